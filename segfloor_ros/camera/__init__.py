@@ -1,0 +1,1 @@
+"""Calibration, rectification and image sources of the stereo camera."""

@@ -1,0 +1,130 @@
+"""The rectified stereo camera and its place on the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.errors import CalibrationError
+from segfloor_ros.geometry import R_ROS_OPTICAL, Array, make_transform
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A rectified stereo pair: two pinholes with equal intrinsics, the right one `baseline_m`
+    along the left's x. Pixels are (u, v) = (column, row), the centre of the top-left pixel is
+    (0, 0). Depth is Z = fx * baseline / d for the disparity d = u_left - u_right > 0. Raises
+    CalibrationError for impossible values.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline_m: float
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, self.baseline_m)
+        if not np.isfinite(values).all():
+            raise CalibrationError(f'calibration has values that are not finite: {values}')
+        if self.fx <= 0 or self.fy <= 0:
+            raise CalibrationError(
+                f'focal length fx = {self.fx:g}, fy = {self.fy:g} px: '
+                'the camera is not calibrated (K[0] = 0)'
+            )
+        if self.baseline_m <= 0:
+            raise CalibrationError(
+                f'baseline is {self.baseline_m:g} m, it must be positive: '
+                'are left and right swapped, or is P[3] of the right camera missing?'
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise CalibrationError(f'image size {self.width}x{self.height} is impossible')
+
+    @property
+    def K(self) -> Array:
+        """The (3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def disparity_times_depth(self) -> float:
+        """fx * baseline in pixel metres: disparity = this / depth."""
+        return self.fx * self.baseline_m
+
+    def project(self, points: Array) -> Array:
+        """Project points (N, 3) of the left optical frame to (N, 3) = (u, v, u_right) in pixels.
+
+        Points must lie in front of the camera (z > 0).
+        """
+        inverse_z = 1.0 / points[:, 2]
+        u = self.fx * points[:, 0] * inverse_z + self.cx
+        v = self.fy * points[:, 1] * inverse_z + self.cy
+        return np.stack([u, v, u - self.disparity_times_depth * inverse_z], axis=1)
+
+    def back_project(self, uv_px: NDArray[np.floating], depth_m: NDArray[np.floating]) -> Array:
+        """Return the points (N, 3) of the left optical frame at pixels (N, 2) and depths (N,) in
+        metres.
+        """
+        uv = np.asarray(uv_px, np.float64)
+        z = np.asarray(depth_m, np.float64)
+        return np.stack(
+            [(uv[:, 0] - self.cx) * z / self.fx, (uv[:, 1] - self.cy) * z / self.fy, z], axis=1
+        )
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where the left camera sits on the base (`base_link`: on the floor below the robot's
+    centre, x forward, z up). height_m: of the left camera's centre above the floor. pitch_rad:
+    positive looks down. roll_rad: positive when the camera is rolled to its right, yaw_rad:
+    positive looks to the left (REP-103 angles, applied yaw, pitch, roll). forward_m, left_m:
+    of the camera's centre ahead of and to the left of the base.
+    """
+
+    height_m: float
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+    forward_m: float = 0.0
+    left_m: float = 0.0
+    yaw_rad: float = 0.0
+
+    @property
+    def T_base_left(self) -> Array:
+        """The pose (4, 4) of the left optical frame in the base frame."""
+        angles = [self.yaw_rad, self.pitch_rad, self.roll_rad]
+        R_base_camera = Rotation.from_euler('ZYX', angles).as_matrix()
+        translation = np.array([self.forward_m, self.left_m, self.height_m])
+        return make_transform(R_base_camera @ R_ROS_OPTICAL, translation)
+
+    @classmethod
+    def from_transform(cls, T_base_left: Array) -> Mount:
+        """Return the mount of a (4, 4) pose of the left optical frame in the base frame."""
+        R_base_camera = T_base_left[:3, :3] @ R_ROS_OPTICAL.T
+        yaw, pitch, roll = (float(a) for a in Rotation.from_matrix(R_base_camera).as_euler('ZYX'))
+        x, y, z = (float(value) for value in T_base_left[:3, 3])
+        return cls(z, pitch, roll, x, y, yaw)
+
+    @property
+    def up_in_camera(self) -> Array:
+        """The floor's unit normal (3,) pointing up, in the left optical frame."""
+        return self.T_base_left[2, :3].copy()
+
+    def heights_m(self, points_left: Array) -> Array:
+        """Return the heights (N,) above the floor of points (N, 3) of the left optical frame."""
+        return points_left @ self.up_in_camera + self.height_m
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """One rectified grey stereo pair: images (H, W) uint8, the frame's number in its recording,
+    its stamp in ns.
+    """
+
+    index: int
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]

@@ -1,0 +1,1 @@
+"""The labelled sparse cloud: which SLAM points are floor and which are obstacles."""

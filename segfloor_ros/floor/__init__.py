@@ -1,0 +1,1 @@
+"""Floor segmentation: disparity, u/v-disparity, floor profile, mask, camera mount."""

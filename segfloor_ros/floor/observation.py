@@ -1,0 +1,47 @@
+"""What floor segmentation hands to the next stages about one keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FLOOR = 255
+NO_EVIDENCE = 127
+NOT_FLOOR = 0
+
+
+@dataclass(frozen=True)
+class FloorScan:
+    """How far the floor was seen without interruption, per bearing, from the base's origin in
+    the base's x-y plane. Bearing i is angle_min_rad + i * angle_increment_rad, counter-
+    clockwise from x forward. ranges_m: (N,) float32 in metres; 0 where something stands right
+    in front, NaN where the image shows nothing about that bearing.
+    """
+
+    angle_min_rad: float
+    angle_increment_rad: float
+    ranges_m: NDArray[np.float32]
+
+    @property
+    def bearings_rad(self) -> NDArray[np.float64]:
+        """Bearings (N,) in radians."""
+        steps = np.arange(len(self.ranges_m), dtype=np.float64)
+        return self.angle_min_rad + self.angle_increment_rad * steps
+
+
+@dataclass(frozen=True)
+class FloorObservation:
+    """The floor seen in one rectified stereo pair.
+    disparity_px: (H, W) float32, 0 where there is no match. mask: (H, W) uint8 of `FLOOR`,
+    `NO_EVIDENCE` and `NOT_FLOOR`. profile_px: (H,) float64, the floor's disparity at each image row
+    in the de-rolled image (NaN above the horizon). scan: the compact free-space scan.
+    """
+
+    disparity_px: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    profile_px: NDArray[np.float64]
+    scan: FloorScan
+    min_disparity_px: float
+    max_disparity_px: float

@@ -1,0 +1,1 @@
+"""The occupancy grid: obstacle layer, free layer, map files."""

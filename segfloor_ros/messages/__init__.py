@@ -1,0 +1,1 @@
+"""NumPy to ROS messages and back, QoS profiles."""

@@ -1,0 +1,1 @@
+"""The ROS nodes: parameters and topics, nothing else."""

@@ -1,0 +1,156 @@
+"""Settings of the stages: one frozen dataclass per stage is the only source of names and defaults.
+ A stage declares its settings once, with `setting(...)` fields carrying description, unit and
+range. The ROS parameters (names, descriptors, ranges), the checks of YAML files and of the
+command line, and the tables in docs/ are all derived from that declaration.
+"""
+
+from __future__ import annotations
+
+import builtins
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from segfloor_ros.errors import SettingsError
+
+Value = bool | int | float | str
+S = TypeVar('S', bound='StageSettings')
+
+
+def setting(
+    default: Value,
+    description: str,
+    *,
+    unit: str = '',
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """Declare one setting of a stage.
+     `minimum` and `maximum` are inclusive. `live` settings may change while a node runs; the others
+    are read-only after start.
+    """
+    metadata = {
+        'description': description,
+        'unit': unit,
+        'minimum': minimum,
+        'maximum': maximum,
+        'choices': choices,
+        'live': live,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True)
+class SettingSpec:
+    """What is known of one setting: its name, type, default, description, unit, range and whether
+    it may change.
+    """
+
+    name: str
+    type: builtins.type
+    default: Value
+    description: str
+    unit: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+    live: bool
+
+    def range_text(self) -> str:
+        """Return the accepted values in words, e.g. `0.01 to 0.2 m`, or '' where anything of the
+        type goes.
+        """
+        unit = f' {self.unit}' if self.unit else ''
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if self.minimum is not None and self.maximum is not None:
+            return f'{self.minimum:g} to {self.maximum:g}{unit}'
+        if self.minimum is not None:
+            return f'at least {self.minimum:g}{unit}'
+        if self.maximum is not None:
+            return f'at most {self.maximum:g}{unit}'
+        return ''
+
+    def check(self, value: Any, stage: str) -> Value:
+        """Return `value` as this setting's type. Raises SettingsError naming parameter, value and
+        range.
+        """
+        where = f'{stage}.{self.name}'
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.type:
+            raise SettingsError(f'{where} = {value!r}: expected {_TYPE_NAMES[self.type]}')
+        if isinstance(value, float) and math.isinf(value):
+            raise SettingsError(f'{where} = {value!r}: must be finite')
+        if not self._accepts(value):
+            raise SettingsError(
+                f'{where} = {value!r} is out of range: {self.range_text() or "a number"}'
+            )
+        return value
+
+    def _accepts(self, value: Any) -> bool:
+        if isinstance(value, float) and math.isnan(value):
+            # NaN stands for "not given" where it is the default, e.g. a height to be measured.
+            return isinstance(self.default, float) and math.isnan(self.default)
+        return (
+            (not self.choices or value in self.choices)
+            and (self.minimum is None or value >= self.minimum)
+            and (self.maximum is None or value <= self.maximum)
+        )
+
+
+_TYPE_NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
+
+
+@dataclasses.dataclass(frozen=True)
+class StageSettings:
+    """Base of every stage's settings. Values are checked on construction; raises SettingsError."""
+
+    def __post_init__(self) -> None:
+        for spec in self.specs():
+            checked = spec.check(getattr(self, spec.name), self.stage_name())
+            object.__setattr__(self, spec.name, checked)
+
+    @classmethod
+    def stage_name(cls) -> str:
+        """Return the stage's name, which is also its node's name: `StereoSlamSettings` →
+        `stereo_slam`.
+        """
+        words = ''.join(f'_{c.lower()}' if c.isupper() else c for c in cls.__name__)
+        return words.lstrip('_').removesuffix('_settings')
+
+    @classmethod
+    def specs(cls) -> list[SettingSpec]:
+        """Return the settings of this stage in order of declaration."""
+        types = {'bool': bool, 'int': int, 'float': float, 'str': str}
+        return [
+            SettingSpec(name=f.name, type=types[str(f.type)], default=f.default, **f.metadata)  # type: ignore[arg-type]
+            for f in dataclasses.fields(cls)
+        ]
+
+    @classmethod
+    def from_mapping(cls: type[S], values: Mapping[str, Any]) -> S:
+        """Build the settings from names and values. Raises SettingsError for an unknown name or a
+        bad value.
+        """
+        known = [spec.name for spec in cls.specs()]
+        for name in values:
+            if name not in known:
+                raise SettingsError(
+                    f'unknown parameter {cls.stage_name()}.{name}{suggestion(name, known)}'
+                )
+        return cls(**values)
+
+    def replaced(self: S, **changes: Any) -> S:
+        """Return a copy with some values changed, checked like the original."""
+        return type(self).from_mapping({**dataclasses.asdict(self), **changes})
+
+
+def suggestion(name: str, known: list[str]) -> str:
+    """Return `: did you mean X?`, or the list of known names when nothing is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f': did you mean {near[0]}?' if near else ': known are ' + ', '.join(sorted(known))

@@ -1,0 +1,1 @@
+"""Rendered worlds with exact ground truth."""

@@ -1,0 +1,1 @@
+"""Feature-based stereo SLAM: features, tracking, keyframes, sparse map, bundle adjustment."""
