@@ -75,14 +75,14 @@ class SettingSpec:
             return f'at most {self.maximum:g}{unit}'
         return ''
 
-    def check(self, value: Any, stage: str) -> Value:
+    def check(self, value: Any, stage: str) -> Any:
         """Return `value` as this setting's type. Raises SettingsError naming parameter, value and
         range.
         """
         where = f'{stage}.{self.name}'
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        if type(value) is not self.type:
+        if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
             raise SettingsError(f'{where} = {value!r}: expected {_TYPE_NAMES[self.type]}')
         if isinstance(value, float) and math.isinf(value):
             raise SettingsError(f'{where} = {value!r}: must be finite')

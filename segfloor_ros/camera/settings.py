@@ -1,0 +1,30 @@
+"""Settings of the camera stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from segfloor_ros.settings import StageSettings, setting
+
+
+@dataclass(frozen=True)
+class StereoCameraSettings(StageSettings):
+    """Where images come from and how left and right are paired."""
+
+    input: str = setting('', 'Recording or device to read: folder, bag, video or device.')
+    rate_hz: float = setting(
+        0.0,
+        'Frame rate of a recording without time stamps; 0 takes 10 Hz.',
+        unit='Hz',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    pairing_tolerance_s: float = setting(
+        0.01,
+        'Largest difference of stamps at which a left and a right image are one pair.',
+        unit='s',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
+    right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')

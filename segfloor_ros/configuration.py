@@ -1,0 +1,143 @@
+"""The settings of all stages together: defaults < parameter file < command line.
+ A parameter file is a plain ROS 2 parameter file; the nodes and the `segfloor` command read
+the same one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.settings import StageSettings, suggestion
+from segfloor_ros.slam.settings import StereoSlamSettings
+
+# Parameters every ROS node has; they may stand in a parameter file and are no concern of the stages.
+ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+
+
+@dataclasses.dataclass(frozen=True)
+class Configuration:
+    """The settings of the five stages, each under its node's name."""
+
+    stereo_camera: StereoCameraSettings = dataclasses.field(default_factory=StereoCameraSettings)
+    stereo_slam: StereoSlamSettings = dataclasses.field(default_factory=StereoSlamSettings)
+    floor_segmentation: FloorSegmentationSettings = dataclasses.field(
+        default_factory=FloorSegmentationSettings
+    )
+    cloud_labelling: CloudLabellingSettings = dataclasses.field(
+        default_factory=CloudLabellingSettings
+    )
+    occupancy_grid: OccupancyGridSettings = dataclasses.field(default_factory=OccupancyGridSettings)
+
+    def stages(self) -> dict[str, StageSettings]:
+        """Return the settings by stage name, in the order of the data flow."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+
+    def as_ros_parameters(self) -> dict[str, Any]:
+        """Return the nested mapping of a ROS 2 parameter file with every value as resolved."""
+        return {
+            name: {'ros__parameters': dataclasses.asdict(stage)}
+            for name, stage in self.stages().items()
+        }
+
+
+STAGE_SETTINGS: dict[str, type[StageSettings]] = {
+    cls.stage_name(): cls
+    for cls in (
+        StereoCameraSettings,
+        StereoSlamSettings,
+        FloorSegmentationSettings,
+        CloudLabellingSettings,
+        OccupancyGridSettings,
+    )
+}
+
+
+def resolve(
+    params_file: Path | None = None,
+    assignments: Iterable[str] = (),
+    **stage_changes: Mapping[str, Any],
+) -> Configuration:
+    """Build the configuration: defaults < `params_file` < `assignments` (`stage.name=value`) <
+    changes.
+
+    Raises SettingsError naming the parameter, the value and what is accepted.
+    """
+    values: dict[str, dict[str, Any]] = {name: {} for name in STAGE_SETTINGS}
+    if params_file is not None:
+        _merge(values, read_params_file(params_file))
+    for assignment in assignments:
+        stage, name, value = _parse_assignment(assignment)
+        values[stage][name] = value
+    _merge(values, stage_changes)
+    return Configuration(
+        **{name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()}
+    )
+
+
+def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the values of a ROS 2 parameter file by stage.
+     `/**` applies to every stage that has the parameter; names of nodes outside this package are
+    passed over. Raises SettingsError when the file is missing or not of that form.
+    """
+    try:
+        document = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise SettingsError(f'{path}: cannot read the parameter file ({error.strerror})') from None
+    except yaml.YAMLError as error:
+        line = getattr(getattr(error, 'problem_mark', None), 'line', 0) + 1
+        raise SettingsError(f'{path}, line {line}: not valid YAML') from None
+    if not isinstance(document, dict):
+        raise SettingsError(f'{path}: expected node names with ros__parameters below them')
+    values: dict[str, dict[str, Any]] = {}
+    for node, content in document.items():
+        parameters = content.get('ros__parameters') if isinstance(content, dict) else None
+        if not isinstance(parameters, dict):
+            raise SettingsError(f'{path}: {node} has no ros__parameters')
+        parameters = {k: v for k, v in parameters.items() if k not in ROS_PARAMETERS}
+        _merge(values, _by_stage(str(node), parameters, path))
+    return values
+
+
+def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+    stage = node.rsplit('/', 1)[-1]
+    if stage in STAGE_SETTINGS:
+        return {stage: parameters}
+    if stage != '**':
+        return {}
+    values: dict[str, dict[str, Any]] = {}
+    for name, value in parameters.items():
+        owners = [
+            stage
+            for stage, cls in STAGE_SETTINGS.items()
+            if any(spec.name == name for spec in cls.specs())
+        ]
+        if not owners:
+            raise SettingsError(f'{path}: no stage has a parameter {name}')
+        for owner in owners:
+            values.setdefault(owner, {})[name] = value
+    return values
+
+
+def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
+    key, separator, text = assignment.partition('=')
+    stage, dot, name = key.strip().partition('.')
+    if not separator or not dot:
+        raise SettingsError(f'--set {assignment}: expected stage.parameter=value')
+    if stage not in STAGE_SETTINGS:
+        raise SettingsError(f'unknown stage {stage}{suggestion(stage, list(STAGE_SETTINGS))}')
+    return stage, name, yaml.safe_load(text)
+
+
+def _merge(values: dict[str, dict[str, Any]], changes: Mapping[str, Mapping[str, Any]]) -> None:
+    for stage, parameters in changes.items():
+        values.setdefault(stage, {}).update(parameters)
