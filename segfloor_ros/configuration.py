@@ -20,7 +20,7 @@ from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.settings import StageSettings, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 
-# Parameters every ROS node has; they may stand in a parameter file and are no concern of the stages.
+# Parameters of every ROS node: allowed in a parameter file, no concern of the stages.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
@@ -79,9 +79,10 @@ def resolve(
         stage, name, value = _parse_assignment(assignment)
         values[stage][name] = value
     _merge(values, stage_changes)
-    return Configuration(
-        **{name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()}
-    )
+    stages: dict[str, Any] = {
+        name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()
+    }
+    return Configuration(**stages)
 
 
 def read_params_file(path: Path) -> dict[str, dict[str, Any]]:

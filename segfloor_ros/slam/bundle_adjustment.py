@@ -1,0 +1,199 @@
+"""Local bundle adjustment: keyframes and points move together until the features fit best.
+ Levenberg-Marquardt on the normal equations, reduced to the cameras by the Schur complement
+(Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section 6.1), Huber cost. One pose
+per stereo pair: the baseline is fixed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, se3_exp
+from segfloor_ros.slam.residuals import (
+    MIN_DEPTH_M,
+    Observations,
+    huber_cost,
+    huber_weights,
+    point_jacobians,
+    pose_jacobians,
+    residuals,
+    squared_norms,
+)
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """A bundle adjustment problem.
+     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
+    Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
+    most once.
+    """
+
+    T_camera_world: Array
+    num_free: int
+    points_world: Array
+    keyframe: NDArray[np.intp]
+    point: NDArray[np.intp]
+    observations: Observations
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    """Adjusted poses (K, 4, 4) and points (P, 3), which observations (N,) fit, and the cost
+    before and after.
+    """
+
+    T_camera_world: Array
+    points_world: Array
+    inliers: NDArray[np.bool_]
+    cost_before: float
+    cost_after: float
+
+
+def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> BundleResult:
+    """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
+    al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16).
+    """
+    state = _evaluate(camera, problem)
+    cost_before = state.cost
+    damping, growth = 1e-4, 2.0
+    for _ in range(iterations):
+        system = _linearise(camera, problem, state)
+        step = system.solve(damping)
+        candidate = _apply(problem, step)
+        trial = _evaluate(camera, candidate)
+        predicted = system.predicted_decrease(step, damping)
+        gain = (state.cost - trial.cost) / max(predicted, 1e-12)
+        if gain > 0:
+            converged = state.cost - trial.cost < 1e-4 * state.cost
+            problem, state = candidate, trial
+            damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            growth = 2.0
+            if converged:
+                break
+        else:
+            damping *= growth
+            growth *= 2.0
+    inliers = state.front & (state.chi2 <= problem.observations.chi2_limit)
+    return BundleResult(
+        problem.T_camera_world, problem.points_world, inliers, cost_before, state.cost
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    points_camera: Array
+    residual: Array
+    chi2: Array
+    front: NDArray[np.bool_]
+    cost: float
+
+
+def _evaluate(camera: StereoCamera, problem: BundleProblem) -> _State:
+    poses = problem.T_camera_world[problem.keyframe]
+    points = np.einsum('nij,nj->ni', poses[:, :3, :3], problem.points_world[problem.point])
+    points += poses[:, :3, 3]
+    front = points[:, 2] > MIN_DEPTH_M
+    points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
+    residual = residuals(camera, points, problem.observations)
+    chi2 = squared_norms(residual, problem.observations.information)
+    cost = huber_cost(chi2, problem.observations.chi2_limit)
+    return _State(points, residual, chi2, front, cost)
+
+
+@dataclass(frozen=True)
+class _Step:
+    twists: Array
+    shifts: Array
+
+
+@dataclass(frozen=True)
+class _System:
+    """The normal equations by blocks: cameras U, points V, mixed W (dense: 6 K x 3 P), right-
+    hand sides.
+    """
+
+    U: Array
+    V: Array
+    W: Array
+    camera_rhs: Array
+    point_rhs: Array
+
+    def solve(self, damping: float) -> _Step:
+        """Solve the damped system by the Schur complement on the cameras."""
+        free, points = len(self.U), len(self.V)
+        V_inverse = np.linalg.inv(_damped(self.V, damping))
+        WV = np.einsum('apb,pbc->apc', self.W, V_inverse).reshape(6 * free, 3 * points)
+        W = self.W.reshape(6 * free, 3 * points)
+        S = -WV @ W.T
+        diagonal = _damped(self.U, damping)
+        for k in range(free):
+            S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += diagonal[k]
+        rhs = self.camera_rhs.ravel() - WV @ self.point_rhs.ravel()
+        twists = np.linalg.solve(S, rhs)
+        back = self.point_rhs - (W.T @ twists).reshape(points, 3)
+        shifts = np.einsum('pab,pb->pa', V_inverse, back)
+        return _Step(twists.reshape(free, 6), shifts)
+
+    def predicted_decrease(self, step: _Step, damping: float) -> float:
+        """Return how much the cost falls by the quadratic model."""
+        diagonal_U = np.einsum('kaa->ka', self.U)
+        diagonal_V = np.einsum('paa->pa', self.V)
+        return float(
+            (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
+            + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs)).sum()
+        )
+
+
+def _damped(blocks: Array, damping: float) -> Array:
+    size = blocks.shape[1]
+    diagonal = np.einsum('kaa->ka', blocks)
+    return blocks + np.eye(size) * (damping * diagonal + 1e-9)[:, None, :]
+
+
+def _linearise(camera: StereoCamera, problem: BundleProblem, state: _State) -> _System:
+    observations = problem.observations
+    weight = observations.information * huber_weights(state.chi2, observations.chi2_limit)[:, None]
+    weight = weight * state.front[:, None]
+    by_camera_point = point_jacobians(camera, state.points_camera)
+    J_point = by_camera_point @ problem.T_camera_world[problem.keyframe][:, :3, :3]
+    WJ_point = J_point * weight[:, :, None]
+    num_points = len(problem.points_world)
+    V = _sum_by(problem.point, _products(J_point, WJ_point), num_points)
+    point_rhs = -_sum_by(
+        problem.point, _products(WJ_point, state.residual[..., None])[..., 0], num_points
+    )
+
+    free = problem.keyframe < problem.num_free
+    k, p = problem.keyframe[free], problem.point[free]
+    J_pose = pose_jacobians(by_camera_point[free], state.points_camera[free])
+    WJ_pose = J_pose * weight[free][:, :, None]
+    U = _sum_by(k, _products(J_pose, WJ_pose), problem.num_free)
+    camera_rhs = -_sum_by(
+        k, _products(WJ_pose, state.residual[free][..., None])[..., 0], problem.num_free
+    )
+    W = np.zeros((problem.num_free, 6, num_points, 3))
+    W[k, :, p] = _products(WJ_pose, J_point[free])
+    return _System(U, V, W.reshape(problem.num_free * 6, num_points, 3), camera_rhs, point_rhs)
+
+
+def _products(A: Array, B: Array) -> Array:
+    """Return A^T B for stacks (N, 3, a) and (N, 3, b)."""
+    return np.swapaxes(A, 1, 2) @ B
+
+
+def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:
+    """Sum values (N, ...) into `size` groups."""
+    flat = values.reshape(len(values), -1)
+    sums = np.stack([np.bincount(index, column, size) for column in flat.T], axis=1)
+    return sums.reshape(size, *values.shape[1:])
+
+
+def _apply(problem: BundleProblem, step: _Step) -> BundleProblem:
+    poses = problem.T_camera_world.copy()
+    poses[: problem.num_free] = se3_exp(step.twists) @ poses[: problem.num_free]
+    return replace(problem, T_camera_world=poses, points_world=problem.points_world + step.shifts)

@@ -1,0 +1,127 @@
+"""Matching of binary descriptors: guided by a predicted pixel, along a rectified row, or
+without guidance.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.slam.features import Features
+
+_BITS = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
+_BITS16 = (_BITS[:, None] + _BITS[None, :]).ravel()
+
+NEIGHBOURS = 16
+"""Features looked at around a predicted pixel; a radius holds about ten."""
+
+Matches = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+
+def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return the Hamming distances (...,) of descriptors (..., 32), broadcast against each
+    other.
+    """
+    difference = np.bitwise_xor(a.view(np.uint16), b.view(np.uint16))
+    return _BITS16[difference].sum(axis=-1, dtype=np.int32)
+
+
+def match_predicted(
+    features: Features,
+    tree: cKDTree,
+    predicted_uv_px: NDArray[np.floating],
+    predicted_octave: NDArray[np.floating],
+    descriptor: NDArray[np.uint8],
+    radius_px: NDArray[np.floating],
+    max_hamming: int,
+    ratio: float = 0.85,
+) -> Matches:
+    """Match map points to the features around their predicted pixels.
+     predicted_uv_px: (M, 2), predicted_octave: (M,), descriptor: (M, 32), radius_px: (M,). A match
+    must lie within one octave of the prediction and be clearly better than the second best of the
+    same octave. Returns (point rows, feature rows), one to one.
+    """
+    if len(predicted_uv_px) == 0 or len(features) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    reach, near = tree.query(
+        predicted_uv_px, k=min(NEIGHBOURS, len(features)), distance_upper_bound=radius_px.max()
+    )
+    reach, near = np.atleast_2d(reach), np.atleast_2d(near)
+    octave = np.append(features.octave.astype(np.float64), -100.0)[near]
+    valid = (reach <= radius_px[:, None]) & (np.abs(octave - predicted_octave[:, None]) <= 1.5)
+    rows, columns = np.nonzero(valid)
+    distance = np.full(near.shape, 512, np.int32)
+    distance[rows, columns] = hamming(descriptor[rows], features.descriptor[near[rows, columns]])
+    best = distance.argmin(axis=1)
+    index = np.arange(len(near))
+    best_distance = distance[index, best]
+    rival = (distance < 512) & (np.abs(octave - octave[index, best][:, None]) < 0.5)
+    rival[index, best] = False
+    second = np.where(rival, distance, 512).min(axis=1)
+    accepted = (best_distance <= max_hamming) & (best_distance <= ratio * second)
+    points = np.flatnonzero(accepted)
+    return one_to_one(points, near[points, best[points]], best_distance[points])
+
+
+def match_rows(
+    left: Features,
+    right: Features,
+    max_disparity_px: float,
+    pyramid_scale: float,
+    max_hamming: int,
+) -> Matches:
+    """Match a rectified pair: same row within the feature's scale, disparity in [0,
+    max_disparity_px].
+
+    Returns (left rows, right rows), one to one and best in both directions.
+    """
+    order = np.argsort(right.uv_px[:, 1], kind='stable')
+    right_v = right.uv_px[order, 1]
+    tolerance = 2.0 * pyramid_scale ** left.octave.astype(np.float64)
+    low = np.searchsorted(right_v, left.uv_px[:, 1] - tolerance)
+    high = np.searchsorted(right_v, left.uv_px[:, 1] + tolerance, side='right')
+    i = np.repeat(np.arange(len(left)), high - low)
+    j = order[
+        np.arange(len(i))
+        - np.repeat(np.cumsum(high - low) - (high - low), high - low)
+        + np.repeat(low, high - low)
+    ]
+    disparity = left.uv_px[i, 0] - right.uv_px[j, 0]
+    octaves_apart = np.abs(left.octave[i].astype(np.int32) - right.octave[j])
+    valid = (disparity > -1.0) & (disparity <= max_disparity_px) & (octaves_apart <= 1)
+    i, j = i[valid], j[valid]
+    distance = hamming(left.descriptor[i], right.descriptor[j])
+    near = distance <= max_hamming
+    i, j, distance = i[near], j[near], distance[near]
+    return one_to_one(i, j, distance)
+
+
+def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8], max_hamming: int) -> Matches:
+    """Match descriptors (N, 32) and (M, 32) by mutual nearest neighbours; returns (query rows,
+    train rows).
+    """
+    if len(query) == 0 or len(train) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(query, train)
+    pairs = np.array(
+        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_hamming], np.intp
+    ).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def one_to_one(a: NDArray[np.intp], b: NDArray[np.intp], distance: NDArray[np.int32]) -> Matches:
+    """Keep the pairs (a[i], b[i]) that are the nearest of both their ends; ties go to the
+    lower index.
+    """
+    order = np.lexsort((b, a, distance))
+    a, b = a[order], b[order]
+    best_of_a = np.zeros(len(a), bool)
+    best_of_a[np.unique(a, return_index=True)[1]] = True
+    best_of_b = np.zeros(len(b), bool)
+    best_of_b[np.unique(b, return_index=True)[1]] = True
+    keep = best_of_a & best_of_b
+    a, b = a[keep], b[keep]
+    by_a = np.argsort(a, kind='stable')
+    return a[by_a], b[by_a]

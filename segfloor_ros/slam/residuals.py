@@ -1,0 +1,104 @@
+"""The measurement model of a stereo feature, shared by pose refinement and bundle adjustment.
+ A feature measures (u, v, d): its pixel in the left image and its disparity. The disparity is
+found by correlating the patch around (u, v) with the right image, so its error is independent
+of the error of (u, v), and smaller; (u, v, u_right) would not have that property.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, skew
+
+CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
+"""95 % quantiles of the chi-squared distribution by degrees of freedom."""
+
+MIN_DEPTH_M = 0.05
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Stereo measurements of N features.
+     uvd_px: (N, 3) float64 = (u, v, disparity), disparity NaN where there is none. sigma_px: (N,
+    3) standard deviations.
+    """
+
+    uvd_px: Array
+    sigma_px: Array
+
+    def __len__(self) -> int:
+        return len(self.uvd_px)
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
+        """Return the chosen rows."""
+        return Observations(self.uvd_px[rows], self.sigma_px[rows])
+
+    @property
+    def information(self) -> Array:
+        """Inverse variances (N, 3) in 1/px²; 0 where there is no measurement."""
+        return np.where(np.isfinite(self.uvd_px), 1.0 / self.sigma_px**2, 0.0)
+
+    @property
+    def chi2_limit(self) -> Array:
+        """The 95 % bound (N,) on the squared, normalised residual of each feature."""
+        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_95[3], CHI2_95[2])
+
+
+def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:
+    """Return predicted minus measured (u, v, d), (N, 3) px, for points (N, 3) of the left
+    optical frame.
+
+    A disparity that was not measured gives 0. Points must have z > 0.
+    """
+    inverse_z = 1.0 / points[:, 2]
+    predicted = np.stack(
+        [
+            camera.fx * points[:, 0] * inverse_z + camera.cx,
+            camera.fy * points[:, 1] * inverse_z + camera.cy,
+            camera.disparity_times_depth * inverse_z,
+        ],
+        axis=1,
+    )
+    return np.nan_to_num(predicted - observations.uvd_px, nan=0.0)
+
+
+def point_jacobians(camera: StereoCamera, points: Array) -> Array:
+    """Return d(u, v, d) / d(point), (N, 3, 3), for points (N, 3) of the left optical frame."""
+    inverse_z = 1.0 / points[:, 2]
+    inverse_z2 = inverse_z**2
+    jacobian = np.zeros((len(points), 3, 3))
+    jacobian[:, 0, 0] = camera.fx * inverse_z
+    jacobian[:, 0, 2] = -camera.fx * points[:, 0] * inverse_z2
+    jacobian[:, 1, 1] = camera.fy * inverse_z
+    jacobian[:, 1, 2] = -camera.fy * points[:, 1] * inverse_z2
+    jacobian[:, 2, 2] = -camera.disparity_times_depth * inverse_z2
+    return jacobian
+
+
+def pose_jacobians(point_jacobian: Array, points: Array) -> Array:
+    """Return d(u, v, d) / d(twist), (N, 3, 6), for the update T_camera_world <- exp(twist)
+    T_camera_world.
+
+    d(point)/d(twist) = [I, -skew(point)] (Barfoot 2017, eq. 7.183 with rho first).
+    """
+    return np.concatenate([point_jacobian, -point_jacobian @ skew(points)], axis=2)
+
+
+def squared_norms(residual: Array, information: Array) -> Array:
+    """Return the squared, normalised residuals (N,)."""
+    return (residual**2 * information).sum(axis=1)
+
+
+def huber_weights(chi2: Array, limit: Array) -> Array:
+    """Return the weights (N,) of the Huber cost whose quadratic part ends at chi2 = limit."""
+    return np.sqrt(np.minimum(1.0, limit / np.maximum(chi2, 1e-12)))
+
+
+def huber_cost(chi2: Array, limit: Array) -> float:
+    """Return the summed Huber cost (Hartley & Zisserman, Multiple View Geometry, A6.8)."""
+    linear = 2.0 * np.sqrt(limit * chi2) - limit
+    return float(np.where(chi2 <= limit, chi2, linear).sum())

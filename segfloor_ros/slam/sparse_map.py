@@ -1,0 +1,221 @@
+"""The sparse map: points and keyframes as arrays, linked by point ids.
+ The id of a point is its row and is never given twice. Frame `world` is the left optical frame
+of the first frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.residuals import Observations
+from segfloor_ros.slam.results import NO_POINT
+
+
+@dataclass
+class KeyframeRecord:
+    """One keyframe of the map: pose (moves in bundle adjustment), features, and the map point
+    of each (N,) int32.
+    """
+
+    index: int
+    frame_index: int
+    stamp_ns: int
+    T_camera_world: Array
+    features: Features
+    observations: Observations
+    point_id: NDArray[np.int32]
+
+    @property
+    def T_world_camera(self) -> Array:
+        """The camera's pose (4, 4)."""
+        return invert(self.T_camera_world)
+
+
+class GrowingArray:
+    """An array that grows along its first axis; appending is amortised constant time."""
+
+    def __init__(self, row_shape: tuple[int, ...], dtype: type) -> None:
+        self._buffer = np.zeros((1024, *row_shape), dtype)
+        self._length = 0
+
+    @property
+    def rows(self) -> NDArray:
+        """A view of the rows in use; writing to it writes to the array."""
+        return self._buffer[: self._length]
+
+    def extend(self, rows: NDArray) -> None:
+        """Append rows (N, ...)."""
+        needed = self._length + len(rows)
+        if needed > len(self._buffer):
+            grown = np.zeros(
+                (max(needed, 2 * len(self._buffer)), *self._buffer.shape[1:]), self._buffer.dtype
+            )
+            grown[: self._length] = self.rows
+            self._buffer = grown
+        self._buffer[self._length : needed] = rows
+        self._length = needed
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Drop the rows that are not chosen (N,)."""
+        kept = self.rows[chosen]
+        self._buffer[: len(kept)] = kept
+        self._length = len(kept)
+
+
+class SparseMap:
+    """Points, keyframes and who observes whom."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[KeyframeRecord] = []
+        self._xyz = GrowingArray((3,), np.float64)
+        self._descriptor = GrowingArray((32,), np.uint8)
+        self._viewing_distance = GrowingArray((), np.float64)
+        self._viewing_octave = GrowingArray((), np.float64)
+        self._viewing_direction = GrowingArray((3,), np.float64)
+        self._alive = GrowingArray((), np.bool_)
+        self._visible_count = GrowingArray((), np.int32)
+        self._found_count = GrowingArray((), np.int32)
+        self._observer_count = GrowingArray((), np.int32)
+        self._born = GrowingArray((), np.int32)
+        self._edge_point = GrowingArray((), np.int32)
+        self._edge_keyframe = GrowingArray((), np.int32)
+
+    @property
+    def xyz_world(self) -> Array:
+        """Positions (P, 3) of all points ever made, a writable view indexed by id."""
+        return self._xyz.rows
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """Whether each point (P,) is part of the map."""
+        return self._alive.rows
+
+    @property
+    def descriptor(self) -> NDArray[np.uint8]:
+        """Descriptors (P, 32) as last seen by a keyframe."""
+        return self._descriptor.rows
+
+    @property
+    def viewing_distance_m(self) -> Array:
+        """Distance (P,) from which the descriptor was taken."""
+        return self._viewing_distance.rows
+
+    @property
+    def viewing_octave(self) -> Array:
+        """Pyramid level (P,) at which the descriptor was taken."""
+        return self._viewing_octave.rows
+
+    @property
+    def viewing_direction(self) -> Array:
+        """Unit vectors (P, 3) from the camera to the point, in world axes, when the descriptor
+        was taken.
+        """
+        return self._viewing_direction.rows
+
+    @property
+    def observer_count(self) -> NDArray[np.int32]:
+        """Number of keyframes (P,) that observe each point."""
+        return self._observer_count.rows
+
+    def add_keyframe(self, keyframe: KeyframeRecord) -> None:
+        """Add a keyframe; its matched points take on its view of them."""
+        self.keyframes.append(keyframe)
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        self._link(keyframe, rows)
+
+    def add_points(
+        self, keyframe: KeyframeRecord, rows: NDArray[np.intp], xyz_world: Array
+    ) -> None:
+        """Add new points (N, 3), seen by the features `rows` (N,) of a keyframe that is
+        already in the map.
+        """
+        count = len(rows)
+        first_id = len(self.alive)
+        self._xyz.extend(xyz_world)
+        self._descriptor.extend(np.zeros((count, 32), np.uint8))
+        self._viewing_distance.extend(np.zeros(count))
+        self._viewing_octave.extend(np.zeros(count))
+        self._viewing_direction.extend(np.zeros((count, 3)))
+        self._alive.extend(np.ones(count, bool))
+        self._visible_count.extend(np.ones(count, np.int32))
+        self._found_count.extend(np.ones(count, np.int32))
+        self._observer_count.extend(np.zeros(count, np.int32))
+        self._born.extend(np.full(count, keyframe.index, np.int32))
+        keyframe.point_id[rows] = np.arange(first_id, first_id + count, dtype=np.int32)
+        self._link(keyframe, rows)
+
+    def _link(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
+        ids = keyframe.point_id[rows]
+        self._edge_point.extend(ids)
+        self._edge_keyframe.extend(np.full(len(ids), keyframe.index, np.int32))
+        self.observer_count[ids] += 1
+        sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
+        distance = np.linalg.norm(sight, axis=1)
+        self.descriptor[ids] = keyframe.features.descriptor[rows]
+        self.viewing_distance_m[ids] = distance
+        self.viewing_octave[ids] = keyframe.features.octave[rows]
+        self.viewing_direction[ids] = sight / distance[:, None]
+
+    def unlink(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
+        """Forget the observations `rows` of a keyframe; a point that nobody observes any more
+        is removed.
+        """
+        ids = keyframe.point_id[rows]
+        keyframe.point_id[rows] = NO_POINT
+        gone = np.zeros(len(self.alive), bool)
+        gone[ids] = True
+        edges = gone[self._edge_point.rows] & (self._edge_keyframe.rows == keyframe.index)
+        self._drop_edges(edges)
+        self.observer_count[ids] -= 1
+        self.alive[ids[self.observer_count[ids] <= 0]] = False
+
+    def remove_points(self, ids: NDArray[np.integer]) -> None:
+        """Take points out of the map; their ids are not used again."""
+        self.alive[ids] = False
+        gone = ~self.alive
+        self._drop_edges(gone[self._edge_point.rows])
+        for keyframe in self.keyframes:
+            known = keyframe.point_id != NO_POINT
+            known[known] = gone[keyframe.point_id[known]]
+            keyframe.point_id[known] = NO_POINT
+
+    def _drop_edges(self, dropped: NDArray[np.bool_]) -> None:
+        for edges in (self._edge_point, self._edge_keyframe):
+            edges.keep(~dropped)
+
+    def note_tracking(self, visible: NDArray[np.integer], found: NDArray[np.integer]) -> None:
+        """Count that points should have been seen in a frame, and which of them were."""
+        self._visible_count.rows[visible] += 1
+        self._found_count.rows[found] += 1
+
+    def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
+        """Return ids of points that tracking seldom finds, or that only one keyframe saw
+        although made before keyframe `settled_before`.
+        """
+        seldom = self._found_count.rows < min_found_ratio * self._visible_count.rows
+        lonely = (self._born.rows < settled_before) & (self.observer_count < 2)
+        return np.flatnonzero(self.alive & (seldom | lonely))
+
+    def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the keyframes that observe any of the points, most shared first, and the
+        numbers shared.
+        """
+        wanted = np.zeros(len(self.alive), bool)
+        wanted[ids] = True
+        shared = np.bincount(
+            self._edge_keyframe.rows[wanted[self._edge_point.rows]], minlength=len(self.keyframes)
+        )
+        order = np.lexsort((-np.arange(len(shared)), -shared))
+        order = order[shared[order] > 0]
+        return order, shared[order]
+
+    def points_of(self, keyframe_indices: NDArray[np.integer]) -> NDArray[np.int32]:
+        """Return the ascending ids of all points that the keyframes observe."""
+        ids = [self.keyframes[k].point_id for k in keyframe_indices]
+        merged = np.unique(np.concatenate(ids)) if ids else np.zeros(0, np.int32)
+        return merged[merged != NO_POINT]
