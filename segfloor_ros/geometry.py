@@ -5,11 +5,13 @@ x right, y down, z forward; ROS frames have x forward, y left, z up (REP-103).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 R_ROS_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Maps optical axes to ROS axes: (x, y, z)_ros = (z, -x, -y)_optical."""

@@ -190,7 +190,7 @@ def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:
     """Sum values (N, ...) into `size` groups."""
     flat = values.reshape(len(values), -1)
     sums = np.stack([np.bincount(index, column, size) for column in flat.T], axis=1)
-    return sums.reshape(size, *values.shape[1:])
+    return np.asarray(sums, np.float64).reshape(size, *values.shape[1:])
 
 
 def _apply(problem: BundleProblem, step: _Step) -> BundleProblem:

@@ -6,19 +6,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.geometry import Array
+
 HALF_PATCH_PX = 5
 MIN_CORRELATION = 0.75
 
 
 def refine_disparity(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
     uv_px: NDArray[np.floating],
     guess_px: NDArray[np.floating],
     reach_px: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Find the disparity of each feature within `reach_px` of a guess, to a fraction of a pixel.
-     left, right: rectified grey images (H, W). uv_px: (N, 2) in the left image. guess_px: (N,).
+     left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image. guess_px: (N,).
     The patch is compared by zero-mean normalised cross-correlation, which a difference in gain or
     brightness between the cameras does not change; the peak is refined by a parabola. Returns
     disparity (N,), NaN where there is no clear peak inside the reach or the patch leaves the
@@ -43,12 +45,12 @@ def refine_disparity(
 
 
 def _correlation(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
     uv_px: NDArray[np.floating],
     guess_px: NDArray[np.floating],
     reach_px: int,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return scores (N, 2 * reach + 1); column s shifts the right patch by s - reach pixels to
     the right.
     """
@@ -68,7 +70,7 @@ def _correlation(
 
 
 def sample_patches(
-    image: NDArray[np.uint8], uv_px: NDArray[np.float32], half_width: int, half_height: int
+    image: NDArray[np.float32], uv_px: NDArray[np.float32], half_width: int, half_height: int
 ) -> NDArray[np.float32]:
     """Return the patches (N, 2 half_height + 1, 2 half_width + 1) around sub-pixel positions
     (N, 2).

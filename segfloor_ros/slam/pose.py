@@ -64,7 +64,7 @@ def solve_pnp(
     inliers = np.zeros(len(points_world), bool)
     inliers[np.asarray(rows).ravel()] = True
     R = Rotation.from_rotvec(np.asarray(rotation_vector).ravel()).as_matrix()
-    return make_transform(R, np.asarray(translation).ravel()), inliers
+    return make_transform(R, np.asarray(translation, np.float64).ravel()), inliers
 
 
 def refine_pose(

@@ -6,6 +6,7 @@ of the first frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,15 +41,15 @@ class GrowingArray:
     """An array that grows along its first axis; appending is amortised constant time."""
 
     def __init__(self, row_shape: tuple[int, ...], dtype: type) -> None:
-        self._buffer = np.zeros((1024, *row_shape), dtype)
+        self._buffer: NDArray[Any] = np.zeros((1024, *row_shape), dtype)
         self._length = 0
 
     @property
-    def rows(self) -> NDArray:
+    def rows(self) -> NDArray[Any]:
         """A view of the rows in use; writing to it writes to the array."""
         return self._buffer[: self._length]
 
-    def extend(self, rows: NDArray) -> None:
+    def extend(self, rows: NDArray[Any]) -> None:
         """Append rows (N, ...)."""
         needed = self._length + len(rows)
         if needed > len(self._buffer):
@@ -84,6 +85,7 @@ class SparseMap:
         self._born = GrowingArray((), np.int32)
         self._edge_point = GrowingArray((), np.int32)
         self._edge_keyframe = GrowingArray((), np.int32)
+        self._edge_row = GrowingArray((), np.int32)
 
     @property
     def xyz_world(self) -> Array:
@@ -153,6 +155,7 @@ class SparseMap:
         ids = keyframe.point_id[rows]
         self._edge_point.extend(ids)
         self._edge_keyframe.extend(np.full(len(ids), keyframe.index, np.int32))
+        self._edge_row.extend(rows)
         self.observer_count[ids] += 1
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
@@ -185,7 +188,7 @@ class SparseMap:
             keyframe.point_id[known] = NO_POINT
 
     def _drop_edges(self, dropped: NDArray[np.bool_]) -> None:
-        for edges in (self._edge_point, self._edge_keyframe):
+        for edges in (self._edge_point, self._edge_keyframe, self._edge_row):
             edges.keep(~dropped)
 
     def note_tracking(self, visible: NDArray[np.integer], found: NDArray[np.integer]) -> None:
@@ -197,8 +200,9 @@ class SparseMap:
         """Return ids of points that tracking seldom finds, or that only one keyframe saw
         although made before keyframe `settled_before`.
         """
-        seldom = self._found_count.rows < min_found_ratio * self._visible_count.rows
-        lonely = (self._born.rows < settled_before) & (self.observer_count < 2)
+        found = self._found_count.rows
+        seldom = found < min_found_ratio * self._visible_count.rows
+        lonely = (self._born.rows < settled_before) & (self.observer_count < 2) & (found < 4)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
     def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -219,3 +223,18 @@ class SparseMap:
         ids = [self.keyframes[k].point_id for k in keyframe_indices]
         merged = np.unique(np.concatenate(ids)) if ids else np.zeros(0, np.int32)
         return merged[merged != NO_POINT]
+
+    def edges_of(
+        self, ids: NDArray[np.integer]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Return all observations of the points: point ids, keyframe indices, feature rows;
+        (E,) each.
+        """
+        wanted = np.zeros(len(self.alive), bool)
+        wanted[ids] = True
+        edges = wanted[self._edge_point.rows]
+        return (
+            self._edge_point.rows[edges],
+            self._edge_keyframe.rows[edges],
+            self._edge_row.rows[edges],
+        )

@@ -1,0 +1,153 @@
+"""Mapping: what happens when a frame becomes a keyframe."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
+from segfloor_ros.slam.disparity_refinement import refine_disparity
+from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.matching import match_rows
+from segfloor_ros.slam.residuals import Observations
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.tracking import DISPARITY_REACH_PX, MIN_SIGMA_DISPARITY
+
+MIN_DISPARITY_PX = 1.0
+MIN_SHARED_POINTS = 15
+SETTLING_KEYFRAMES = 2
+MIN_FOUND_RATIO = 0.25
+
+
+class LocalMapper:
+    """Adds keyframes and their points to the map and adjusts the neighbourhood."""
+
+    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
+        self._camera = camera
+        self._settings = settings
+
+    def measure_stereo(
+        self,
+        left: NDArray[np.float32],
+        right: NDArray[np.float32],
+        features: Features,
+        right_features: Features,
+        observations: Observations,
+    ) -> None:
+        """Add a disparity, in place, to every feature that has none yet and is found in the
+        right image.
+        """
+        max_disparity = 0.5 * self._camera.width
+        rows, matched = match_rows(
+            features,
+            right_features,
+            max_disparity,
+            self._settings.pyramid_scale,
+            self._settings.max_hamming,
+        )
+        missing = np.isnan(observations.uvd_px[rows, 2])
+        rows, matched = rows[missing], matched[missing]
+        guess = (features.uv_px[rows, 0] - right_features.uv_px[matched, 0]).astype(np.float64)
+        disparity, sigma = refine_disparity(
+            left, right, features.uv_px[rows], guess, DISPARITY_REACH_PX
+        )
+        observations.uvd_px[rows, 2] = disparity
+        observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
+
+    def insert(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+        """Add a keyframe, new points from its stereo features, adjust its neighbourhood and
+        cull poor points.
+        """
+        sparse_map.add_keyframe(keyframe)
+        self._add_new_points(sparse_map, keyframe)
+        if len(sparse_map.keyframes) > 1:
+            self._adjust_neighbourhood(sparse_map, keyframe)
+            poor = sparse_map.poor_points(keyframe.index - SETTLING_KEYFRAMES, MIN_FOUND_RATIO)
+            sparse_map.remove_points(poor)
+
+    def _add_new_points(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+        uvd = keyframe.observations.uvd_px
+        with np.errstate(invalid='ignore'):
+            measured = uvd[:, 2] >= MIN_DISPARITY_PX
+        rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
+        depth = self._camera.disparity_times_depth / uvd[rows, 2]
+        points = self._camera.back_project(uvd[rows, :2], depth)
+        sparse_map.add_points(keyframe, rows, transform_points(keyframe.T_world_camera, points))
+
+    def _adjust_neighbourhood(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+        free, fixed = self._choose_keyframes(sparse_map, keyframe)
+        ids = sparse_map.points_of(free)
+        edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
+        chosen = np.concatenate([free, fixed])
+        slot = np.full(len(sparse_map.keyframes), -1)
+        slot[chosen] = np.arange(len(chosen))
+        taking_part = slot[edge_keyframe] >= 0
+        edge_point, edge_keyframe, edge_row = (
+            edges[taking_part] for edges in (edge_point, edge_keyframe, edge_row)
+        )
+        problem = BundleProblem(
+            np.stack([sparse_map.keyframes[k].T_camera_world for k in chosen]),
+            len(free),
+            sparse_map.xyz_world[ids],
+            slot[edge_keyframe],
+            np.searchsorted(ids, edge_point),
+            _gather(sparse_map, edge_keyframe, edge_row),
+        )
+        result = adjust(self._camera, problem, self._settings.bundle_iterations)
+        self._write_back(sparse_map, free, ids, result)
+        self._drop_outliers(sparse_map, edge_keyframe, edge_row, result.inliers)
+
+    def _choose_keyframes(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the covisible keyframes that move and those that hold them; the first one
+        never moves.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        free = np.append(keyframe.index, near[: self._settings.local_keyframes - 1])
+        free = free[free != 0]
+        around, _ = sparse_map.covisible(sparse_map.points_of(free))
+        fixed = around[~np.isin(around, free)][: self._settings.fixed_keyframes]
+        if len(fixed) == 0:
+            fixed, free = free[-1:], free[:-1]
+        return free, fixed
+
+    def _write_back(
+        self,
+        sparse_map: SparseMap,
+        free: NDArray[np.intp],
+        ids: NDArray[np.int32],
+        result: BundleResult,
+    ) -> None:
+        for slot, k in enumerate(free):
+            sparse_map.keyframes[k].T_camera_world = result.T_camera_world[slot]
+        sparse_map.xyz_world[ids] = result.points_world
+
+    def _drop_outliers(
+        self,
+        sparse_map: SparseMap,
+        edge_keyframe: NDArray[np.int32],
+        edge_row: NDArray[np.int32],
+        inliers: NDArray[np.bool_],
+    ) -> None:
+        for k in np.unique(edge_keyframe[~inliers]):
+            rows = edge_row[~inliers & (edge_keyframe == k)]
+            sparse_map.unlink(sparse_map.keyframes[k], rows)
+
+
+def _gather(
+    sparse_map: SparseMap, edge_keyframe: NDArray[np.int32], edge_row: NDArray[np.int32]
+) -> Observations:
+    uvd: Array = np.empty((len(edge_row), 3))
+    sigma: Array = np.empty((len(edge_row), 3))
+    for k in np.unique(edge_keyframe):
+        mine = edge_keyframe == k
+        taken = sparse_map.keyframes[k].observations.take(edge_row[mine])
+        uvd[mine], sigma[mine] = taken.uvd_px, taken.sigma_px
+    return Observations(uvd, sigma)

@@ -1,0 +1,349 @@
+"""Stereo SLAM: from stereo frames to poses, keyframes and a sparse map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.geometry import Array, invert, rotation_angle, se3_exp, se3_log, transform_points
+from segfloor_ros.slam.features import FeatureExtractor, Features
+from segfloor_ros.slam.image_check import image_fault
+from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
+from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.results import (
+    NO_POINT,
+    FrameResult,
+    Keyframe,
+    KeyframeFeatures,
+    KeyframePath,
+    SparseCloud,
+)
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.tracking import Track, Tracker
+from segfloor_ros.timing import StageTimes
+
+LOCAL_MAP_KEYFRAMES = 20
+RECOVERY_KEYFRAMES = 3
+UNKNOWN_COVARIANCE = 1e6
+
+
+class MountMeter(Protocol):
+    """Measures the camera's mount from the floor it sees."""
+
+    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
+        """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
+        frame.
+        """
+
+    @property
+    def mount(self) -> Mount | None:
+        """The mount at the first frame, once it is known."""
+
+
+@dataclass(frozen=True)
+class _MapSnapshot:
+    """The map at a keyframe, in world coordinates, before the mount turns it into frame `map`."""
+
+    T_world_camera: Array
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    uv_px: NDArray[np.float32]
+    point_id: NDArray[np.int32]
+    xyz_world: Array
+    path_stamp_ns: NDArray[np.int64]
+    path_T_world_camera: Array
+    cloud_id: NDArray[np.int32]
+    cloud_xyz_world: Array
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """The outcome of a frame in optical coordinates: `odom` and `world` coincide at the first
+    frame.
+    """
+
+    index: int
+    stamp_ns: int
+    tracked: bool
+    T_odom_camera: Array
+    T_world_odom: Array
+    covariance: Array
+    num_matches: int
+    state: str
+    reference_ns: int
+    snapshot: _MapSnapshot | None
+
+
+class StereoSlam:
+    """Tracks a stereo camera and maps what it sees.
+     One call of `process` per frame, in order. Results are held back until the camera's mount is
+    known, since frame `map` lies on the floor; then all of them come at once, none is lost.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: StereoSlamSettings,
+        mount: Mount | None = None,
+        mount_meter: MountMeter | None = None,
+        times: StageTimes | None = None,
+    ) -> None:
+        self.map = SparseMap()
+        self.mount = mount
+        self._mount_meter = mount_meter
+        self._camera = camera
+        self._settings = settings
+        self._times = times or StageTimes()
+        self._extractor = FeatureExtractor(settings)
+        self._tracker = Tracker(camera, settings)
+        self._mapper = LocalMapper(camera, settings)
+        self._held: list[_Outcome] = []
+        self._T_camera_world: Array = np.eye(4)
+        self._velocity: Array = np.zeros(6)
+        self._last_stamp_ns = 0
+        self._lost = False
+        self._recovery_turn = 0
+        self._T_world_odom: Array = np.eye(4)
+        self._frames_since_keyframe = 0
+        self._local_ids: NDArray[np.int32] = np.zeros(0, np.int32)
+
+    def process(self, frame: StereoFrame) -> list[FrameResult]:
+        """Track one frame and return the results that are ready, oldest first."""
+        with self._times.measure('tracking'):
+            fault = image_fault(frame.left, frame.right)
+            left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
+            features = None if fault else self._extractor.extract(frame.left)
+            track = None
+            if features is not None and self.map.keyframes:
+                track = self._track(frame, left, right, features)
+        starts = features is not None and not self.map.keyframes
+        snapshot = None
+        if features is not None and (starts or (track and self._wants_keyframe(track))):
+            with self._times.measure('mapping'):
+                snapshot = self._add_keyframe(frame, left, right, features, track)
+        outcome = self._outcome(frame, track, fault, snapshot)
+        self._last_stamp_ns = frame.stamp_ns
+        return self._release(outcome)
+
+    def _track(
+        self,
+        frame: StereoFrame,
+        left: NDArray[np.float32],
+        right: NDArray[np.float32],
+        features: Features,
+    ) -> Track | None:
+        dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
+        predicted = se3_exp(self._velocity * dt_s) @ self._T_camera_world
+        ids = self._local_ids
+        if self._lost:
+            predicted = self._T_camera_world
+        track = self._tracker.track(left, right, features, self.map, ids, predicted)
+        if track is None and self._lost:
+            track = self._recover(left, right, features)
+        if track is None or not (self._lost or self._plausible(track, dt_s)):
+            self._lost = True
+            self._velocity = np.zeros(6)
+            return None
+        motion = se3_log(track.T_camera_world @ invert(self._T_camera_world))
+        velocity: Array = np.zeros(6) if self._lost else motion / dt_s
+        self._velocity = velocity
+        self._lost = False
+        self._T_camera_world = track.T_camera_world
+        self._local_ids = self._choose_local_points(track.point_ids)
+        self.map.note_tracking(track.visible_ids, track.point_ids)
+        self._frames_since_keyframe += 1
+        return track
+
+    def _recover(
+        self, left: NDArray[np.float32], right: NDArray[np.float32], features: Features
+    ) -> Track | None:
+        """Look for the view among the keyframes, a few per frame, the latest ones first."""
+        count = len(self.map.keyframes)
+        first = self._recovery_turn * RECOVERY_KEYFRAMES % count
+        self._recovery_turn += 1
+        turn = count - 1 - (first + np.arange(min(RECOVERY_KEYFRAMES, count))) % count
+        ids = self.map.points_of(turn)
+        observations = self._tracker.pixel_observations(features)
+        estimate = self._tracker.locate(features, observations, self.map, ids)
+        if estimate is None:
+            return None
+        ids = self._choose_local_points(ids)
+        return self._tracker.track(left, right, features, self.map, ids, estimate.T_camera_world)
+
+    def _plausible(self, track: Track, dt_s: float) -> bool:
+        motion = track.T_camera_world @ invert(self._T_camera_world)
+        speed = float(np.linalg.norm(motion[:3, 3])) / dt_s
+        turn = rotation_angle(motion[:3, :3]) / dt_s
+        return speed <= self._settings.max_speed_mps and turn <= self._settings.max_turn_radps
+
+    def _choose_local_points(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+        order, _ = self.map.covisible(ids)
+        return self.map.points_of(order[:LOCAL_MAP_KEYFRAMES])
+
+    def _wants_keyframe(self, track: Track) -> bool:
+        last = self.map.keyframes[-1]
+        known = last.point_id[last.point_id != NO_POINT]
+        reliable = self.map.observer_count[known] >= SEEN_BY_SEVERAL
+        depth = transform_points(track.T_camera_world, self.map.xyz_world[track.point_ids])[:, 2]
+        view = View(
+            self._frames_since_keyframe,
+            len(track.point_ids),
+            int(reliable.sum()),
+            last.T_camera_world @ invert(track.T_camera_world),
+            float(np.median(depth)),
+        )
+        return is_keyframe(view, self._settings)
+
+    def _add_keyframe(
+        self,
+        frame: StereoFrame,
+        left: NDArray[np.float32],
+        right: NDArray[np.float32],
+        features: Features,
+        track: Track | None,
+    ) -> _MapSnapshot:
+        right_features = self._extractor.extract(frame.right)
+        point_id = np.full(len(features), NO_POINT, np.int32)
+        if track is None:
+            observations = self._tracker.pixel_observations(features)
+        else:
+            observations = track.observations
+            point_id[track.feature_rows] = track.point_ids
+        self._mapper.measure_stereo(left, right, features, right_features, observations)
+        keyframe = KeyframeRecord(
+            len(self.map.keyframes),
+            frame.index,
+            frame.stamp_ns,
+            self._T_camera_world,
+            features,
+            observations,
+            point_id,
+        )
+        T_odom_camera = invert(self._T_world_odom) @ keyframe.T_world_camera
+        self._mapper.insert(self.map, keyframe)
+        self._T_camera_world = keyframe.T_camera_world
+        self._T_world_odom = keyframe.T_world_camera @ invert(T_odom_camera)
+        self._frames_since_keyframe = 0
+        known = keyframe.point_id[keyframe.point_id != NO_POINT]
+        self._local_ids = self._choose_local_points(known)
+        if self.mount is None and self._mount_meter is not None:
+            self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera)
+            self.mount = self._mount_meter.mount
+        return self._snapshot(frame, keyframe)
+
+    def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> _MapSnapshot:
+        cloud_id = np.flatnonzero(self.map.alive).astype(np.int32)
+        point_id = keyframe.point_id.copy()
+        xyz = np.full((len(point_id), 3), np.nan)
+        known = point_id != NO_POINT
+        xyz[known] = self.map.xyz_world[point_id[known]]
+        return _MapSnapshot(
+            keyframe.T_world_camera,
+            frame.left,
+            frame.right,
+            keyframe.features.uv_px,
+            point_id,
+            xyz,
+            np.array([k.stamp_ns for k in self.map.keyframes], np.int64),
+            np.stack([k.T_world_camera for k in self.map.keyframes]),
+            cloud_id,
+            self.map.xyz_world[cloud_id],
+        )
+
+    def _outcome(
+        self, frame: StereoFrame, track: Track | None, fault: str, snapshot: _MapSnapshot | None
+    ) -> _Outcome:
+        tracked = track is not None or snapshot is not None
+        covariance: Array = np.eye(6) * UNKNOWN_COVARIANCE
+        if track is not None:
+            covariance = track.covariance
+        elif tracked:
+            covariance = np.zeros((6, 6))
+        state = 'tracking' if tracked else f'lost: {fault or "too few known points in view"}'
+        return _Outcome(
+            frame.index,
+            frame.stamp_ns,
+            tracked,
+            invert(self._T_world_odom) @ invert(self._T_camera_world),
+            self._T_world_odom,
+            covariance,
+            len(track.point_ids) if track else 0,
+            state,
+            self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
+            snapshot,
+        )
+
+    def _release(self, outcome: _Outcome) -> list[FrameResult]:
+        self._held.append(outcome)
+        if self.mount is None:
+            return []
+        ready, self._held = self._held, []
+        return [_in_map(outcome, self.mount.T_base_left) for outcome in ready]
+
+
+def _in_map(outcome: _Outcome, T_map_world: Array) -> FrameResult:
+    """Turn optical coordinates into ROS frames; `map` is the base at the first pose, so
+    T_map_world = T_base_left.
+    """
+    T_left_base = invert(T_map_world)
+    return FrameResult(
+        outcome.index,
+        outcome.stamp_ns,
+        outcome.tracked,
+        T_map_world @ outcome.T_odom_camera @ T_left_base,
+        T_map_world @ outcome.T_world_odom @ T_left_base,
+        _covariance_of_base(outcome, T_map_world),
+        outcome.num_matches,
+        outcome.state,
+        outcome.reference_ns,
+        _keyframe_in_map(outcome, T_map_world) if outcome.snapshot else None,
+    )
+
+
+def _covariance_of_base(outcome: _Outcome, T_base_left: Array) -> Array:
+    """Carry the covariance of the camera twist to the base, in odom axes (Barfoot 2017, eq.
+    7.49: adjoint).
+    """
+    R, t = T_base_left[:3, :3], T_base_left[:3, 3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    adjoint[:3, 3:] = cross @ R
+    T_odom_base = T_base_left @ outcome.T_odom_camera @ invert(T_base_left)
+    axes = np.zeros((6, 6))
+    axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
+    A = axes @ adjoint
+    return A @ outcome.covariance @ A.T
+
+
+def _keyframe_in_map(outcome: _Outcome, T_map_world: Array) -> Keyframe:
+    snapshot = outcome.snapshot
+    assert snapshot is not None
+    T_left_base = invert(T_map_world)
+    features = KeyframeFeatures(
+        snapshot.uv_px,
+        snapshot.point_id,
+        transform_points(T_map_world, snapshot.xyz_world).astype(np.float32),
+    )
+    path = KeyframePath(
+        snapshot.path_stamp_ns, T_map_world @ snapshot.path_T_world_camera @ T_left_base
+    )
+    cloud = SparseCloud(
+        snapshot.cloud_id,
+        transform_points(T_map_world, snapshot.cloud_xyz_world).astype(np.float32),
+    )
+    return Keyframe(
+        outcome.stamp_ns,
+        outcome.index,
+        T_map_world @ snapshot.T_world_camera @ T_left_base,
+        snapshot.left,
+        snapshot.right,
+        features,
+        path,
+        cloud,
+    )

@@ -1,0 +1,43 @@
+"""How long each step takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+
+class StageTimes:
+    """Collects durations by name; one instance is shared by the stages of a run."""
+
+    def __init__(self) -> None:
+        self._durations_s: dict[str, list[float]] = {}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        """Add the time spent inside the `with` block under `name`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add(name, time.perf_counter() - start)
+
+    def add(self, name: str, duration_s: float) -> None:
+        """Add one duration in seconds."""
+        self._durations_s.setdefault(name, []).append(duration_s)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return count, mean, median, 95th percentile and maximum in milliseconds by name."""
+        table = {}
+        for name, durations in self._durations_s.items():
+            ms = 1e3 * np.array(durations)
+            table[name] = {
+                'count': len(ms),
+                'mean_ms': round(float(ms.mean()), 3),
+                'p50_ms': round(float(np.percentile(ms, 50)), 3),
+                'p95_ms': round(float(np.percentile(ms, 95)), 3),
+                'max_ms': round(float(ms.max()), 3),
+            }
+        return table
