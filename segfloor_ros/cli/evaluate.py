@@ -1,0 +1,211 @@
+"""`segfloor evaluate`: scores of maps, trajectories and floor masks against the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.evaluation.alignment import find_alignment
+from segfloor_ros.evaluation.floor import score_floor_folders
+from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, MapScore, compare, score_map
+from segfloor_ros.evaluation.overlay import save_overlay
+from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
+from segfloor_ros.evaluation.raster import from_frame
+from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
+from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
+from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.occupancy import OccupancyGrid
+
+app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
+
+JsonOption = Annotated[bool, typer.Option('--json', help='Print JSON in place of the table.')]
+
+
+@app.command('map')
+def evaluate_map(
+    estimate: Annotated[Path, typer.Argument(metavar='EST', help='map.yaml or a run folder.')],
+    truth: Annotated[Path, typer.Argument(metavar='TRUTH', help='map.yaml or a scene folder.')],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            help='Where the robot was, so that recall counts only what it could see: '
+            'base_poses.txt (t x y yaw in the frame of TRUTH) or TUM (in the frame of EST).'
+        ),
+    ] = None,
+    align: Annotated[
+        str,
+        typer.Option(
+            help='none: EST starts where the scene says, or in the frame of TRUTH; '
+            'found: searched, translation and rotation; or X,Y,YAW of the frame of EST (m, rad).'
+        ),
+    ] = 'none',
+    overlay: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
+    nodes: Annotated[
+        int, typer.Option(min=0, help='Nodes of a road map; 0: one per 1.5 m², 20 to 400.')
+    ] = 0,
+    min_distance: Annotated[
+        float, typer.Option(min=0.0, help='Between nodes of a road map [m].')
+    ] = 0.25,
+    repetitions: Annotated[int, typer.Option(min=1, help='Road maps to average.')] = 30,
+    seed: Annotated[int, typer.Option(help='Of the random nodes.')] = 0,
+    sight: Annotated[
+        float, typer.Option(min=0.1, help='How far the camera counts as seeing [m].')
+    ] = DEFAULT_RANGE_M,
+    fov: Annotated[
+        float | None, typer.Option(help='Horizontal field of view [deg]; else from the scene.')
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Road-map precision and recall, raw and after opening, and precision and recall per cell."""
+    grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
+    known = load_truth(truth)
+    pose = resolve_alignment(align, grid, known)
+    known = _with_drive(known, trajectory, fov, pose)
+    plan = RoadMapPlan(nodes=nodes, min_distance_m=min_distance, repetitions=repetitions, seed=seed)
+    score = score_map(grid, known, pose, plan, sight)
+    if overlay is not None:
+        save_overlay(compare(grid, known, pose, sight), overlay)
+    if as_json:
+        _print_json(score.as_dict())
+        return
+    Console().print(map_table(score))
+    if overlay is not None:
+        typer.echo(f'overlay: {overlay}')
+
+
+@app.command('trajectory')
+def evaluate_trajectory(
+    estimate: Annotated[
+        Path, typer.Argument(metavar='EST', help='TUM or KITTI file, or a run folder.')
+    ],
+    truth: Annotated[
+        Path, typer.Argument(metavar='TRUTH', help='TUM or KITTI file, or a recording folder.')
+    ],
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, help='Frames of the recording; else one per true pose.'),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """ATE and RPE after rigid alignment, with the share of frames that were tracked."""
+    matched = match_files(estimate, truth, frames)
+    score = score_trajectory(matched)
+    if plot is not None:
+        save_trajectory_plot(matched, plot)
+    if as_json:
+        _print_json(score.as_dict())
+        return
+    table = Table('measure', 'value', 'unit')
+    table.columns[1].justify = 'right'
+    table.add_row('frames tracked', f'{100 * score.tracked:.1f}', '%')
+    table.add_row('  of', str(score.frames), 'frames')
+    table.add_row('path length', f'{score.path_length_m:.2f}', 'm')
+    table.add_row('ATE (RMSE, aligned)', f'{score.ate_rmse_m:.4f}', 'm')
+    table.add_row('ATE (largest)', f'{score.ate_max_m:.4f}', 'm')
+    table.add_row('RPE over 1 m', f'{score.rpe_translation_m:.4f}', 'm')
+    table.add_row('RPE over 1 m', f'{score.rpe_rotation_rad:.5f}', 'rad')
+    table.add_row('error at the end', f'{score.end_error_m:.4f}', 'm')
+    Console().print(table)
+    if plot is not None:
+        typer.echo(f'plot: {plot}')
+
+
+@app.command('floor')
+def evaluate_floor(
+    estimate: Annotated[
+        Path, typer.Argument(metavar='EST_DIR', help='Folder of masks, or a run folder.')
+    ],
+    truth: Annotated[
+        Path, typer.Argument(metavar='TRUTH_DIR', help='Folder of masks, or a scene folder.')
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Precision, recall, intersection over union and coverage of floor masks."""
+    score = score_floor_folders(estimate, truth)
+    if as_json:
+        _print_json(score.as_dict())
+        return
+    table = Table('measure', 'value', 'unit')
+    table.columns[1].justify = 'right'
+    for name in ('precision', 'recall', 'iou', 'coverage'):
+        table.add_row(name, f'{100 * getattr(score, name):.2f}', '%')
+    table.add_row('masks scored', str(score.masks), '')
+    table.add_row('true masks without an estimate', str(score.missing), '')
+    Console().print(table)
+
+
+def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> Pose2d:
+    """Return where the estimate's frame lies in the truth's, as `--align` says."""
+    if align == 'none':
+        return truth.start_pose or (0.0, 0.0, 0.0)
+    if align == 'found':
+        return find_alignment(estimate, truth.grid, truth.start_pose)
+    try:
+        x, y, yaw = (float(part) for part in align.split(','))
+    except ValueError:
+        raise SettingsError(
+            f'--align {align}: expected none, found or X,Y,YAW in metres and radians'
+        ) from None
+    return x, y, yaw
+
+
+def map_table(score: MapScore) -> Table:
+    """Return the score of a map as a table for the terminal."""
+    title = 'map, floor the drive could see' if score.observable_only else 'map, whole floor'
+    table = Table('measure', 'precision %', 'recall %', title=f'{title}: {score.area_m2:.1f} m²')
+    for column in table.columns[1:]:
+        column.justify = 'right'
+    for name, road_map in (('raw', score.raw), ('after opening', score.opened)):
+        table.add_row(
+            f'road map, {name} (±: over repetitions)',
+            _percent(road_map.precision),
+            _percent(road_map.recall),
+        )
+    cells = score.cells
+    table.add_row(
+        'free cells', f'{100 * cells.free_precision:.2f}', f'{100 * cells.free_recall:.2f}'
+    )
+    table.add_row(
+        'occupied cells',
+        f'{100 * cells.occupied_precision:.2f}',
+        f'{100 * cells.occupied_recall:.2f}',
+    )
+    x, y, yaw = score.alignment
+    table.caption = (
+        f'{score.nodes} nodes; frame of EST at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.4f} rad'
+    )
+    return table
+
+
+def _with_drive(
+    truth: MapTruth, trajectory: Path | None, fov_deg: float | None, pose: Pose2d
+) -> MapTruth:
+    """Return the truth with the drive and field of view of the command line, where given."""
+    if trajectory is not None:
+        poses = read_base_poses(trajectory)
+        if read_table(trajectory).shape[1] == TUM_COLUMNS:
+            poses[:, :2] = from_frame(poses[:, :2], pose)
+            poses[:, 2] += pose[2]
+        truth = dataclasses.replace(truth, base_poses=poses)
+    if fov_deg is not None:
+        truth = dataclasses.replace(truth, fov_rad=math.radians(fov_deg))
+    return truth
+
+
+def _percent(spread: Spread) -> str:
+    return f'{100 * spread.mean:.2f} ± {100 * spread.std:.2f}'
+
+
+def _print_json(values: dict[str, Any]) -> None:
+    typer.echo(json.dumps(values, indent=2))

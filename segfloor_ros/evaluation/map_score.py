@@ -1,0 +1,141 @@
+"""The score of an occupancy map against the true one: road maps and cells."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.evaluation.prm import RoadMapPlan, RoadMapScore, score_road_maps
+from segfloor_ros.evaluation.raster import FREE, OCCUPIED, Mask, observable, resample, states
+from segfloor_ros.evaluation.truth import MapTruth, Pose2d
+from segfloor_ros.grid.occupancy import OccupancyGrid
+
+DEFAULT_RANGE_M = 5.0
+DEFAULT_TOLERANCE_M = 0.1
+
+
+@dataclass(frozen=True)
+class CellScore:
+    """Shares of cells. free_precision: of the cells called free that are. free_recall: of the
+    wanted floor that is called free. occupied_precision and occupied_recall: of the obstacle
+    cells, those with one of the other map within the tolerance.
+    """
+
+    free_precision: float
+    free_recall: float
+    occupied_precision: float
+    occupied_recall: float
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """Everything about one estimated map. raw and opened: road map scores of the free cells as
+    they are and after a morphological opening (3x3). observable_only: recall counts only what
+    the drive could see. alignment: where the estimate's frame lies in the truth's.
+    """
+
+    raw: RoadMapScore
+    opened: RoadMapScore
+    cells: CellScore
+    nodes: int
+    area_m2: float
+    observable_only: bool
+    alignment: Pose2d
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the score as nested plain numbers."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both maps on the truth's raster: states (rows, columns) int8, the floor that counts for
+    recall and the obstacles that do.
+    """
+
+    estimate: NDArray[np.int8]
+    truth: NDArray[np.int8]
+    wanted_floor: Mask
+    wanted_obstacles: Mask
+    resolution_m: float
+
+
+def compare(
+    estimate: OccupancyGrid,
+    truth: MapTruth,
+    alignment: Pose2d,
+    range_m: float = DEFAULT_RANGE_M,
+) -> Comparison:
+    """Bring the estimate onto the truth's raster. Where the drive is known, only what it could
+    see within `range_m` counts for recall.
+    """
+    true_states = states(truth.grid)
+    floor, obstacles = true_states == FREE, true_states == OCCUPIED
+    if truth.base_poses is not None:
+        floor, obstacles = observable(truth.grid, truth.base_poses, truth.fov_rad, range_m)
+    return Comparison(
+        resample(estimate, truth.grid, alignment),
+        true_states,
+        floor,
+        obstacles,
+        truth.grid.resolution_m,
+    )
+
+
+def score_map(
+    estimate: OccupancyGrid,
+    truth: MapTruth,
+    alignment: Pose2d = (0.0, 0.0, 0.0),
+    plan: RoadMapPlan | None = None,
+    range_m: float = DEFAULT_RANGE_M,
+    tolerance_m: float = DEFAULT_TOLERANCE_M,
+) -> MapScore:
+    """Score an estimated map whose frame lies at `alignment` in the truth's frame."""
+    plan = plan or RoadMapPlan()
+    maps = compare(estimate, truth, alignment, range_m)
+    free = maps.estimate == FREE
+    area_m2 = float(maps.wanted_floor.sum()) * maps.resolution_m**2
+    road_maps = [
+        score_road_maps(part, maps.truth == FREE, maps.wanted_floor, maps.resolution_m, plan)
+        for part in (free, opened(free))
+    ]
+    return MapScore(
+        road_maps[0],
+        road_maps[1],
+        score_cells(maps, tolerance_m),
+        plan.nodes_for(area_m2),
+        area_m2,
+        truth.base_poses is not None,
+        alignment,
+    )
+
+
+def opened(mask: Mask) -> Mask:
+    """Return a mask without its lone rays and specks: erosion and dilation by 3x3 cells."""
+    kernel = np.ones((3, 3), np.uint8)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+
+
+def score_cells(maps: Comparison, tolerance_m: float = DEFAULT_TOLERANCE_M) -> CellScore:
+    """Return precision and recall per cell, obstacles within `tolerance_m` of each other."""
+    free, occupied = maps.estimate == FREE, maps.estimate == OCCUPIED
+    reach = 2 * round(tolerance_m / maps.resolution_m) + 1
+    return CellScore(
+        free_precision=_share(maps.truth == FREE, free),
+        free_recall=_share(free, maps.wanted_floor),
+        occupied_precision=_share(_grown(maps.truth == OCCUPIED, reach), occupied),
+        occupied_recall=_share(_grown(occupied, reach), maps.wanted_obstacles),
+    )
+
+
+def _share(true_where: Mask, among: Mask) -> float:
+    total = int(among.sum())
+    return float((true_where & among).sum()) / total if total else 0.0
+
+
+def _grown(mask: Mask, side: int) -> Mask:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0

@@ -1,0 +1,172 @@
+"""The error of an estimated trajectory against the true one, computed by evo."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from evo.core import metrics, sync
+from evo.core.filters import FilterException
+from evo.core.trajectory import PoseTrajectory3D
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.geometry import Array, invert, make_transform
+
+MAX_STAMP_DIFFERENCE_S = 0.02
+RPE_STEP_M = 1.0
+MIN_MATCHES = 3
+
+
+@dataclass(frozen=True)
+class TrajectoryScore:
+    """ATE: RMSE and maximum of the distances after the best rigid alignment (no scale). RPE: RMSE
+    of the motion over one metre, NaN for shorter paths. end_error_m: distance at the last common
+    pose when the first common poses are laid on each other. tracked: share of the true poses
+    that have an estimate.
+    """
+
+    tracked: float
+    matched: int
+    frames: int
+    path_length_m: float
+    ate_rmse_m: float
+    ate_max_m: float
+    rpe_translation_m: float
+    rpe_rotation_rad: float
+    end_error_m: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the score as plain numbers."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class MatchedTrajectories:
+    """Poses (N, 4, 4) at common times (N,) in seconds, the estimate as it came and laid on the
+    truth, and the number of frames there should be.
+    """
+
+    times_s: Array
+    truth: Array
+    estimate: Array
+    aligned: Array
+    frames: int
+
+
+def match_files(estimate: Path, truth: Path, frames: int | None = None) -> MatchedTrajectories:
+    """Read two trajectories and match them by time. frames: how many the recording has; without
+    it, one per true pose, or fewer where the truth is denser than the estimate.
+
+    A folder stands for its camera_trajectory.txt (a run) or poses.txt (a recording). Raises
+    InputError when fewer than three poses match.
+    """
+    estimate_file = _file_in(estimate, 'camera_trajectory.txt')
+    truth_file = _file_in(truth, 'poses.txt')
+    estimated, true = read_trajectory(estimate_file), read_trajectory(truth_file)
+    return match(estimated, true, frames or _expected_frames(estimated[0], true[0]))
+
+
+def match(
+    estimated: tuple[Array, Array], true: tuple[Array, Array], frames: int
+) -> MatchedTrajectories:
+    """Match two trajectories (times (N,), poses (N, 4, 4)) by time and align them rigidly."""
+    evo_truth, evo_estimate = (
+        PoseTrajectory3D(poses_se3=list(poses), timestamps=times)
+        for times, poses in (true, estimated)
+    )
+    try:
+        evo_truth, evo_estimate = sync.associate_trajectories(
+            evo_truth, evo_estimate, max_diff=MAX_STAMP_DIFFERENCE_S
+        )
+    except sync.SyncException:
+        evo_truth.reduce_to_ids([])
+    if evo_truth.num_poses < MIN_MATCHES:
+        raise InputError(
+            f'only {evo_truth.num_poses} poses of the two trajectories are within '
+            f'{MAX_STAMP_DIFFERENCE_S} s of each other: are both of the same recording?'
+        )
+    matched_truth, matched_estimate = (
+        np.array(evo_truth.poses_se3),
+        np.array(evo_estimate.poses_se3),
+    )
+    T_truth_estimate = rigid_alignment(matched_estimate[:, :3, 3], matched_truth[:, :3, 3])
+    return MatchedTrajectories(
+        np.asarray(evo_truth.timestamps),
+        matched_truth,
+        matched_estimate,
+        T_truth_estimate @ matched_estimate,
+        frames,
+    )
+
+
+def rigid_alignment(points_a: Array, points_b: Array) -> Array:
+    """Return the `T_b_a` (4, 4) that brings points (N, 3) nearest to others (N, 3) in the sense of
+    least squares. On a straight path, where the roll about it is free, it is one of the best.
+
+    Umeyama, Least-squares estimation of transformation parameters, PAMI 1991, eq. 40-41, no scale.
+    """
+    mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points_b - mean_b).T @ (points_a - mean_a))
+    handedness = np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
+    rotation = U @ handedness @ Vt
+    return make_transform(rotation, mean_b - rotation @ mean_a)
+
+
+def score_trajectory(matched: MatchedTrajectories) -> TrajectoryScore:
+    """Score matched trajectories."""
+    distances = np.linalg.norm(matched.aligned[:, :3, 3] - matched.truth[:, :3, 3], axis=1)
+    ate = _statistics(metrics.APE(metrics.PoseRelation.translation_part), matched)
+    count = len(matched.truth)
+    return TrajectoryScore(
+        tracked=min(1.0, count / matched.frames),
+        matched=count,
+        frames=matched.frames,
+        path_length_m=_path_length(matched.truth),
+        ate_rmse_m=ate,
+        ate_max_m=float(distances.max()),
+        rpe_translation_m=_relative(metrics.PoseRelation.translation_part, matched),
+        rpe_rotation_rad=_relative(metrics.PoseRelation.rotation_angle_rad, matched),
+        end_error_m=_end_error(matched),
+    )
+
+
+def _relative(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> float:
+    metric = metrics.RPE(relation, RPE_STEP_M, metrics.Unit.meters, all_pairs=True)
+    try:
+        return _statistics(metric, matched)
+    except (metrics.MetricsException, FilterException):
+        return float('nan')
+
+
+def _statistics(metric: metrics.PE, matched: MatchedTrajectories) -> float:
+    pair = tuple(
+        PoseTrajectory3D(poses_se3=list(poses), timestamps=matched.times_s)
+        for poses in (matched.truth, matched.aligned)
+    )
+    metric.process_data(pair)
+    return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+
+def _end_error(matched: MatchedTrajectories) -> float:
+    ends = [invert(poses[0]) @ poses[-1] for poses in (matched.truth, matched.estimate)]
+    return float(np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]))
+
+
+def _path_length(poses: Array) -> float:
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def _expected_frames(estimated_s: Array, true_s: Array) -> int:
+    if len(estimated_s) < 2 or len(true_s) < 2:
+        return len(true_s)
+    period_s = float(np.median(np.diff(estimated_s)))
+    if float(np.median(np.diff(true_s))) > 0.75 * period_s:
+        return len(true_s)
+    return round(float(true_s[-1] - true_s[0]) / period_s) + 1
+
+
+def _file_in(path: Path, name: str) -> Path:
+    return path / name if path.is_dir() else path

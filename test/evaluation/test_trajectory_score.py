@@ -1,0 +1,134 @@
+"""Trajectory files and errors worked out by hand."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
+from segfloor_ros.geometry import se3_exp
+
+
+def drive(count=101, step_m=0.1) -> np.ndarray:
+    """Return poses (N, 4, 4) of a straight drive along x."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count) * step_m
+    return poses
+
+
+def write_tum(path, poses, times=None):
+    times = np.arange(len(poses)) * 0.1 if times is None else times
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    np.savetxt(path, np.column_stack([times, poses[:, :3, 3], quaternions]))
+    return path
+
+
+def score(tmp_path, estimate, truth, times=None):
+    estimate_file = write_tum(tmp_path / 'estimate.txt', estimate, times)
+    truth_file = write_tum(tmp_path / 'truth.txt', truth)
+    return score_trajectory(match_files(estimate_file, truth_file))
+
+
+def test_perfect_trajectory(tmp_path):
+    result = score(tmp_path, drive(), drive())
+    assert result.tracked == 1.0
+    assert result.path_length_m == pytest.approx(10.0)
+    for error in (
+        result.ate_rmse_m,
+        result.ate_max_m,
+        result.rpe_translation_m,
+        result.end_error_m,
+    ):
+        assert error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_rigid_motion_of_the_whole_path_costs_nothing(tmp_path):
+    moved = se3_exp(np.array([1.0, -2.0, 0.5, 0.2, -0.1, 0.7])) @ drive()
+    result = score(tmp_path, moved, drive())
+    assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert result.end_error_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_scale_is_not_corrected(tmp_path):
+    longer = drive()
+    longer[:, 0, 3] *= 1.01
+    result = score(tmp_path, longer, drive())
+    x = np.arange(101) * 0.1
+    assert result.end_error_m == pytest.approx(0.1)
+    assert result.ate_rmse_m == pytest.approx(0.01 * x.std())
+    assert result.ate_max_m == pytest.approx(0.01 * 5.0)
+    assert result.rpe_translation_m == pytest.approx(0.01, rel=0.15)
+
+
+def test_lost_frames_are_reported(tmp_path):
+    kept = np.r_[0:30, 60:101]
+    result = score(tmp_path, drive()[kept], drive(), times=kept * 0.1)
+    assert result.matched == 71
+    assert result.frames == 101
+    assert result.tracked == pytest.approx(71 / 101)
+
+
+def test_denser_truth_does_not_count_as_lost_frames(tmp_path):
+    write_tum(tmp_path / 'truth.txt', drive(401, 0.025), np.arange(401) * 0.025)
+    write_tum(tmp_path / 'estimate.txt', drive())
+    matched = match_files(tmp_path / 'estimate.txt', tmp_path / 'truth.txt')
+    assert matched.frames == 101
+    assert score_trajectory(matched).tracked == 1.0
+
+
+def test_short_path_has_no_error_over_a_metre(tmp_path):
+    result = score(tmp_path, drive(6), drive(6))
+    assert np.isnan(result.rpe_translation_m)
+    assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_kitti_and_tum_agree(tmp_path):
+    poses = se3_exp(np.random.default_rng(0).normal(size=(20, 6)) * 0.3)
+    np.savetxt(tmp_path / 'poses.txt', poses[:, :3].reshape(-1, 12))
+    np.savetxt(tmp_path / 'times.txt', np.arange(20) * 0.1)
+    write_tum(tmp_path / 'tum.txt', poses)
+    for from_kitti, from_tum in zip(
+        read_trajectory(tmp_path / 'poses.txt'), read_trajectory(tmp_path / 'tum.txt'), strict=True
+    ):
+        np.testing.assert_allclose(from_kitti, from_tum, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        ('', 'empty'),
+        ('1 2 3\n', 'has 3 columns'),
+        ('a b c d e f g h\n', 'not a table of numbers'),
+        ('0 0 0 0 0 0 0 1\n0 1 0 0 0 0 0 1\n', 'must increase'),
+        ('0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 0\n', 'row 2: the quaternion'),
+        ('0 nan 0 0 0 0 0 1\n', 'not finite'),
+    ],
+)
+def test_malformed_files_name_what_is_wrong(tmp_path, content, message):
+    path = tmp_path / 'bad.txt'
+    path.write_text(content)
+    with pytest.raises(InputError, match=message) as error:
+        read_trajectory(path)
+    assert 'bad.txt' in str(error.value)
+
+
+def test_missing_file_and_missing_times_are_named(tmp_path):
+    with pytest.raises(InputError, match=r'none\.txt'):
+        read_trajectory(tmp_path / 'none.txt')
+    np.savetxt(tmp_path / 'poses.txt', drive(3)[:, :3].reshape(-1, 12))
+    with pytest.raises(InputError, match=r'times\.txt'):
+        read_trajectory(tmp_path / 'poses.txt')
+
+
+def test_trajectories_of_different_times_are_refused(tmp_path):
+    with pytest.raises(InputError, match='only 0 poses'):
+        score(tmp_path, drive(10), drive(10), times=1000.0 + np.arange(10))
+
+
+def test_plot_is_a_picture(tmp_path):
+    write_tum(tmp_path / 'a.txt', drive())
+    matched = match_files(tmp_path / 'a.txt', tmp_path / 'a.txt')
+    save_trajectory_plot(matched, tmp_path / 'plot.png')
+    assert (tmp_path / 'plot.png').read_bytes().startswith(b'\x89PNG')
