@@ -19,12 +19,13 @@ def refine_disparity(
     guess_px: NDArray[np.floating],
     reach_px: int,
 ) -> tuple[Array, Array]:
-    """Find the disparity of each feature within `reach_px` of a guess, to a fraction of a pixel.
-     left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image. guess_px: (N,).
-    The patch is compared by zero-mean normalised cross-correlation, which a difference in gain or
-    brightness between the cameras does not change; the peak is refined by a parabola. Returns
-    disparity (N,), NaN where there is no clear peak inside the reach or the patch leaves the
-    image, and the standard deviation (N,) in pixels as the peak's sharpness gives it.
+    """Find the disparity of each feature within `reach_px` of a guess, to a fraction of a
+    pixel. left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image.
+    guess_px: (N,). The patch is compared by zero-mean normalised cross-correlation, which a
+    difference in gain or brightness between the cameras does not change; the peak is refined
+    by a parabola. Returns disparity (N,), NaN where there is no clear peak inside the reach or
+    the patch leaves the image, and the standard deviation (N,) in pixels as the peak's
+    sharpness gives it.
     """
     disparity = np.full(len(uv_px), np.nan)
     sigma = np.full(len(uv_px), np.nan)

@@ -138,10 +138,8 @@ class StereoSlam:
         features: Features,
     ) -> Track | None:
         dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
-        predicted = se3_exp(self._velocity * dt_s) @ self._T_camera_world
+        predicted: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
         ids = self._local_ids
-        if self._lost:
-            predicted = self._T_camera_world
         track = self._tracker.track(left, right, features, self.map, ids, predicted)
         if track is None and self._lost:
             track = self._recover(left, right, features)

@@ -1,0 +1,46 @@
+"""The `segfloor` command."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import typer
+
+from segfloor_ros.cli.output import print_error
+from segfloor_ros.cli.run import run
+from segfloor_ros.errors import MapError, SegfloorError
+
+app = typer.Typer(
+    help='Occupancy maps for ground robots from a stereo camera alone.',
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(run)
+
+
+@app.callback()
+def _options() -> None:
+    """Occupancy maps for ground robots from a stereo camera alone."""
+
+
+def main() -> None:
+    """Run the command line; known errors print one line. Status 2: bad input; 1: no map came
+    of it.
+    """
+    logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
+    try:
+        app()
+    except MapError as error:
+        print_error(str(error))
+        sys.exit(1)
+    except SegfloorError as error:
+        print_error(str(error))
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == '__main__':
+    main()

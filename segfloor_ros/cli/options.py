@@ -1,0 +1,21 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+InputArgument = Annotated[
+    str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')
+]
+OutOption = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
+ParamsOption = Annotated[
+    Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
+    typer.Option('--params', help='ROS parameter file (YAML) for all stages.'),
+]
+SetOption = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option('--set', help='One parameter, e.g. occupancy_grid.resolution_m=0.02; repeatable.'),
+]

@@ -1,0 +1,36 @@
+"""`segfloor run`: a recording through the pipeline in lockstep."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
+from segfloor_ros.cli.output import console, print_summary, progress_bar
+from segfloor_ros.configuration import resolve
+from segfloor_ros.lockstep import LockstepRun, SaveMasks
+from segfloor_ros.recording import OutputFolder
+
+
+def run(
+    input: InputArgument,
+    out: OutOption,
+    params: ParamsOption = None,
+    assignments: SetOption = None,
+    save_masks: Annotated[
+        SaveMasks, typer.Option(help='Floor masks to save.')
+    ] = SaveMasks.keyframes,
+) -> None:
+    """Map a recording: every frame, no ROS graph, the same result byte for byte."""
+    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
+    source = open_source(configuration.stereo_camera)
+    with OutputFolder(out) as folder:
+        with progress_bar('mapping', source.frame_count) as progress:
+            result = LockstepRun(source, configuration, folder, save_masks).execute(
+                lambda done, state: progress.update(0, completed=done, note=state)
+            )
+        folder.write(result)
+    print_summary(input, result.summary)
+    console.print(f'map: {out / "map.yaml"}', highlight=False)

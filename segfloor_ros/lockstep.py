@@ -1,0 +1,160 @@
+"""A whole recording through the pipeline, frame by frame, to a results folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from enum import Enum
+
+import numpy as np
+
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.sources import StereoSource
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import MapError
+from segfloor_ros.floor.observation import FloorObservation
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.memory import MemoryLog
+from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.recording import OutputFolder, RunResult, RunSummary, lost_intervals
+from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
+from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
+
+ProgressListener = Callable[[int, str], None]
+"""Told after every frame: how many are done, and the state in words."""
+
+
+class SaveMasks(str, Enum):
+    """Of which frames the floor masks are kept."""
+
+    none = 'none'
+    keyframes = 'keyframes'
+    all = 'all'
+
+
+class LockstepRun:
+    """One run of a source through the pipeline, with everything noted that the results folder
+    needs.
+    """
+
+    def __init__(
+        self,
+        source: StereoSource,
+        configuration: Configuration,
+        folder: OutputFolder,
+        save_masks: SaveMasks = SaveMasks.keyframes,
+    ) -> None:
+        self._source = source
+        self._configuration = configuration
+        self._folder = folder
+        self._save_masks = save_masks
+        self._memory = MemoryLog()
+        self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
+        # Masks of other frames come from a segmentation of their own, which the map does not hear of.
+        self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
+        self._unmasked: list[StereoFrame] = []
+        self._results: list[FrameResult] = []
+        self._frames = 0
+        self._path: KeyframePath | None = None
+
+    def execute(self, on_progress: ProgressListener | None = None) -> RunResult:
+        """Process every frame and return the result; an interrupt (Ctrl-C) ends the run early
+        and keeps the map.
+
+        Raises MapError when no map came of it.
+        """
+        start = time.perf_counter()
+        try:
+            self._process_frames(on_progress)
+            grid = self._pipeline.finish()
+        finally:
+            self._pipeline.close()
+        wall_s = time.perf_counter() - start
+        mount, labelled, path = self._pipeline.mount, self._pipeline.labelled, self._path
+        if grid is None or mount is None or labelled is None or path is None:
+            raise MapError(self._why_no_map())
+        poses = [
+            TrackedPose(result.stamp_ns, result.T_odom_base, result.reference_keyframe_ns)
+            for result in self._results
+            if result.tracked
+        ]
+        return RunResult(
+            grid,
+            corrected_trajectory(poses, path),
+            Trajectory(path.stamp_ns, path.T_map_base),
+            labelled,
+            mount,
+            self._summary(wall_s),
+            self._configuration,
+        )
+
+    def _process_frames(self, on_progress: ProgressListener | None) -> None:
+        try:
+            for frame in self._source.frames():
+                self._frames += 1
+                if self._save_masks is SaveMasks.all:
+                    self._unmasked.append(frame)
+                for result in self._pipeline.process(frame):
+                    self._note(result)
+                if on_progress is not None:
+                    state = self._results[-1].state if self._results else 'looking for the floor'
+                    on_progress(self._frames, state)
+        except KeyboardInterrupt:
+            return
+
+    def _note(self, result: FrameResult) -> None:
+        if self._save_masks is SaveMasks.all:
+            self._mask_frame(self._unmasked.pop(0), result)
+        if result.keyframe is not None:
+            self._path = result.keyframe.path
+            result = dataclasses.replace(result, keyframe=None)
+        self._results.append(result)
+
+    def _mask_frame(self, frame: StereoFrame, result: FrameResult) -> None:
+        if result.keyframe is not None:
+            return
+        assert self._pipeline.mount is not None
+        T_map_base = result.T_map_odom @ result.T_odom_base if result.tracked else None
+        floor = self._other_frames.process(
+            frame.left, frame.right, self._pipeline.mount, T_map_base
+        )
+        self._folder.add_mask(frame.index, floor.mask)
+
+    def _on_keyframe(self, keyframe: Keyframe, floor: FloorObservation) -> None:
+        self._memory.sample()
+        if self._save_masks is not SaveMasks.none:
+            self._folder.add_mask(keyframe.frame_index, floor.mask)
+
+    def _why_no_map(self) -> str:
+        name = self._configuration.stereo_camera.input
+        if self._frames == 0:
+            return f'{name}: no frame could be read, so there is no map'
+        if self._pipeline.mount is None:
+            return (
+                f'{name}: no floor was recognised in {self._frames} frames, so the height of the '
+                'camera is unknown; give stereo_slam.camera_height_m, camera_pitch_rad and '
+                'camera_roll_rad'
+            )
+        return f'{name}: none of {self._frames} frames could be tracked, so there is no map'
+
+    def _summary(self, wall_s: float) -> RunSummary:
+        tracked = np.array([result.tracked for result in self._results], bool)
+        mount = self._pipeline.mount
+        assert mount is not None
+        return RunSummary(
+            frames=self._frames,
+            tracked_frames=int(tracked.sum()),
+            skipped_frames=self._source.skipped_frames,
+            lost_intervals=lost_intervals([r.index for r in self._results], tracked),
+            keyframes=len(self._pipeline.slam.map.keyframes),
+            loops=0,
+            map_updates=self._pipeline.map_updates,
+            wall_s=round(wall_s, 3),
+            frames_per_s=round(self._frames / wall_s, 2),
+            camera_height_m=round(mount.height_m, 4),
+            camera_pitch_rad=round(mount.pitch_rad, 5),
+            camera_roll_rad=round(mount.roll_rad, 5),
+            stages=self._pipeline.times.summary(),
+            rss_mb=self._memory.summary(),
+        )

@@ -1,0 +1,177 @@
+"""The results folder of a run: maps, trajectories, cloud, masks, summary and settings.
+ Everything is written to a hidden folder beside the target and moved in at the end, so that a
+run that fails leaves nothing half-written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.ply import write_ply
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import InputError
+from segfloor_ros.grid.map_file import save_map
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.trajectory import Trajectory, write_tum
+
+OUTPUT_NAMES = (
+    'map.pgm',
+    'map.yaml',
+    'trajectory.txt',
+    'keyframes.txt',
+    'camera_trajectory.txt',
+    'labelled_cloud.ply',
+    'floor_masks',
+    'summary.json',
+    'settings.yaml',
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSummary:
+    """The figures of a run, as written to summary.json.
+     lost_intervals: first and last frame number of every stretch without a pose. stages: by name
+    count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update in MB.
+    """
+
+    frames: int
+    tracked_frames: int
+    skipped_frames: int
+    lost_intervals: list[tuple[int, int]]
+    keyframes: int
+    loops: int
+    map_updates: int
+    wall_s: float
+    frames_per_s: float
+    camera_height_m: float
+    camera_pitch_rad: float
+    camera_roll_rad: float
+    stages: dict[str, dict[str, float]]
+    rss_mb: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """What a run leaves behind. trajectory, keyframes: `base_link` in `map`."""
+
+    grid: OccupancyGrid
+    trajectory: Trajectory
+    keyframes: Trajectory
+    labelled: LabelledPoints
+    mount: Mount
+    summary: RunSummary
+    configuration: Configuration
+
+
+def lost_intervals(
+    frame_indices: Sequence[int], tracked: NDArray[np.bool_]
+) -> list[tuple[int, int]]:
+    """Return the first and last frame number of every stretch without a pose; both inputs are
+    (N,).
+    """
+    lost = np.concatenate([[False], ~np.asarray(tracked, bool), [False]])
+    edges = np.flatnonzero(np.diff(lost.astype(np.int8)))
+    return [
+        (int(frame_indices[start]), int(frame_indices[end - 1]))
+        for start, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+class OutputFolder:
+    """A results folder in the making; used as a context manager, it appears only when `write`
+    was called.
+    """
+
+    def __init__(self, target: Path) -> None:
+        if target.exists() and not target.is_dir():
+            raise InputError(f'{target}: exists and is no folder; choose another --out')
+        self._target = target
+        self._staging: Path | None = None
+
+    def __enter__(self) -> OutputFolder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._staging is not None:
+            shutil.rmtree(self._staging, ignore_errors=True)
+
+    def add_mask(self, frame_index: int, mask: NDArray[np.uint8]) -> None:
+        """Keep the floor mask (H, W) of a frame."""
+        folder = self._open() / 'floor_masks'
+        folder.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / f'{frame_index:06d}.png'), mask)
+
+    def write(self, result: RunResult) -> None:
+        """Write every file and move them into place, replacing the files of an earlier run."""
+        staging = self._open()
+        save_map(result.grid, staging / 'map.yaml')
+        write_tum(staging / 'trajectory.txt', result.trajectory)
+        write_tum(staging / 'keyframes.txt', result.keyframes)
+        camera = result.trajectory.seen_from(result.mount.T_base_left)
+        write_tum(staging / 'camera_trajectory.txt', camera)
+        write_ply(staging / 'labelled_cloud.ply', result.labelled)
+        summary = json.dumps(dataclasses.asdict(result.summary), indent=2)
+        (staging / 'summary.json').write_text(summary + '\n')
+        settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
+        (staging / 'settings.yaml').write_text(settings)
+        self._move_into_place(staging)
+
+    def _open(self) -> Path:
+        if self._staging is None:
+            parent = self._target.absolute().parent
+            try:
+                parent.mkdir(parents=True, exist_ok=True)
+                self._staging = Path(tempfile.mkdtemp(prefix='.segfloor-', dir=parent))
+            except OSError as error:
+                raise InputError(
+                    f'{parent}: cannot write there ({error.strerror}); choose another --out'
+                ) from None
+        return self._staging
+
+    def _move_into_place(self, staging: Path) -> None:
+        self._target.mkdir(exist_ok=True)
+        for name in OUTPUT_NAMES:
+            old = self._target / name
+            if old.is_dir():
+                shutil.rmtree(old)
+            if (staging / name).exists():
+                os.replace(staging / name, old)
+
+
+def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Return the summary as (what, value with unit) for people."""
+    tracked = f'{summary.tracked_frames} of {summary.frames}'
+    lost = ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'
+    rows: list[tuple[str, Any]] = [
+        ('frames tracked', tracked),
+        ('frames lost', lost),
+        ('frames skipped (unreadable)', summary.skipped_frames),
+        ('keyframes', summary.keyframes),
+        ('map updates', summary.map_updates),
+        ('camera height', f'{summary.camera_height_m:.3f} m'),
+        ('camera pitch', f'{np.degrees(summary.camera_pitch_rad):.2f} deg'),
+        ('time', f'{summary.wall_s:.1f} s ({summary.frames_per_s:.1f} frames/s)'),
+        ('memory, peak', f'{summary.rss_mb["peak"]:.0f} MB'),
+        ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
+    ]
+    return [(what, str(value)) for what, value in rows]
