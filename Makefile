@@ -1,0 +1,51 @@
+# make        everything needed, in .venv        make test   style, types and all tests
+# make demo   record a drive, map it, score it   make lint   style and types only
+# PYTHON=/path/to/python chooses the interpreter (3.10 or newer).
+
+CANDIDATES := $(PYTHON) python3 python3.12 python3.11 python3.13 python3.10
+OLD_ENOUGH := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info < (3, 14))
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CODE := segfloor_ros test launch_configs docs setup.py
+
+.PHONY: all test demo lint format docs clean
+
+all: $(STAMP)
+
+$(VENV)/bin/python:
+	@for python in $(CANDIDATES); do \
+	  if "$$python" -c '$(OLD_ENOUGH)' 2>/dev/null; then \
+	    echo "making $(VENV) with $$python"; exec "$$python" -m venv --clear $(VENV); \
+	  fi; \
+	done; \
+	echo 'no Python 3.10 to 3.13 with venv was found; name one: make PYTHON=/path/to/python' >&2; \
+	exit 1
+
+$(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt \
+	  pip setuptools wheel
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt \
+	  --no-build-isolation -e '.[ros,cli,sim,dev]'
+	@touch $@
+
+test: $(STAMP) lint
+	$(BIN)/python -m pytest
+
+demo: $(STAMP)
+	$(BIN)/segfloor demo
+
+lint: $(STAMP)
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/mypy segfloor_ros
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix $(CODE)
+	$(BIN)/ruff format $(CODE)
+
+docs: $(STAMP)
+	$(BIN)/python docs/generate.py
+
+clean:
+	rm -rf $(VENV) build install log .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -1,0 +1,74 @@
+"""Build description for pip and for colcon (ament_python)."""
+
+import re
+import sys
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'segfloor_ros'
+NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+HERE = Path(__file__).resolve().parent
+VERSION = re.search(r"__version__ = '(.+)'", (HERE / PACKAGE / '__init__.py').read_text())[1]
+
+
+def files(folder, *patterns):
+    """Return the files of a folder as paths relative to this one, as data_files wants them."""
+    found = [path for pattern in patterns for path in sorted((HERE / folder).glob(pattern))]
+    return [str(path.relative_to(HERE)) for path in found]
+
+
+data_files = [
+    ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+    (f'share/{PACKAGE}', ['package.xml']),
+    (f'share/{PACKAGE}/launch_configs', files('launch_configs', '*.launch.py', '*.rviz')),
+    (f'share/{PACKAGE}/params', files('params', '*.yaml')),
+]
+if 'install' in sys.argv or 'develop' in sys.argv:
+    # colcon runs these commands and puts every entry point under lib/<package>, for `ros2 run`;
+    # pip does not run them and makes bin/segfloor itself.
+    data_files.append(('bin', ['resource/segfloor']))
+
+setup(
+    name=PACKAGE,
+    version=VERSION,
+    description='Occupancy maps for ground robots from a stereo camera alone',
+    long_description=(HERE / 'README.md').read_text() if (HERE / 'README.md').exists() else '',
+    long_description_content_type='text/markdown',
+    license='Apache-2.0',
+    maintainer='Segfloor maintainers',
+    maintainer_email='segfloor@example.org',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=data_files,
+    python_requires='>=3.10',
+    # colcon does not install these: on a ROS install rosdep brings the distribution's python3-opencv,
+    # python3-numpy, python3-scipy and python3-yaml, which pip packages must not shadow.
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'pyyaml>=6.0',
+        'opencv-python-headless>=4.6',
+    ],
+    extras_require={
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'cli': ['typer>=0.12', 'rich>=13', 'rosbags>=0.10', 'evo>=1.28', 'matplotlib>=3.6'],
+        'sim': ['mujoco>=3.1'],
+        'dev': [
+            'colcon-common-extensions',
+            'mypy',
+            'pytest',
+            'pytest-timeout',
+            'ruff',
+            'setuptools<80',
+            'types-PyYAML',
+        ],
+    },
+    tests_require=['pytest'],
+    entry_points={
+        'console_scripts': [
+            'segfloor = segfloor_ros.cli.main:main',
+            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
+        ],
+    },
+    zip_safe=True,
+)
