@@ -1,1 +1,1 @@
-"""NumPy to ROS messages and back, QoS profiles."""
+"""Conversions between NumPy data and ROS 2 messages, quality of service, and joining by stamp."""

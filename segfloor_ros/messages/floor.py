@@ -1,0 +1,57 @@
+"""The floor seen in a keyframe: disparity image, mask and scan."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from sensor_msgs.msg import LaserScan
+from stereo_msgs.msg import DisparityImage
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.floor.observation import FloorObservation, FloorScan
+from segfloor_ros.messages.errors import MessageError
+from segfloor_ros.messages.headers import make_header
+from segfloor_ros.messages.images import image_message
+
+MAX_RANGE_M = 1000.0
+
+
+def disparity_message(
+    stamp_ns: int, frame_id: str, camera: StereoCamera, floor: FloorObservation
+) -> DisparityImage:
+    """Return the disparity image: Z = f * t / d; 0 where there is no match."""
+    message = DisparityImage(
+        header=make_header(stamp_ns, frame_id),
+        image=image_message(stamp_ns, frame_id, floor.disparity_px, '32FC1'),
+        f=float(camera.fx),
+        t=float(camera.baseline_m),
+        min_disparity=float(floor.min_disparity_px),
+        max_disparity=float(floor.max_disparity_px),
+        delta_d=1.0 / 16.0,
+    )
+    message.valid_window.width, message.valid_window.height = camera.width, camera.height
+    return message
+
+
+def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
+    """Return the floor scan in the base's plane: how far the floor was seen, per bearing."""
+    ranges = np.ascontiguousarray(scan.ranges_m, np.float32)
+    steps = max(len(ranges) - 1, 0)
+    return LaserScan(
+        header=make_header(stamp_ns, frame_id),
+        angle_min=float(scan.angle_min_rad),
+        angle_max=float(scan.angle_min_rad + steps * scan.angle_increment_rad),
+        angle_increment=float(scan.angle_increment_rad),
+        range_min=0.0,
+        range_max=MAX_RANGE_M,
+        ranges=array.array('f', ranges.tobytes()),
+    )
+
+
+def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
+    """Return the floor scan of a message. Raises MessageError, naming the topic."""
+    if not np.isfinite([message.angle_min, message.angle_increment]).all():
+        raise MessageError(f'{topic}: the angles of the scan are not finite')
+    ranges = np.frombuffer(message.ranges, np.float32).copy()
+    return FloorScan(float(message.angle_min), float(message.angle_increment), ranges)

@@ -1,0 +1,97 @@
+"""Joining the parts of a keyframe or a stereo pair that arrive as separate messages."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A set that was given up: its stamp, and the parts that never came."""
+
+    stamp_ns: int
+    missing: tuple[str, ...]
+
+
+class StampJoiner:
+    """Collects one value per part and stamp, and hands out complete sets.
+
+    Every topic delivers in order, so once a set is complete, the sets that were begun before it
+    cannot be completed any more: they are dropped and what they lacked is kept for the report. At
+    most `capacity` sets wait. A stamp that was handed out recently is not taken again, and a jump
+    back in time starts new sets like any other stamp. With a tolerance, stamps that differ by no
+    more are one set.
+    """
+
+    def __init__(self, parts: Sequence[str], capacity: int = 100, tolerance_ns: int = 0) -> None:
+        self._parts = tuple(parts)
+        self._capacity = capacity
+        self._tolerance_ns = tolerance_ns
+        self._waiting: OrderedDict[int, dict[str, Any]] = OrderedDict()
+        self._done: OrderedDict[int, None] = OrderedDict()
+        self._dropped: list[Dropped] = []
+
+    def add(self, part: str, stamp_ns: int, value: Any) -> dict[str, Any] | None:
+        """Take in one part; returns the values by part when its set is complete with it."""
+        key = self._set_for(part, stamp_ns)
+        if key is None:
+            return None
+        parts = self._waiting.setdefault(key, {})
+        parts[part] = value
+        if len(parts) == len(self._parts):
+            return self._complete(key)
+        if len(self._waiting) > self._capacity:
+            self._drop(next(iter(self._waiting)))
+        return None
+
+    def take_dropped(self) -> list[Dropped]:
+        """Return the sets given up since the last call."""
+        dropped, self._dropped = self._dropped, []
+        return dropped
+
+    def waiting_for(self) -> tuple[str, ...]:
+        """Return the parts that every waiting set lacks; () when nothing waits."""
+        lacking = [set(self._parts) - parts.keys() for parts in self._waiting.values()]
+        if not lacking:
+            return ()
+        everywhere = set.intersection(*lacking)
+        return tuple(part for part in self._parts if part in everywhere)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._waiting.clear()
+        self._done.clear()
+        self._dropped.clear()
+
+    def _set_for(self, part: str, stamp_ns: int) -> int | None:
+        if self._near(self._done, stamp_ns) is not None:
+            return None
+        near = self._near(self._waiting, stamp_ns, part)
+        return stamp_ns if near is None else near
+
+    def _near(self, sets: OrderedDict[int, Any], stamp_ns: int, part: str = '') -> int | None:
+        """Return the nearest set within the tolerance; of the waiting ones, one lacking `part`."""
+        if self._tolerance_ns == 0:
+            return stamp_ns if stamp_ns in sets else None
+        near = [
+            key
+            for key, parts in sets.items()
+            if abs(key - stamp_ns) <= self._tolerance_ns and not (parts and part in parts)
+        ]
+        return min(near, key=lambda key: abs(key - stamp_ns), default=None)
+
+    def _complete(self, key: int) -> dict[str, Any]:
+        while (first := next(iter(self._waiting))) != key:
+            self._drop(first)
+        self._done[key] = None
+        while len(self._done) > self._capacity:
+            self._done.popitem(last=False)
+        return self._waiting.pop(key)
+
+    def _drop(self, key: int) -> None:
+        parts = self._waiting.pop(key)
+        missing = tuple(part for part in self._parts if part not in parts)
+        self._dropped.append(Dropped(key, missing))

@@ -1,0 +1,133 @@
+"""Poses, odometry, paths and transforms. Quaternions are normalised on the way in."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Twist,
+    Vector3,
+)
+from nav_msgs.msg import Odometry, Path
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.geometry import Array, invert, se3_log, transform_from_quaternion
+from segfloor_ros.messages.errors import MessageError
+from segfloor_ros.messages.headers import make_header, to_ns
+from segfloor_ros.slam.results import KeyframePath
+
+UNKNOWN_TWIST_VARIANCE = 1e6
+
+
+def pose_message(T_a_b: Array) -> Pose:
+    """Return the pose message of a (4, 4) transform."""
+    return _pose_messages(T_a_b[None])[0]
+
+
+def pose_array(pose: Pose) -> Array:
+    """Return the (4, 4) transform of a pose message. Raises MessageError for impossible numbers."""
+    p, q = pose.position, pose.orientation
+    values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+    if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 0.5:
+        raise MessageError(f'a pose of {values.tolist()} is impossible (x y z qx qy qz qw)')
+    return transform_from_quaternion(values[:3], values[3:])
+
+
+def odometry_message(
+    stamp_ns: int,
+    frame_id: str,
+    child_frame_id: str,
+    T_a_b: Array,
+    covariance: Array,
+    twist: Array | None = None,
+) -> Odometry:
+    """Return the odometry of frame b in frame a.
+
+    covariance: (6, 6), order x y z roll pitch yaw. twist: (6,) linear and angular velocity in
+    frame b, m/s and rad/s; None is marked as unknown by a large variance.
+    """
+    message = Odometry(header=make_header(stamp_ns, frame_id), child_frame_id=child_frame_id)
+    message.pose.pose = pose_message(T_a_b)
+    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
+    if twist is None:
+        message.twist.covariance = (np.eye(6) * UNKNOWN_TWIST_VARIANCE).ravel()
+    else:
+        vx, vy, vz, wx, wy, wz = (float(value) for value in twist)
+        message.twist.twist = Twist(
+            linear=Vector3(x=vx, y=vy, z=vz), angular=Vector3(x=wx, y=wy, z=wz)
+        )
+    return message
+
+
+def body_twist(T_a_before: Array, T_a_now: Array, duration_s: float) -> Array:
+    """Return the mean velocity (6,) between two poses in the moving frame: m/s, rad/s."""
+    return se3_log(invert(T_a_before) @ T_a_now) / duration_s
+
+
+def path_message(stamp_ns: int, frame_id: str, path: KeyframePath) -> Path:
+    """Return the path of all keyframes; its header carries the stamp of the latest keyframe."""
+    message = Path(header=make_header(stamp_ns, frame_id))
+    message.poses = [
+        PoseStamped(header=make_header(pose_stamp_ns, frame_id), pose=pose)
+        for pose_stamp_ns, pose in zip(
+            path.stamp_ns.tolist(), _pose_messages(path.T_map_base), strict=True
+        )
+    ]
+    return message
+
+
+def path_arrays(message: Path) -> KeyframePath:
+    """Return stamps and poses of a path message. Raises MessageError for impossible poses."""
+    stamps = np.array([to_ns(pose.header.stamp) for pose in message.poses], np.int64)
+    values = array.array('d')
+    for stamped in message.poses:
+        p, q = stamped.pose.position, stamped.pose.orientation
+        values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    numbers = np.frombuffer(values, np.float64).reshape(-1, 7)
+    if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
+        raise MessageError('a path holds poses that are impossible')
+    T_map_base = np.zeros((len(numbers), 4, 4))
+    if len(numbers):
+        T_map_base[:, :3, :3] = Rotation.from_quat(numbers[:, 3:]).as_matrix()
+    T_map_base[:, :3, 3] = numbers[:, :3]
+    T_map_base[:, 3, 3] = 1.0
+    return KeyframePath(stamps, T_map_base)
+
+
+def transform_message(
+    stamp_ns: int, frame_id: str, child_frame_id: str, T_a_b: Array
+) -> TransformStamped:
+    """Return the transform of frame b (child) in frame a."""
+    pose = pose_message(T_a_b)
+    p = pose.position
+    return TransformStamped(
+        header=make_header(stamp_ns, frame_id),
+        child_frame_id=child_frame_id,
+        transform=Transform(translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=pose.orientation),
+    )
+
+
+def transform_array(message: TransformStamped) -> Array:
+    """Return the (4, 4) transform of a transform message. Raises MessageError when impossible."""
+    t, q = message.transform.translation, message.transform.rotation
+    return pose_array(Pose(position=Point(x=t.x, y=t.y, z=t.z), orientation=q))
+
+
+def _pose_messages(T_a_b: Array) -> list[Pose]:
+    if len(T_a_b) == 0:
+        return []
+    quaternions = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat()
+    quaternions *= np.where(quaternions[:, 3:] < 0, -1.0, 1.0)
+    return [
+        Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(
+            T_a_b[:, :3, 3].tolist(), quaternions.tolist(), strict=True
+        )
+    ]

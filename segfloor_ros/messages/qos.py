@@ -1,0 +1,53 @@
+"""Quality of service of the topics, by name.
+
+Everything between the nodes of this package is reliable: best effort loses large messages. Only
+the camera images of other drivers may be taken best effort, by parameter.
+"""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+IMAGE_DEPTH = 30
+KEYFRAME_DEPTH = 100
+
+
+def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
+
+
+IMAGES = _reliable(IMAGE_DEPTH)
+"""Camera images and their calibrations."""
+
+IMAGES_BEST_EFFORT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+"""Camera images of drivers that publish best effort; frames may be lost."""
+
+KEYFRAMES = _reliable(KEYFRAME_DEPTH)
+"""Everything about a keyframe; deep enough for a burst after the camera's mount was measured."""
+
+ODOMETRY = _reliable(KEYFRAME_DEPTH)
+"""Poses of frames."""
+
+LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last value also for those who come later: the map, the camera's mount (REP-2003)."""
+
+DIAGNOSTICS = _reliable(KEYFRAME_DEPTH)
+"""Status messages."""
+
+
+def images(reliability: str) -> QoSProfile:
+    """Return the profile of an image subscription for `reliable` or `best_effort`."""
+    return IMAGES_BEST_EFFORT if reliability == 'best_effort' else IMAGES
+
+
+def describe(profile: QoSProfile) -> str:
+    """Return a profile in words, e.g. `reliable, volatile, depth 30`."""
+    words = (profile.reliability.name, profile.durability.name)
+    return ', '.join(word.lower().replace('_', ' ') for word in words) + f', depth {profile.depth}'
