@@ -51,7 +51,7 @@ class LockstepRun:
         self._save_masks = save_masks
         self._memory = MemoryLog()
         self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
-        # Masks of other frames come from a segmentation of their own, which the map does not hear of.
+        # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
         self._unmasked: list[StereoFrame] = []
         self._results: list[FrameResult] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
@@ -29,7 +30,7 @@ def run(
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:
             result = LockstepRun(source, configuration, folder, save_masks).execute(
-                lambda done, state: progress.update(0, completed=done, note=state)
+                lambda done, state: progress.update(TaskID(0), completed=done, note=state)
             )
         folder.write(result)
     print_summary(input, result.summary)

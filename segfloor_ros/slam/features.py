@@ -38,6 +38,7 @@ class FeatureExtractor:
     def __init__(self, settings: StereoSlamSettings) -> None:
         self._budget = settings.num_features
         self._cell_px = settings.cell_size_px
+        self._scale = settings.pyramid_scale
         self._orb = cv2.ORB_create(
             nfeatures=OVERSAMPLING * settings.num_features,
             scaleFactor=settings.pyramid_scale,
@@ -59,7 +60,20 @@ class FeatureExtractor:
         kept, descriptor = self._orb.compute(image, [corners[i] for i in chosen])
         octave = np.array([corner.octave & 0xFF for corner in kept], np.uint8)
         uv = np.asarray(cv2.KeyPoint_convert(kept), np.float32).reshape(-1, 2)
-        return Features(uv, octave, np.asarray(descriptor))
+        return Features(self._at_full_resolution(uv, octave, image), octave, np.asarray(descriptor))
+
+    def _at_full_resolution(
+        self, uv: NDArray[np.float32], octave: NDArray[np.uint8], image: NDArray[np.uint8]
+    ) -> NDArray[np.float32]:
+        """Return exact positions (N, 2).
+         OpenCV multiplies a corner's place in its pyramid level by the nominal scale; but levels have
+        whole sizes, and what scales is the distance from the image's outer edge, half a pixel before
+        the first pixel's centre.
+        """
+        nominal = self._scale ** octave.astype(np.float64)[:, None]
+        size = np.array(image.shape[::-1], np.float64)
+        level_size = np.rint(size / nominal)
+        return (((uv / nominal) + 0.5) * (size / level_size) - 0.5).astype(np.float32)
 
 
 def spread(

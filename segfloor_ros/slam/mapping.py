@@ -53,7 +53,7 @@ class LocalMapper:
         rows, matched = rows[missing], matched[missing]
         guess = (features.uv_px[rows, 0] - right_features.uv_px[matched, 0]).astype(np.float64)
         disparity, sigma = refine_disparity(
-            left, right, features.uv_px[rows], guess, DISPARITY_REACH_PX
+            left, right, observations.uvd_px[rows, :2], guess, DISPARITY_REACH_PX
         )
         observations.uvd_px[rows, 2] = disparity
         observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)

@@ -24,6 +24,7 @@ from segfloor_ros.slam.residuals import (
 
 ROUNDS = 3
 STEPS_PER_ROUND = 6
+MAX_NOISE_FACTOR = 4.0
 RANSAC_ITERATIONS = 200
 RANSAC_REPROJECTION_PX = 4.0
 
@@ -38,6 +39,7 @@ class PoseEstimate:
     T_camera_world: Array
     inliers: NDArray[np.bool_]
     covariance: Array
+    noise_factor: float
 
 
 def solve_pnp(
@@ -74,29 +76,34 @@ def refine_pose(
     observations: Observations,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
-    between rounds.
-
-    points_world: (N, 3). Points that fall behind the camera count as outliers.
+        between rounds.
+     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
+    and a poor calibration make errors larger than the single measurements tell; the median
+    residual shows by how much, and the bound on outliers follows it.
     """
     inliers = np.ones(len(points_world), bool)
-    pose = T_camera_world
+    pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
         pose = _minimise(camera, pose, points_world[inliers], observations.take(inliers))
-        inliers = _inliers(camera, pose, points_world, observations)
+        chi2 = _chi2(camera, pose, points_world, observations)
+        excess = chi2 / observations.chi2_median
+        factor = float(np.sqrt(np.clip(np.median(excess), 1.0, MAX_NOISE_FACTOR**2)))
+        inliers = chi2 <= factor**2 * observations.chi2_limit
         if inliers.sum() < 4:
             break
-    covariance = _covariance(camera, pose, points_world[inliers], observations.take(inliers))
-    return PoseEstimate(pose, inliers, covariance)
+    scaled = observations.take(inliers).with_noise_factor(factor)
+    covariance = _covariance(camera, pose, points_world[inliers], scaled)
+    return PoseEstimate(pose, inliers, covariance, factor)
 
 
-def _inliers(
+def _chi2(
     camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
-) -> NDArray[np.bool_]:
+) -> Array:
     points = transform_points(pose, points_world)
     front = points[:, 2] > MIN_DEPTH_M
     points[~front] = (0.0, 0.0, 1.0)
     chi2 = squared_norms(residuals(camera, points, observations), observations.information)
-    return front & (chi2 <= observations.chi2_limit)
+    return np.where(front, chi2, np.inf)
 
 
 def _minimise(

@@ -17,6 +17,9 @@ from segfloor_ros.geometry import Array, skew
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 """95 % quantiles of the chi-squared distribution by degrees of freedom."""
 
+CHI2_50 = {2: 1.386, 3: 2.366}
+"""Medians of the chi-squared distribution by degrees of freedom."""
+
 MIN_DEPTH_M = 0.05
 
 
@@ -41,6 +44,15 @@ class Observations:
     def information(self) -> Array:
         """Inverse variances (N, 3) in 1/px²; 0 where there is no measurement."""
         return np.where(np.isfinite(self.uvd_px), 1.0 / self.sigma_px**2, 0.0)
+
+    def with_noise_factor(self, factor: float) -> Observations:
+        """Return the same measurements with standard deviations `factor` times as large."""
+        return Observations(self.uvd_px, self.sigma_px * factor)
+
+    @property
+    def chi2_median(self) -> Array:
+        """The median (N,) of the squared, normalised residual of each feature when all is well."""
+        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_50[3], CHI2_50[2])
 
     @property
     def chi2_limit(self) -> Array:

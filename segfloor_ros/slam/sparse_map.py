@@ -13,14 +13,19 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.patch_alignment import SIDE_PX
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
+
+MAX_PATCH_ZOOM = 1.3
+"""Change of a patch's size in the image at which it is taken anew."""
 
 
 @dataclass
 class KeyframeRecord:
-    """One keyframe of the map: pose (moves in bundle adjustment), features, and the map point
-    of each (N,) int32.
+    """One keyframe of the map.
+     The pose moves in bundle adjustment. point_id: (N,) int32, the map point of each feature.
+    patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature.
     """
 
     index: int
@@ -30,6 +35,7 @@ class KeyframeRecord:
     features: Features
     observations: Observations
     point_id: NDArray[np.int32]
+    patches: NDArray[np.uint8]
 
     @property
     def T_world_camera(self) -> Array:
@@ -75,6 +81,8 @@ class SparseMap:
         self.keyframes: list[KeyframeRecord] = []
         self._xyz = GrowingArray((3,), np.float64)
         self._descriptor = GrowingArray((32,), np.uint8)
+        self._patch = GrowingArray((SIDE_PX, SIDE_PX), np.uint8)
+        self._patch_distance = GrowingArray((), np.float64)
         self._viewing_distance = GrowingArray((), np.float64)
         self._viewing_octave = GrowingArray((), np.float64)
         self._viewing_direction = GrowingArray((3,), np.float64)
@@ -101,6 +109,19 @@ class SparseMap:
     def descriptor(self) -> NDArray[np.uint8]:
         """Descriptors (P, 32) as last seen by a keyframe."""
         return self._descriptor.rows
+
+    @property
+    def patch(self) -> NDArray[np.uint8]:
+        """Grey levels (P, SIDE_PX, SIDE_PX) around each point, kept as long as its size in the
+        image stays about the same: every change of patch adds an error to the point's
+        position.
+        """
+        return self._patch.rows
+
+    @property
+    def patch_distance_m(self) -> Array:
+        """Distance (P,) from which the patch was taken."""
+        return self._patch_distance.rows
 
     @property
     def viewing_distance_m(self) -> Array:
@@ -140,6 +161,8 @@ class SparseMap:
         first_id = len(self.alive)
         self._xyz.extend(xyz_world)
         self._descriptor.extend(np.zeros((count, 32), np.uint8))
+        self._patch.extend(np.zeros((count, SIDE_PX, SIDE_PX), np.uint8))
+        self._patch_distance.extend(np.zeros(count))
         self._viewing_distance.extend(np.zeros(count))
         self._viewing_octave.extend(np.zeros(count))
         self._viewing_direction.extend(np.zeros((count, 3)))
@@ -163,6 +186,10 @@ class SparseMap:
         self.viewing_distance_m[ids] = distance
         self.viewing_octave[ids] = keyframe.features.octave[rows]
         self.viewing_direction[ids] = sight / distance[:, None]
+        zoom = np.abs(np.log(np.maximum(self.patch_distance_m[ids], 1e-6) / distance))
+        stale = zoom > np.log(MAX_PATCH_ZOOM)
+        self.patch[ids[stale]] = keyframe.patches[rows[stale]]
+        self.patch_distance_m[ids[stale]] = distance[stale]
 
     def unlink(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
         """Forget the observations `rows` of a keyframe; a point that nobody observes any more

@@ -14,6 +14,7 @@ from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.image_check import image_fault
 from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
 from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import (
     NO_POINT,
     FrameResult,
@@ -221,6 +222,7 @@ class StereoSlam:
             features,
             observations,
             point_id,
+            sample_patches(left, observations.uvd_px[:, :2]).astype(np.uint8),
         )
         T_odom_camera = invert(self._T_world_odom) @ keyframe.T_world_camera
         self._mapper.insert(self.map, keyframe)
@@ -244,7 +246,7 @@ class StereoSlam:
             keyframe.T_world_camera,
             frame.left,
             frame.right,
-            keyframe.features.uv_px,
+            keyframe.observations.uvd_px[:, :2].astype(np.float32),
             point_id,
             xyz,
             np.array([k.stamp_ns for k in self.map.keyframes], np.int64),

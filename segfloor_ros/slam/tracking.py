@@ -13,6 +13,7 @@ from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.disparity_refinement import refine_disparity
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.matching import Matches, match_predicted, match_unguided
+from segfloor_ros.slam.patch_alignment import align_patches
 from segfloor_ros.slam.pose import PoseEstimate, refine_pose, solve_pnp
 from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -23,6 +24,7 @@ SIGMA_PIXEL = 0.6
 level.
 """
 
+MIN_SIGMA_PIXEL = 0.15
 MIN_SIGMA_DISPARITY = 0.1
 DISPARITY_REACH_PX = 4
 WIDE_SEARCH = 3.0
@@ -103,8 +105,9 @@ class Tracker:
         points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
         if len(rows) < self._settings.min_tracked:
             return None
-        self._measure_disparity(left, right, observations, rows, seen.uvd_px[points, 2])
         ids = seen.ids[points]
+        self._align_pixels(left, observations, rows, sparse_map, ids, estimate.T_camera_world)
+        self._measure_disparity(left, right, observations, rows, seen.uvd_px[points, 2])
         estimate = refine_pose(
             self._camera,
             estimate.T_camera_world,
@@ -119,7 +122,7 @@ class Tracker:
             rows[estimate.inliers],
             ids[estimate.inliers],
             seen.ids,
-            observations,
+            observations.with_noise_factor(estimate.noise_factor),
         )
 
     def _coarse_pose(
@@ -224,6 +227,26 @@ class Tracker:
             sparse_map.descriptor[seen.ids],
             radius_factor * self._settings.match_radius_px * scale,
             self._settings.max_hamming,
+        )
+
+    def _align_pixels(
+        self,
+        left: NDArray[np.float32],
+        observations: Observations,
+        rows: NDArray[np.intp],
+        sparse_map: SparseMap,
+        ids: NDArray[np.int32],
+        T_camera_world: Array,
+    ) -> None:
+        """Replace corner positions by those of the points' patches, where the patch is found."""
+        points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
+        zoom = sparse_map.patch_distance_m[ids] / np.linalg.norm(points, axis=1)
+        template = sparse_map.patch[ids].astype(np.float32)
+        found = align_patches(template, left, observations.uvd_px[rows, :2], zoom)
+        sound = rows[found.sound]
+        observations.uvd_px[sound, :2] = found.uv_px[found.sound]
+        observations.sigma_px[sound, :2] = np.clip(
+            found.sigma_px[found.sound], MIN_SIGMA_PIXEL, None
         )
 
     def _measure_disparity(
