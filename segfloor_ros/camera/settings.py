@@ -26,5 +26,18 @@ class StereoCameraSettings(StageSettings):
         minimum=0.0,
         maximum=1.0,
     )
+    left_calibration: str = setting(
+        '', 'Calibration file of the left camera; empty: the one that lies with the recording.'
+    )
+    right_calibration: str = setting(
+        '', 'Calibration file of the right camera; empty: the one that lies with the recording.'
+    )
+    bit_depth: int = setting(
+        0,
+        'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
+        unit='bits',
+        minimum=0,
+        maximum=16,
+    )
     left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
     right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')

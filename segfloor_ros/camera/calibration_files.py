@@ -1,0 +1,164 @@
+"""Reading and writing calibration files: ROS camera calibration YAML, EuRoC sensor.yaml, KITTI
+calib.txt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.errors import CalibrationError
+from segfloor_ros.geometry import Array, invert
+
+
+def read_calibration(left: Path, right: Path) -> StereoCalibration:
+    """Read a pair of ROS camera calibration files or of EuRoC sensor files.
+
+    Raises CalibrationError naming the file when one is missing, incomplete or impossible.
+    """
+    documents = _read_yaml(left), _read_yaml(right)
+    if all('T_BS' in document for document in documents):
+        return _from_euroc(left, right, *documents)
+    return StereoCalibration(_ros_eye(documents[0], str(left)), _ros_eye(documents[1], str(right)))
+
+
+def read_kitti_calibration(
+    path: Path, width: int, height: int, cameras: tuple[int, int] = (0, 1)
+) -> StereoCalibration:
+    """Read the projections P0 and P1 (or P2 and P3) of a KITTI odometry `calib.txt`.
+
+    The file does not tell the image size. Geiger et al., Vision meets Robotics, IJRR 2013.
+    """
+    rows = {}
+    for line in _read_text(path).splitlines():
+        name, colon, numbers = line.partition(':')
+        if colon:
+            rows[name.strip()] = numbers.split()
+    eyes = []
+    for camera in cameras:
+        name = f'P{camera}'
+        if name not in rows:
+            raise CalibrationError(
+                f'{path}: no line {name}: with the projection of camera {camera}'
+            )
+        P = _numbers(rows[name], 12, f'{path}, {name}').reshape(3, 4)
+        eyes.append(EyeCalibration.of_rectified(width, height, P, f'{path}, {name}'))
+    return StereoCalibration(*eyes)
+
+
+def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:
+    """Write one eye as a ROS camera calibration file; numbers are exact."""
+
+    def matrix(values: Array, rows: int) -> dict[str, Any]:
+        return {'rows': rows, 'cols': values.size // rows, 'data': values.ravel().tolist()}
+
+    document = {
+        'image_width': eye.width,
+        'image_height': eye.height,
+        'camera_name': camera_name,
+        'camera_matrix': matrix(eye.K, 3),
+        'distortion_model': eye.distortion_model,
+        'distortion_coefficients': matrix(eye.D, 1),
+        'rectification_matrix': matrix(eye.R, 3),
+        'projection_matrix': matrix(eye.P, 3),
+    }
+    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100))
+
+
+def _ros_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:
+    for key in ('image_width', 'image_height', 'camera_matrix', 'projection_matrix'):
+        if key not in document:
+            raise CalibrationError(
+                f'{origin}: {key} is missing; a stereo calibration in the form of ROS '
+                'camera_calibration has it'
+            )
+    distortion = document.get('distortion_coefficients', {'data': []})
+    rectification = document.get('rectification_matrix', {'data': np.eye(3).ravel().tolist()})
+    return EyeCalibration(
+        _whole(document['image_width'], f'{origin}, image_width'),
+        _whole(document['image_height'], f'{origin}, image_height'),
+        _matrix(document['camera_matrix'], 9, f'{origin}, camera_matrix'),
+        _matrix(distortion, None, f'{origin}, distortion_coefficients'),
+        _matrix(rectification, 9, f'{origin}, rectification_matrix'),
+        _matrix(document['projection_matrix'], 12, f'{origin}, projection_matrix'),
+        str(document.get('distortion_model', 'plumb_bob')),
+        origin,
+    )
+
+
+def _from_euroc(
+    left: Path, right: Path, left_document: Mapping[str, Any], right_document: Mapping[str, Any]
+) -> StereoCalibration:
+    """Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 2016: T_BS maps the sensor's
+    points into the body frame.
+    """
+    eyes, poses = [], []
+    for path, document in ((left, left_document), (right, right_document)):
+        eyes.append(_euroc_eye(document, str(path)))
+        T_body_eye = _matrix(document['T_BS'], 16, f'{path}, T_BS').reshape(4, 4)
+        poses.append(T_body_eye)
+    return StereoCalibration.from_extrinsics(eyes[0], eyes[1], invert(poses[1]) @ poses[0])
+
+
+def _euroc_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:
+    for key in ('resolution', 'intrinsics'):
+        if key not in document:
+            raise CalibrationError(f'{origin}: {key} is missing; an EuRoC sensor.yaml has it')
+    width, height = _numbers(document['resolution'], 2, f'{origin}, resolution').astype(int)
+    fu, fv, cu, cv = _numbers(document['intrinsics'], 4, f'{origin}, intrinsics')
+    K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
+    D = _numbers(
+        document.get('distortion_coefficients', []), None, f'{origin}, distortion_coefficients'
+    )
+    P = np.hstack([K, np.zeros((3, 1))])
+    model = str(document.get('distortion_model', 'plumb_bob'))
+    return EyeCalibration(int(width), int(height), K, D, np.eye(3), P, model, origin)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except FileNotFoundError:
+        raise CalibrationError(
+            f'{path}: the calibration is missing; put it there, or give '
+            'stereo_camera.left_calibration and stereo_camera.right_calibration'
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(f'{path}: cannot read the calibration ({error})') from None
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    # OpenCV and EuRoC files begin with `%YAML:1.0`, which is not a directive YAML knows.
+    lines = [line for line in _read_text(path).splitlines() if not line.startswith('%YAML')]
+    try:
+        document = yaml.safe_load('\n'.join(lines))
+    except yaml.YAMLError:
+        raise CalibrationError(f'{path}: not a valid YAML calibration file') from None
+    if not isinstance(document, dict):
+        raise CalibrationError(f'{path}: holds no calibration')
+    return document
+
+
+def _matrix(value: Any, count: int | None, where: str) -> Array:
+    return _numbers(value.get('data') if isinstance(value, dict) else value, count, where)
+
+
+def _numbers(value: Any, count: int | None, where: str) -> Array:
+    try:
+        numbers = np.array(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        raise CalibrationError(f'{where}: expected numbers') from None
+    if count is not None and numbers.size != count:
+        raise CalibrationError(f'{where}: expected {count} numbers, found {numbers.size}')
+    return numbers
+
+
+def _whole(value: Any, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise CalibrationError(f'{where} = {value!r}: expected a whole number')
+    return value

@@ -1,0 +1,158 @@
+"""Decoding of images to grey, and of 16-bit grey to 8 bits."""
+
+from __future__ import annotations
+
+import zlib
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.errors import InputError
+
+Grey = NDArray[np.uint8] | NDArray[np.uint16]
+"""A grey image (H, W), uint8 or uint16."""
+
+PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
+USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
+
+# OpenCV names a Bayer pattern by the second pixel of the second row, ROS by the first of the first.
+BAYER_CODES = {
+    'rggb': cv2.COLOR_BayerBG2GRAY,
+    'bggr': cv2.COLOR_BayerRG2GRAY,
+    'gbrg': cv2.COLOR_BayerGR2GRAY,
+    'grbg': cv2.COLOR_BayerGB2GRAY,
+}
+CHANNELS = {
+    'mono8': 1, 'mono16': 1, '8UC1': 1, '16UC1': 1, 'rgb8': 3, 'bgr8': 3, '8UC3': 3, 'rgba8': 4,
+    'bgra8': 4, '8UC4': 4, 'rgb16': 3, 'bgr16': 3, '16UC3': 3, 'rgba16': 4, 'bgra16': 4,
+    'yuv422': 2, 'uyvy': 2, 'yuv422_yuy2': 2, 'yuyv': 2,
+    **{f'bayer_{pattern}{bits}': 1 for pattern in BAYER_CODES for bits in (8, 16)},
+}  # fmt: skip
+"""Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
+
+
+class CorruptImageError(InputError):
+    """The data of one image is damaged; the rest of the recording may be fine."""
+
+
+def decode_compressed(data: bytes) -> Grey:
+    """Return the grey image of the bytes of a PNG, JPEG or other image file.
+
+    Raises CorruptImageError when it is truncated or damaged, also where a decoder would make
+    up the missing part.
+    """
+    _check_complete(data)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise CorruptImageError('the image cannot be decoded')
+    if image.dtype not in (np.uint8, np.uint16):
+        raise CorruptImageError(f'pixels are {image.dtype}, expected 8 or 16 bits')
+    return image
+
+
+def decode_raw(
+    data: bytes | NDArray[np.uint8],
+    *,
+    width: int,
+    height: int,
+    encoding: str,
+    step: int,
+    is_bigendian: bool = False,
+) -> Grey:
+    """Return the grey image of the raw pixels of a ROS `Image`.
+
+    step: bytes from one row to the next, padding included. Raises InputError for an encoding
+    that is no picture, CorruptImageError when the data is not of the size the header says.
+    """
+    channels = CHANNELS.get(encoding)
+    if channels is None:
+        raise InputError(f'image encoding {encoding} is not supported; known are mono8, rgb8, …')
+    dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
+    row_bytes = width * channels * dtype.itemsize
+    buffer = np.frombuffer(data, np.uint8)
+    if width <= 0 or height <= 0 or step < row_bytes or buffer.size != step * height:
+        raise CorruptImageError(
+            f'{buffer.size} bytes do not make a {width}x{height} {encoding} image with a row '
+            f'step of {step}'
+        )
+    rows = np.ascontiguousarray(buffer.reshape(height, step)[:, :row_bytes])
+    pixels = rows.view(dtype.newbyteorder('>' if is_bigendian else '<')).astype(dtype, copy=False)
+    return _grey_of(pixels.reshape(height, width, channels), encoding)
+
+
+def to_grey(image: Grey) -> Grey:
+    """Return the grey image (H, W) of a grey, BGR or BGRA image, 8 or 16 bit."""
+    if image.ndim == 2:
+        return image
+    if image.shape[2] == 1:
+        return image[:, :, 0]
+    code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+    return cv2.cvtColor(image, code)
+
+
+class EightBitScale:
+    """Brings grey pairs of 16 bits to 8 by dropping the same number of low bits for the whole
+    recording.
+
+    A scale per image (its own minimum and maximum) would change the brightness of the same
+    point from frame to frame. The number of bits in use is declared, or else the smallest usual
+    one (8, 10, 12, 14, 16) that holds the first pair; brighter pixels later on saturate.
+    """
+
+    def __init__(self, bit_depth: int = 0) -> None:
+        self.bit_depth = bit_depth
+
+    def __call__(self, left: Grey, right: Grey) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return both images (H, W) as uint8; 8-bit images pass through."""
+        if not self.bit_depth and np.uint16 in (left.dtype, right.dtype):
+            brightest = max(int(left.max()), int(right.max()))
+            self.bit_depth = next(b for b in USUAL_BIT_DEPTHS if brightest < 1 << b)
+        return self._scaled(left), self._scaled(right)
+
+    def _scaled(self, image: Grey) -> NDArray[np.uint8]:
+        if image.dtype == np.uint8:
+            return image  # type: ignore[return-value]
+        shift = max(self.bit_depth - 8, 0)
+        return np.minimum(image >> shift, 255).astype(np.uint8)
+
+
+def _grey_of(pixels: Grey, encoding: str) -> Grey:
+    if encoding.startswith('bayer_'):
+        return cv2.cvtColor(pixels[:, :, 0], BAYER_CODES[encoding[6:10]])
+    if encoding in ('yuv422', 'uyvy'):
+        return pixels[:, :, 1].copy()
+    if encoding in ('yuv422_yuy2', 'yuyv'):
+        return pixels[:, :, 0].copy()
+    if encoding.startswith('rgb'):
+        code = cv2.COLOR_RGBA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_RGB2GRAY
+        return cv2.cvtColor(pixels, code)
+    return to_grey(pixels)
+
+
+def _check_complete(data: bytes) -> None:
+    if not data:
+        raise CorruptImageError('the image is empty')
+    if data.startswith(JPEG_START) and JPEG_END not in data[-64:]:
+        raise CorruptImageError('the JPEG is truncated')
+    if data.startswith(PNG_SIGNATURE):
+        _check_png(data)
+
+
+def _check_png(data: bytes) -> None:
+    """Walk over the chunks (length, type, data, CRC; ISO/IEC 15948) up to the end mark."""
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], 'big')
+        end = position + 8 + length
+        if end + 4 > len(data):
+            break
+        checksum = int.from_bytes(data[end : end + 4], 'big')
+        if zlib.crc32(data[position + 4 : end]) != checksum:
+            raise CorruptImageError('the PNG is damaged')
+        if data[position + 4 : position + 8] == b'IEND':
+            return
+        position = end + 4
+    raise CorruptImageError('the PNG is truncated')

@@ -1,0 +1,54 @@
+"""Rectification of stereo pairs: epipolar lines become rows."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+
+Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
+
+
+class StereoRectifier:
+    """Rectifies pairs of one calibration. The maps are computed once, in fixed point (a 32nd of
+    a pixel); pairs that are rectified already pass through.
+    """
+
+    def __init__(self, calibration: StereoCalibration) -> None:
+        self.calibration = calibration
+        self.camera = calibration.camera
+        self._maps: tuple[Maps, Maps] | None = None
+        if not calibration.is_rectified:
+            self._maps = rectification_maps(calibration.left), rectification_maps(calibration.right)
+
+    def rectify(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the rectified grey images (H, W) of a raw grey pair (H, W), uint8.
+
+        Pixels that lie outside of the raw image are 0. Raises CalibrationError when the size is
+        not the calibration's.
+        """
+        for side, image in (('the left image', left), ('the right image', right)):
+            self.calibration.check_size(image.shape[1], image.shape[0], side)
+        if self._maps is None:
+            return left, right
+        return (
+            cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR),
+            cv2.remap(right, *self._maps[1], cv2.INTER_LINEAR),
+        )
+
+
+def rectification_maps(eye: EyeCalibration) -> Maps:
+    """Return where each pixel of the rectified image is in the raw one, as fixed-point maps of
+    `cv2.remap`.
+    """
+    size = (eye.width, eye.height)
+    arguments = (eye.K, eye.D, eye.R, eye.P[:, :3].copy(), size, cv2.CV_16SC2)
+    if eye.distortion_model == 'equidistant':
+        maps = cv2.fisheye.initUndistortRectifyMap(*arguments)
+    else:
+        maps = cv2.initUndistortRectifyMap(*arguments)
+    return maps[0], maps[1]

@@ -1,0 +1,145 @@
+"""Pairs of image files: what KITTI, EuRoC and plain image folders have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed
+from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
+from segfloor_ros.errors import InputError
+
+IMAGE_SUFFIXES = {'.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff', '.webp'}
+
+
+@dataclass(frozen=True)
+class FilePair:
+    """Two image files of one moment; index: their number in the recording."""
+
+    index: int
+    stamp_ns: int
+    left: Path
+    right: Path
+
+
+class FilePairSource(StereoSource):
+    """A recording of image files."""
+
+    def __init__(
+        self, name: str, pairs: Sequence[FilePair], calibration: StereoCalibration, bit_depth: int
+    ) -> None:
+        self._pairs = pairs
+        stamps = [pair.stamp_ns for pair in pairs]
+        super().__init__(
+            name,
+            calibration,
+            frame_count=len(pairs),
+            rate_hz=rate_of(stamps),
+            bit_depth=bit_depth,
+        )
+
+    def _entries(self) -> Iterator[PairEntry]:
+        last_ns = None
+        for pair in self._pairs:
+            if pair.stamp_ns == last_ns:
+                self._skip(pair.index, f'its stamp {last_ns} ns was there before')
+                continue
+            last_ns = pair.stamp_ns
+            yield PairEntry(pair.index, pair.stamp_ns, _loader(pair))
+
+
+def read_grey(path: Path) -> Grey:
+    """Return the grey image (H, W), uint8 or uint16, of a file.
+
+    Raises CorruptImageError naming the file when it is truncated or damaged, InputError when it
+    cannot be read.
+    """
+    try:
+        return decode_compressed(path.read_bytes())
+    except CorruptImageError as error:
+        raise CorruptImageError(f'{path}: {error}') from None
+    except OSError as error:
+        raise InputError(f'{path}: cannot read the image ({error.strerror})') from None
+
+
+def first_image_size(paths: Sequence[Path], name: str) -> tuple[int, int]:
+    """Return (width, height) of the first image that can be decoded. Raises InputError."""
+    for path in paths:
+        try:
+            height, width = read_grey(path).shape
+        except CorruptImageError:
+            continue
+        return width, height
+    raise InputError(f'{name}: none of its {len(paths)} images can be decoded')
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the image files of a folder in natural order: `left2` before `left10`."""
+    files = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((path for path in files if not path.name.startswith('.')), key=natural_key)
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key that reads runs of digits as numbers."""
+    parts = re.split(r'(\d+)', path.name.casefold())
+    return [(int(part), '') if part.isdigit() else (0, part) for part in parts]
+
+
+def check_equal_numbers(name: str, left: Sequence[Path], right: Sequence[Path]) -> None:
+    """Raise InputError unless there are as many left as right images, and at least one."""
+    if not left and not right:
+        raise InputError(f'{name}: there are no images in its folders')
+    if len(left) != len(right):
+        raise InputError(
+            f'{name}: {len(left)} left and {len(right)} right images; every left image needs its '
+            'right one: complete the copy, or remove the images without partner'
+        )
+
+
+def read_times(path: Path) -> list[int]:
+    """Return the stamps in ns of a file with one time in seconds per line.
+
+    Raises InputError naming the line where one is no number or earlier than the one before.
+    """
+    stamps: list[int] = []
+    for number, line in enumerate(path.read_text().split('\n'), 1):
+        if not line.strip():
+            continue
+        try:
+            stamp_ns = int(Decimal(line.split()[0]).scaleb(9).to_integral_value())
+        except (InvalidOperation, ValueError, OverflowError):
+            raise InputError(f'{path}, line {number}: expected a time in seconds') from None
+        check_forward(f'{path}, line {number}', stamps[-1:], stamp_ns)
+        stamps.append(stamp_ns)
+    return stamps
+
+
+def check_forward(where: str, last_ns: Sequence[int], stamp_ns: int) -> None:
+    """Raise InputError when `stamp_ns` is earlier than the last one, if there was one."""
+    if last_ns and stamp_ns < last_ns[-1]:
+        raise InputError(
+            f'{where}: the stamp goes backwards, from {last_ns[-1] / 1e9:.9f} s to '
+            f'{stamp_ns / 1e9:.9f} s; cut the recording there and use one part'
+        )
+
+
+def stamps_of_rate(count: int, rate_hz: float) -> list[int]:
+    """Return `count` stamps in ns from 0 on at `rate_hz`, or at the usual rate where that is 0."""
+    return [round(i * 1e9 / (rate_hz or DEFAULT_RATE_HZ)) for i in range(count)]
+
+
+def rate_of(stamps_ns: Sequence[int]) -> float:
+    """Return the frame rate in Hz of ascending stamps: of their median interval."""
+    intervals = np.diff(stamps_ns)
+    intervals = intervals[intervals > 0]
+    return float(1e9 / np.median(intervals)) if intervals.size else DEFAULT_RATE_HZ
+
+
+def _loader(pair: FilePair) -> Callable[[], tuple[Grey, Grey]]:
+    return lambda: (read_grey(pair.left), read_grey(pair.right))

@@ -1,0 +1,101 @@
+"""Two folders of images, or one folder with both sides, with ROS calibration files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.files import (
+    FilePair,
+    FilePairSource,
+    check_equal_numbers,
+    images_in,
+    read_times,
+    stamps_of_rate,
+)
+from segfloor_ros.camera.sources.found_calibration import find_calibration
+from segfloor_ros.camera.sources.sides import is_side, side_pairs
+from segfloor_ros.errors import InputError
+
+TIME_FILES = ('times.txt', 'timestamps.txt')
+NANOSECOND_DIGITS = 16
+"""A name that is a number of so many digits is taken for a stamp in ns."""
+
+
+def has_image_sides(folder: Path) -> bool:
+    """Whether `folder` holds two folders of images, or left and right images."""
+    return _side_images(folder) is not None
+
+
+def open_image_folders(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
+    """Open two image folders with their calibration. Raises InputError or CalibrationError."""
+    left, right = find_image_pairs(folder)
+    stamps = _stamps(folder, left, settings.rate_hz)
+    pairs = [FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))]
+    places = (folder, left[0].parent, left[0].parent.parent)
+    calibration = find_calibration(str(folder), places, settings)
+    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth)
+
+
+def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the left and the right images of a folder, in natural order, partner by partner.
+
+    Either in two subfolders (`left` and `right`, or similar names), or side by side
+    (`left01.jpg`, `right01.jpg`). Raises InputError when they do not match.
+    """
+    sides = _side_images(folder)
+    if sides is None:
+        raise InputError(
+            f'{folder}: expected image folders left and right, or images left01… and right01…'
+        )
+    left, right = sides
+    check_equal_numbers(str(folder), left, right)
+    for one, other in zip(left, right, strict=True):
+        if _numbers(one) and _numbers(other) and _numbers(one)[-1:] != _numbers(other)[-1:]:
+            raise InputError(
+                f'{folder}: {one.name} has no partner, {other.name} comes next on the right; '
+                'remove the images without partner'
+            )
+    return left, right
+
+
+def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
+    folders = {path.name: path for path in sorted(folder.iterdir()) if path.is_dir()}
+    for left, right in side_pairs(folders):
+        images = _nested_images(folders[left]), _nested_images(folders[right])
+        if any(images):
+            return images
+    candidates = [*images_in(folder), *(i for f in folders.values() for i in _nested_images(f))]
+    left_images, right_images = (
+        [path for path in candidates if is_side(str(path.relative_to(folder)), side)]
+        for side in (0, 1)
+    )
+    return (left_images, right_images) if left_images or right_images else None
+
+
+def _nested_images(folder: Path) -> list[Path]:
+    data = folder / 'data'
+    return images_in(folder) or (images_in(data) if data.is_dir() else [])
+
+
+def _numbers(path: Path) -> list[int]:
+    return [int(digits) for digits in re.findall(r'\d+', path.stem)]
+
+
+def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
+    """Stamps from a file of times, from names that are times in ns, or else from the rate."""
+    for name in TIME_FILES:
+        if (folder / name).exists():
+            stamps = read_times(folder / name)
+            if len(stamps) != len(left):
+                raise InputError(
+                    f'{folder / name}: {len(stamps)} times for {len(left)} pairs of images; it '
+                    'needs one line for each, or remove it to read the images at '
+                    'stereo_camera.rate_hz'
+                )
+            return stamps
+    if all(path.stem.isdigit() and len(path.stem) >= NANOSECOND_DIGITS for path in left):
+        return [int(path.stem) for path in left]
+    return stamps_of_rate(len(left), rate_hz)

@@ -1,0 +1,83 @@
+"""KITTI odometry folders: image_0 and image_1 (grey) or image_2 and image_3 (colour), calib.txt,
+times.txt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.calibration_files import read_kitti_calibration
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.files import (
+    FilePair,
+    FilePairSource,
+    check_equal_numbers,
+    first_image_size,
+    images_in,
+    read_times,
+    stamps_of_rate,
+)
+from segfloor_ros.camera.sources.found_calibration import given_calibration
+from segfloor_ros.errors import InputError
+
+CAMERAS = ((0, 1), (2, 3))
+
+
+def is_kitti(folder: Path) -> bool:
+    """Whether `folder` looks like a KITTI odometry sequence."""
+    has_index = (folder / 'calib.txt').exists() or (folder / 'times.txt').exists()
+    return has_index and any((folder / f'image_{i}').is_dir() for i in range(4))
+
+
+def open_kitti(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
+    """Open a KITTI odometry folder. Raises InputError or CalibrationError."""
+    cameras = _cameras(folder)
+    left, right = (images_in(folder / f'image_{camera}') for camera in cameras)
+    check_equal_numbers(str(folder), left, right)
+    indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
+    pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
+    calibration = _calibration(folder, settings, left, cameras)
+    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth)
+
+
+def _cameras(folder: Path) -> tuple[int, int]:
+    for cameras in CAMERAS:
+        if all((folder / f'image_{camera}').is_dir() for camera in cameras):
+            return cameras
+    found = ', '.join(path.name for path in sorted(folder.glob('image_*')))
+    raise InputError(
+        f'{folder}: has {found}, but a stereo pair is image_0 with image_1, or image_2 with image_3'
+    )
+
+
+def _indices_and_stamps(
+    times: Path, left: Sequence[Path], rate_hz: float
+) -> tuple[list[int], list[int]]:
+    """Line k of times.txt belongs to the image whose name is the number k; names that are no such
+    numbers are matched in order.
+    """
+    indices = list(range(len(left)))
+    if not times.exists():
+        return indices, stamps_of_rate(len(left), rate_hz)
+    stamps = read_times(times)
+    numbers = [int(path.stem) for path in left if path.stem.isdigit()]
+    if len(numbers) == len(left) and numbers[-1] < len(stamps):
+        return numbers, [stamps[number] for number in numbers]
+    if len(stamps) != len(left):
+        raise InputError(
+            f'{times}: {len(stamps)} times for {len(left)} pairs of images; it needs one line '
+            'for each, or remove it to read the images at stereo_camera.rate_hz'
+        )
+    return indices, stamps
+
+
+def _calibration(
+    folder: Path, settings: StereoCameraSettings, left: Sequence[Path], cameras: tuple[int, int]
+) -> StereoCalibration:
+    given = given_calibration(settings)
+    if given is not None:
+        return given
+    width, height = first_image_size(left, str(folder))
+    return read_kitti_calibration(folder / 'calib.txt', width, height, cameras)

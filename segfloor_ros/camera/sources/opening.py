@@ -1,0 +1,40 @@
+"""Guessing what kind of recording an input is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.image_folders import has_image_sides, open_image_folders
+from segfloor_ros.camera.sources.kitti import is_kitti, open_kitti
+from segfloor_ros.camera.sources.source import StereoSource
+from segfloor_ros.errors import InputError
+
+KINDS = (
+    'a KITTI odometry folder, an EuRoC folder, image folders left and right with left.yaml and '
+    'right.yaml, a ROS bag (.mcap, .db3, .bag), or a video with a calibration'
+)
+
+
+def open_source(settings: StereoCameraSettings) -> StereoSource:
+    """Open the recording or device `settings.input`, whatever its kind.
+
+    Raises InputError when there is nothing to read or its parts do not fit together,
+    CalibrationError when the calibration is missing, impossible or for other images.
+    """
+    if not settings.input:
+        raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
+    path = Path(settings.input)
+    if not path.exists():
+        raise InputError(f'{path}: no such file or folder; give {KINDS}')
+    if path.is_dir():
+        return _open_folder(path, settings)
+    raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
+
+
+def _open_folder(folder: Path, settings: StereoCameraSettings) -> StereoSource:
+    if is_kitti(folder):
+        return open_kitti(folder, settings)
+    if has_image_sides(folder):
+        return open_image_folders(folder, settings)
+    raise InputError(f'{folder}: no recording was recognised in it; give {KINDS}')

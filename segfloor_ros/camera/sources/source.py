@@ -1,0 +1,124 @@
+"""What every source of stereo pairs has in common."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.sources.prefetch import prefetched
+from segfloor_ros.errors import InputError
+
+DEFAULT_RATE_HZ = 10.0
+"""Frame rate of a recording that has no stamps."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RawPair:
+    """One grey pair as the camera saw it, not rectified: images (H, W) uint8, the pair's number
+    in its recording, its stamp in ns.
+    """
+
+    index: int
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PairEntry:
+    """A pair that has not been decoded yet. `load` returns both grey images; it raises
+    CorruptImageError where one of them is damaged.
+    """
+
+    index: int
+    stamp_ns: int
+    load: Callable[[], tuple[Grey, Grey]]
+
+
+class StereoSource(ABC):
+    """A recording or device as a sequence of stereo pairs with one calibration.
+
+    name: of the recording, for messages. calibration: of the raw pairs. camera: the rectified
+    one. frame_count: pairs expected, None when unknown. rate_hz: frames per second.
+    skipped_frames: pairs left out so far because an image was damaged or the stamp was there
+    before.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        calibration: StereoCalibration,
+        *,
+        frame_count: int | None,
+        rate_hz: float,
+        bit_depth: int = 0,
+    ) -> None:
+        self.name = name
+        self.calibration = calibration
+        self.frame_count = frame_count
+        self.rate_hz = rate_hz
+        self.skipped_frames = 0
+        self._eight_bit = EightBitScale(bit_depth)
+        self._check_first_pair()
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The rectified stereo camera."""
+        return self.calibration.camera
+
+    def frames(self) -> Iterator[StereoFrame]:
+        """Yield the rectified pairs in order of their stamps; the next ones are prepared
+        meanwhile on one background thread.
+
+        Raises InputError or CalibrationError where the recording is inconsistent.
+        """
+        return prefetched(self._rectified())
+
+    def raw_pairs(self) -> Iterator[RawPair]:
+        """Yield the pairs of `frames()` unrectified; they belong to `calibration`."""
+        return prefetched(self._decoded())
+
+    @abstractmethod
+    def _entries(self) -> Iterator[PairEntry]:
+        """Yield the pairs in order, without decoding them."""
+
+    def _check_first_pair(self) -> None:
+        """Read up to the first good pair: its size must be the calibration's, its pixels tell the
+        bit depth.
+        """
+        if next(self._decoded(), None) is None:
+            raise InputError(f'{self.name}: no pair of images in it can be read')
+
+    def _rectified(self) -> Iterator[StereoFrame]:
+        rectifier = StereoRectifier(self.calibration)
+        for pair in self._decoded():
+            left, right = rectifier.rectify(pair.left, pair.right)
+            yield StereoFrame(pair.index, pair.stamp_ns, left, right)
+
+    def _decoded(self) -> Iterator[RawPair]:
+        self.skipped_frames = 0
+        for entry in self._entries():
+            try:
+                left, right = entry.load()
+            except CorruptImageError as error:
+                self._skip(entry.index, str(error))
+                continue
+            for image in (left, right):
+                what = f'{self.name}: frame {entry.index}'
+                self.calibration.check_size(image.shape[1], image.shape[0], what)
+            yield RawPair(entry.index, entry.stamp_ns, *self._eight_bit(left, right))
+
+    def _skip(self, index: int, reason: str) -> None:
+        self.skipped_frames += 1
+        logger.warning('%s: frame %d is skipped: %s', self.name, index, reason)
