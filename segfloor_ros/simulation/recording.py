@@ -1,0 +1,186 @@
+"""The files of a simulated drive: images, calibration, poses, true map and true masks."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.grid.map_file import save_map
+from segfloor_ros.simulation.rig import RawCamera
+from segfloor_ros.simulation.simulation import SimulatedFrame, Simulation
+
+DISPARITY_SCALE = 256
+"""Disparity files are 16-bit PNG in units of 1/256 px, as in KITTI's stereo benchmark."""
+
+PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """What to write. floor_every: every how many frames a floor mask, 0 for none. disparity: a true
+    disparity with each mask. images: write images in folders, as opposed to a bag.
+    """
+
+    floor_every: int = 10
+    disparity: bool = False
+    images: bool = True
+
+
+def record(
+    simulation: Simulation,
+    out: Path,
+    options: RecordingOptions,
+    on_frame: Callable[[int], None] = lambda done: None,
+    sink: Callable[[Path], FrameSink] | None = None,
+) -> None:
+    """Write a drive to a new folder, complete or not at all.
+
+    Rectified images go to image_0/ and image_1/ with calib.txt (KITTI odometry layout), others to
+    left/ and right/ with ROS calibrations left.yaml and right.yaml. sink: makes a further
+    receiver of the frames from the folder, e.g. a bag. Raises InputError when `out` holds
+    something already.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f'{out}: exists already; choose another --out or remove it')
+    out.parent.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
+    try:
+        _record_into(staging, simulation, options, on_frame, sink)
+        staging.chmod(0o755)
+        if out.exists():
+            out.rmdir()
+        staging.rename(out)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+class FrameSink:
+    """Receives the frames of a drive besides the folder."""
+
+    def write(self, frame: SimulatedFrame) -> None:
+        """Take one frame."""
+
+    def close(self) -> None:
+        """Finish."""
+
+
+def _record_into(
+    folder: Path,
+    simulation: Simulation,
+    options: RecordingOptions,
+    on_frame: Callable[[int], None],
+    make_sink: Callable[[Path], FrameSink] | None,
+) -> None:
+    write_truth(folder, simulation)
+    sink = make_sink(folder) if make_sink is not None else None
+    poses = []
+    for frame in simulation.frames():
+        if options.images:
+            _write_images(folder, frame, simulation.scene.camera.rectified)
+        if sink is not None:
+            sink.write(frame)
+        if options.floor_every and frame.index % options.floor_every == 0:
+            _write_frame_truth(folder, simulation, frame.index, options)
+        poses.append(frame.T_world_left)
+        on_frame(frame.index + 1)
+    if sink is not None:
+        sink.close()
+    _write_poses(folder / 'poses.txt', np.array(poses))
+
+
+def write_truth(folder: Path, simulation: Simulation) -> None:
+    """Write map, scene.yaml, base_poses.txt, times.txt and the calibration."""
+    scene, rig, drive = simulation.scene, simulation.scene.camera, simulation.drive
+    save_map(simulation.true_map, folder / 'map.yaml')
+    times = drive.times_s
+    np.savetxt(folder / 'times.txt', times, fmt='%.6f')
+    np.savetxt(folder / 'base_poses.txt', np.column_stack([times, drive.xy_yaw]), fmt='%.6f')
+    facts = {
+        'description': ' '.join(scene.description.split()),
+        'seed': scene.seed,
+        'frames': simulation.frame_count,
+        'path_m': drive.length_m,
+        'rate_hz': rig.rate_hz,
+        'fov_x_deg': rig.fov_x_deg,
+        'baseline_m': rig.baseline_m,
+        'camera_height_m': rig.height_m,
+        'camera_pitch_rad': float(np.radians(rig.pitch_deg)),
+        'camera_roll_rad': float(np.radians(rig.roll_deg)),
+        'camera_forward_m': rig.forward_m,
+        'rectified': rig.rectified,
+        'start_pose_world': [float(value) for value in drive.xy_yaw[0]],
+    }
+    (folder / 'scene.yaml').write_text(yaml.safe_dump(facts, sort_keys=False))
+    _write_calibration(folder, simulation)
+
+
+def _write_calibration(folder: Path, simulation: Simulation) -> None:
+    left, right = simulation.imaging.raw
+    if simulation.scene.camera.rectified:
+        rows = [f'P{i}: ' + ' '.join(f'{v:.12g}' for v in side.P.ravel())
+                for i, side in enumerate((left, right))]  # fmt: skip
+        (folder / 'calib.txt').write_text('\n'.join(rows) + '\n')
+        return
+    size = (simulation.camera.width, simulation.camera.height)
+    for name, side in (('left', left), ('right', right)):
+        document = ros_calibration(name, side, *size)
+        (folder / f'{name}.yaml').write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def ros_calibration(name: str, side: RawCamera, width: int, height: int) -> dict:
+    """Return a calibration in the form of ROS's camera_calibration_parsers."""
+    return {
+        'image_width': width,
+        'image_height': height,
+        'camera_name': name,
+        'camera_matrix': _matrix(side.K),
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': _matrix(side.D[None]),
+        'rectification_matrix': _matrix(side.R),
+        'projection_matrix': _matrix(side.P),
+    }
+
+
+def _matrix(values: Array) -> dict:
+    return {
+        'rows': values.shape[0],
+        'cols': values.shape[1],
+        'data': [float(value) for value in values.ravel()],
+    }
+
+
+def _write_images(folder: Path, frame: SimulatedFrame, rectified: bool) -> None:
+    names = ('image_0', 'image_1') if rectified else ('left', 'right')
+    for name, image in zip(names, (frame.left, frame.right), strict=True):
+        _write_png(folder / name / f'{frame.index:06d}.png', image)
+
+
+def _write_frame_truth(
+    folder: Path, simulation: Simulation, index: int, options: RecordingOptions
+) -> None:
+    truth = simulation.truth(index)
+    _write_png(folder / 'floor' / f'{index:06d}.png', truth.floor)
+    if options.disparity:
+        scaled = np.clip(np.round(truth.disparity_px * DISPARITY_SCALE), 0, 65535)
+        _write_png(folder / 'disparity' / f'{index:06d}.png', scaled.astype(np.uint16))
+
+
+def _write_poses(path: Path, T_world_left: Array) -> None:
+    """Write the left optical frame in the first left optical frame, KITTI rows."""
+    relative = invert(T_world_left[0]) @ T_world_left
+    np.savetxt(path, relative[:, :3].reshape(-1, 12), fmt='%.9g')
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    if not cv2.imwrite(str(path), image, PNG_SPEED):
+        raise InputError(f'{path}: cannot be written; is the disk full?')

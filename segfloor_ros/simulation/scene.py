@@ -1,0 +1,195 @@
+"""The description of a simulated world: what a scene file may say, with units and defaults.
+
+Positions are metres in the world frame (x, y on the floor, z up), angles degrees, counter-
+clockwise. `at` is the middle of a thing's footprint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+Point = tuple[float, float]
+Point3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A chain of upright walls along the centre line `points`; `closed` joins the ends. posters:
+    how many sheets hang on it, at random places on both sides.
+    """
+
+    points: tuple[Point, ...]
+    texture: str = 'plaster'
+    height_m: float = 2.5
+    thickness_m: float = 0.1
+    bottom_m: float = 0.0
+    closed: bool = False
+    posters: int = 0
+
+
+@dataclass(frozen=True)
+class Box:
+    """A block of `size` (length along its heading, width, height), `bottom_m` above the floor."""
+
+    at: Point
+    size: Point3
+    texture: str = 'wood'
+    yaw_deg: float = 0.0
+    bottom_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder."""
+
+    at: Point
+    radius_m: float
+    height_m: float
+    texture: str = 'metal'
+    bottom_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Furniture:
+    """A composed thing: `kind` is chair, table, stool, guitar or plant."""
+
+    kind: str
+    at: Point
+    yaw_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Slope:
+    """A strip of floor from `start` to `end` (x, y, z), `width_m` wide: a ramp, or a platform
+    where both heights are equal.
+    """
+
+    start: Point3
+    end: Point3
+    width_m: float
+    texture: str = 'concrete'
+
+
+@dataclass(frozen=True)
+class FloorPatch:
+    """A part of the flat floor that looks different."""
+
+    at: Point
+    size: Point
+    texture: str = 'plain'
+    yaw_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Person:
+    """Someone who walks to and fro along `points`, from `start_s` on."""
+
+    points: tuple[Point, ...]
+    speed_m_s: float = 0.8
+    start_s: float = 0.0
+    height_m: float = 1.75
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The ground. reflectance: 0 dull to 1 a mirror."""
+
+    texture: str = 'tiles'
+    reflectance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """What hangs over everything; height 0 leaves it out."""
+
+    height_m: float = 2.5
+    texture: str = 'panels'
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light. levels: pairs (time in s, brightness) between which the brightness is interpolated;
+    empty keeps it at 1. ambient: share of the light that comes from everywhere.
+    """
+
+    ambient: float = 0.55
+    levels: tuple[Point, ...] = ()
+
+
+@dataclass(frozen=True)
+class Vibration:
+    """Shaking of the camera: amplitudes of random motion with about this frequency."""
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    bounce_m: float = 0.0
+    frequency_hz: float = 3.0
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """The stereo camera. Position and angles are of the left camera on the base; pitch looks
+    down, roll to the right. fov_x_deg: of the rectified image. distortion: k1 k2 p1 p2 k3 of the
+    raw images; with it, or with misalignment_deg (rotation of either raw camera against the
+    rectified pair), the images are written unrectified. exposure_s: motion blur. right_gain:
+    brightness of the right image over that of the left.
+    """
+
+    width: int = 640
+    height: int = 480
+    fov_x_deg: float = 90.0
+    baseline_m: float = 0.12
+    height_m: float = 0.3
+    forward_m: float = 0.0
+    pitch_deg: float = 7.0
+    roll_deg: float = 0.0
+    rate_hz: float = 10.0
+    noise_sigma: float = 1.5
+    distortion: tuple[float, ...] = ()
+    misalignment_deg: float = 0.0
+    right_gain: float = 1.0
+    exposure_s: float = 0.0
+    vibration: Vibration = field(default_factory=Vibration)
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images come out of the camera rectified."""
+        return not any(self.distortion) and self.misalignment_deg == 0.0
+
+
+@dataclass(frozen=True)
+class Route:
+    """The drive: through `waypoints`, corners rounded over about `smoothing_m`, speeding up and
+    braking at `acceleration_m_s2`, slower where it turns faster than `turn_rate_deg_s`.
+    """
+
+    waypoints: tuple[Point, ...]
+    speed_m_s: float = 0.4
+    smoothing_m: float = 0.3
+    acceleration_m_s2: float = 0.3
+    turn_rate_deg_s: float = 35.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world, the camera and the drive through it. robot_height_m: what hangs higher is no
+    obstacle in the true map; step_height_m: what is lower is not one either.
+    """
+
+    description: str
+    path: Route
+    seed: int = 1
+    floor: Floor = field(default_factory=Floor)
+    ceiling: Ceiling = field(default_factory=Ceiling)
+    walls: tuple[Wall, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    cylinders: tuple[Cylinder, ...] = ()
+    furniture: tuple[Furniture, ...] = ()
+    slopes: tuple[Slope, ...] = ()
+    floor_patches: tuple[FloorPatch, ...] = ()
+    people: tuple[Person, ...] = ()
+    lighting: Lighting = field(default_factory=Lighting)
+    camera: CameraRig = field(default_factory=CameraRig)
+    resolution_m: float = 0.05
+    robot_height_m: float = 1.0
+    step_height_m: float = 0.03

@@ -1,0 +1,88 @@
+"""Scene files: YAML whose keys are the fields of `scene.Scene`."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.settings import suggestion
+from segfloor_ros.simulation import scene as scene_module
+from segfloor_ros.simulation.scene import Scene
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """Return the scene files that come with the package, by name."""
+    folder = Path(str(resources.files('segfloor_ros.simulation') / 'scenes'))
+    return {file.stem: file for file in sorted(folder.glob('*.yaml'))}
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene file. Raises InputError naming the file, the entry and what is wrong with it."""
+    return scene_from_mapping(read_yaml(path), str(path))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping that a YAML file holds. Raises InputError."""
+    try:
+        document = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        line = getattr(getattr(error, 'problem_mark', None), 'line', 0) + 1
+        raise InputError(f'{path}, line {line}: not valid YAML') from None
+    if not isinstance(document, dict):
+        raise InputError(f'{path}: expected names and values, e.g. `walls:`')
+    return document
+
+
+def scene_from_mapping(values: dict[str, Any], where: str) -> Scene:
+    """Build a scene from plain values. where: what errors call it."""
+    return _build(Scene, values, where)
+
+
+def _build(kind: Any, value: Any, where: str) -> Any:
+    """Return a value of a declared type: a dataclass, a tuple of a type or a plain value."""
+    if dataclasses.is_dataclass(kind):
+        return _build_entry(kind, value, where)
+    if typing.get_origin(kind) is tuple:
+        return _build_tuple(typing.get_args(kind), value, where)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        names = {float: 'a number', int: 'a whole number', str: 'text', bool: 'true or false'}
+        raise InputError(f'{where}: {value!r} is not {names[kind]}')
+    return value
+
+
+def _build_entry(kind: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, dict):
+        raise InputError(f'{where}: expected names and values, found {value!r}')
+    types = typing.get_type_hints(kind, vars(scene_module))
+    for name in value:
+        if name not in types:
+            raise InputError(f'{where}: unknown entry {name}{suggestion(str(name), list(types))}')
+    required = [f.name for f in dataclasses.fields(kind) if _is_required(f)]
+    missing = [name for name in required if name not in value]
+    if missing:
+        raise InputError(f'{where}: {missing[0]} is missing')
+    return kind(**{name: _build(types[name], v, f'{where}, {name}') for name, v in value.items()})
+
+
+def _build_tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise InputError(f'{where}: expected a list, found {value!r}')
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        return tuple(_build(kinds[0], v, f'{where} {i + 1}') for i, v in enumerate(value))
+    if len(value) != len(kinds):
+        raise InputError(f'{where}: expected {len(kinds)} numbers, found {value!r}')
+    return tuple(_build(kind, v, where) for kind, v in zip(kinds, value, strict=True))
+
+
+def _is_required(entry: dataclasses.Field) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

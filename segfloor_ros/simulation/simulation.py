@@ -1,0 +1,122 @@
+"""The simulation of a drive: images of a stereo camera with everything true about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.simulation.drive import Drive, plan_drive
+from segfloor_ros.simulation.imaging import Picture, develop, plan_imaging
+from segfloor_ros.simulation.renderer import WorldRenderer
+from segfloor_ros.simulation.rig import RigMotion, rectified_camera
+from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.solids import floors, obstacles
+from segfloor_ros.simulation.truth_map import true_map
+from segfloor_ros.simulation.world import CAMERAS, build_world
+
+BLUR_SAMPLES = 6
+
+
+@dataclass(frozen=True)
+class SimulatedFrame:
+    """One pair of images (H, W) uint8 as the cameras deliver them, and where the rectified left
+    optical frame was (4, 4).
+    """
+
+    index: int
+    time_s: float
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    T_world_left: Array
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """What is true of one frame's rectified left image: floor mask (H, W) uint8, 255 floor;
+    depth_m and disparity_px (H, W) float32.
+    """
+
+    floor: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    disparity_px: NDArray[np.float32]
+
+
+class Simulation:
+    """Drives through a scene. Use as a context manager; raises RenderingError where nothing can
+    be rendered and InputError for an impossible scene. supersampling: the pictures are
+    rendered this many times finer than the camera's pixels.
+    """
+
+    def __init__(self, scene: Scene, supersampling: int = 1):
+        self.scene = scene
+        self.drive: Drive = plan_drive(scene.path, scene.camera.rate_hz)
+        self.camera = rectified_camera(scene.camera)
+        self.imaging = plan_imaging(scene)
+        solids, ground = obstacles(scene), floors(scene)
+        self.motion = RigMotion(scene, self.drive, ground)
+        self.true_map: OccupancyGrid = true_map(scene, solids, ground, self.drive.xy_yaw[0, :2])
+        self._renderer = WorldRenderer(scene, build_world(scene))
+        self._pictures = self._renderer.view(
+            self.imaging.width * supersampling,
+            self.imaging.height * supersampling,
+            self.imaging.focal_px * supersampling,
+        )
+        self._truth = self._renderer.view(self.camera.width, self.camera.height, self.camera.fx)
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pictures.close()
+        self._truth.close()
+
+    @property
+    def frame_count(self) -> int:
+        """How many pairs the drive has."""
+        return len(self.drive.times_s)
+
+    def frames(self, every: int = 1) -> Iterator[SimulatedFrame]:
+        """Yield the pairs in order, or only one of every so many."""
+        for index in range(0, self.frame_count, every):
+            yield self.frame(index)
+
+    def frame(self, index: int) -> SimulatedFrame:
+        """Render one pair."""
+        time_s = float(self.drive.times_s[index])
+        left, right = (
+            develop(picture, self.imaging, self.scene, side, index, time_s)
+            for side, picture in enumerate(self._exposed(time_s))
+        )
+        return SimulatedFrame(index, time_s, left, right, self.motion.T_world_left(time_s))
+
+    def truth(self, index: int) -> FrameTruth:
+        """Render what is true of one frame's rectified left image."""
+        time_s = float(self.drive.times_s[index])
+        self._renderer.move(self.motion.T_world_left(time_s), time_s)
+        depth_m = self._truth.depth_m(CAMERAS[0])
+        disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
+        return FrameTruth(self._truth.floor_mask(CAMERAS[0]), depth_m, disparity_px)
+
+    def _exposed(self, time_s: float) -> list[Picture]:
+        """Return the ideal left and right pictures, averaged over the exposure around a time."""
+        exposure_s = self.scene.camera.exposure_s
+        moments = [time_s]
+        if exposure_s > 0:
+            moments = list(time_s + exposure_s * (np.arange(BLUR_SAMPLES) / BLUR_SAMPLES - 0.5))
+        pictures: list[list[Picture]] = [[], []]
+        for moment in moments:
+            self._renderer.move(self.motion.T_world_left(moment), moment)
+            for side, camera in enumerate(CAMERAS):
+                pictures[side].append(self._pictures.grey(camera))
+        return [np.mean(side, axis=0, dtype=np.float32) for side in pictures]

@@ -1,0 +1,221 @@
+"""The solids of a world: upright prisms, from which pictures, floor masks and the true map all
+follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import Array
+from segfloor_ros.settings import suggestion
+from segfloor_ros.simulation.scene import (
+    Box,
+    Cylinder,
+    FloorPatch,
+    Furniture,
+    Point,
+    Scene,
+    Slope,
+    Wall,
+)
+
+CYLINDER_SIDES = 32
+PATCH_THICKNESS_M = 0.001
+POSTER_THICKNESS_M = 0.004
+POSTER_VARIANTS = 6
+
+
+@dataclass(frozen=True)
+class Prism:
+    """A solid over a convex footprint (K, 2), counter-clockwise, between the heights bottom_m and
+    top_m (K,) of its corners. is_floor: its top can be driven on. fit: stretch the texture once
+    over each side rather than repeat it. smooth: shade the sides as one round surface.
+    """
+
+    footprint: Array
+    bottom_m: Array
+    top_m: Array
+    texture: str
+    is_floor: bool = False
+    fit: bool = False
+    smooth: bool = False
+
+
+def block(
+    at: Point,
+    size: tuple[float, float, float],
+    texture: str,
+    yaw_deg: float = 0.0,
+    bottom_m: float = 0.0,
+    fit: bool = False,
+) -> Prism:
+    """Return a box of length, width and height."""
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size[:2]
+    footprint = corners @ _turn(yaw_deg).T + np.array(at)
+    return Prism(footprint, np.full(4, bottom_m), np.full(4, bottom_m + size[2]), texture, fit=fit)
+
+
+def cylinder(
+    at: Point, radius_m: float, height_m: float, texture: str, bottom_m: float = 0.0
+) -> Prism:
+    """Return an upright cylinder as a prism of many sides."""
+    angle = np.arange(CYLINDER_SIDES) * 2 * np.pi / CYLINDER_SIDES
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius_m + np.array(at)
+    bottom = np.full(CYLINDER_SIDES, bottom_m)
+    return Prism(circle, bottom, bottom + height_m, texture, smooth=True)
+
+
+def obstacles(scene: Scene) -> list[Prism]:
+    """Return the solids of a scene that stand still and are not floor, sheets on walls included."""
+    solids = [prism for wall in scene.walls for prism in _wall(wall)]
+    solids += [_box(box) for box in scene.boxes]
+    solids += [_cylinder(thing) for thing in scene.cylinders]
+    solids += [prism for thing in scene.furniture for prism in _furniture(thing)]
+    return solids + _posters(scene)
+
+
+def floors(scene: Scene) -> list[Prism]:
+    """Return the solids of a scene that are floor, besides the ground plane."""
+    return [_slope(slope) for slope in scene.slopes] + [_patch(p) for p in scene.floor_patches]
+
+
+def _wall(wall: Wall) -> list[Prism]:
+    """Return one box per stretch, each long enough to fill the corner."""
+    solids = []
+    for start, end in _stretches(wall):
+        along = np.array(end) - np.array(start)
+        length = float(np.hypot(*along))
+        middle = (np.array(start) + np.array(end)) / 2
+        size = (length + wall.thickness_m, wall.thickness_m, wall.height_m)
+        yaw_deg = float(np.degrees(np.arctan2(along[1], along[0])))
+        at = (float(middle[0]), float(middle[1]))
+        solids.append(block(at, size, wall.texture, yaw_deg, wall.bottom_m))
+    return solids
+
+
+def _stretches(wall: Wall) -> list[tuple[Point, Point]]:
+    points = list(wall.points) + ([wall.points[0]] if wall.closed else [])
+    return list(pairwise(points))
+
+
+def _posters(scene: Scene) -> list[Prism]:
+    """Hang sheets at random places on both sides of the walls that want them."""
+    rng = np.random.default_rng([scene.seed, 1])
+    solids = []
+    for wall in scene.walls:
+        stretches = _stretches(wall)
+        lengths = np.array([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in stretches])
+        for chosen in rng.choice(len(stretches), wall.posters, p=lengths / lengths.sum()):
+            (start, end), length = stretches[chosen], lengths[chosen]
+            along = (np.array(end) - np.array(start)) / length
+            across = np.array([-along[1], along[0]]) * (1 if rng.uniform() < 0.5 else -1)
+            wide, tall = rng.uniform(0.3, 0.9), rng.uniform(0.4, 1.1)
+            place = rng.uniform(0.5, max(0.6, length - 0.5))
+            offset = wall.thickness_m / 2 + POSTER_THICKNESS_M / 2
+            at = np.array(start) + along * place + across * offset
+            yaw_deg = float(np.degrees(np.arctan2(along[1], along[0])))
+            bottom_m = min(rng.uniform(0.2, 1.2), wall.height_m - tall)
+            texture = f'poster:{rng.integers(POSTER_VARIANTS)}'
+            size = (wide, POSTER_THICKNESS_M, tall)
+            solids.append(block((at[0], at[1]), size, texture, yaw_deg, bottom_m, fit=True))
+    return solids
+
+
+def _box(box: Box) -> Prism:
+    return block(box.at, box.size, box.texture, box.yaw_deg, box.bottom_m)
+
+
+def _cylinder(thing: Cylinder) -> Prism:
+    return cylinder(thing.at, thing.radius_m, thing.height_m, thing.texture, thing.bottom_m)
+
+
+def _slope(slope: Slope) -> Prism:
+    start, end = np.array(slope.start), np.array(slope.end)
+    along = end[:2] - start[:2]
+    side = np.array([-along[1], along[0]]) / np.hypot(*along) * slope.width_m / 2
+    footprint = np.array([start[:2] - side, end[:2] - side, end[:2] + side, start[:2] + side])
+    top = np.array([start[2], end[2], end[2], start[2]])
+    # Nowhere thinner than a sheet, so that the foot of a ramp is a solid too.
+    return Prism(footprint, np.full(4, -0.02), top, slope.texture, is_floor=True)
+
+
+def _patch(patch: FloorPatch) -> Prism:
+    size = (*patch.size, PATCH_THICKNESS_M)
+    flat = block(patch.at, size, patch.texture, patch.yaw_deg)
+    return Prism(flat.footprint, flat.bottom_m, flat.top_m, flat.texture, is_floor=True)
+
+
+# (forward, left, length, width, height, bottom) of the blocks of each kind, in metres.
+FURNITURE: dict[str, tuple[str, tuple[tuple[float, ...], ...]]] = {
+    'chair': (
+        'wood',
+        (
+            (0.18, 0.18, 0.03, 0.03, 0.44, 0.0),
+            (0.18, -0.18, 0.03, 0.03, 0.44, 0.0),
+            (-0.18, 0.18, 0.03, 0.03, 0.92, 0.0),
+            (-0.18, -0.18, 0.03, 0.03, 0.92, 0.0),
+            (0.0, 0.0, 0.42, 0.42, 0.04, 0.44),
+            (-0.19, 0.0, 0.025, 0.36, 0.22, 0.66),
+        ),
+    ),
+    'table': (
+        'wood',
+        (
+            (0.62, 0.32, 0.05, 0.05, 0.71, 0.0),
+            (0.62, -0.32, 0.05, 0.05, 0.71, 0.0),
+            (-0.62, 0.32, 0.05, 0.05, 0.71, 0.0),
+            (-0.62, -0.32, 0.05, 0.05, 0.71, 0.0),
+            (0.0, 0.0, 1.4, 0.8, 0.04, 0.71),
+        ),
+    ),
+    'stool': (
+        'metal',
+        (
+            (0.13, 0.13, 0.025, 0.025, 0.45, 0.0),
+            (0.13, -0.13, 0.025, 0.025, 0.45, 0.0),
+            (-0.13, 0.13, 0.025, 0.025, 0.45, 0.0),
+            (-0.13, -0.13, 0.025, 0.025, 0.45, 0.0),
+            (0.0, 0.0, 0.32, 0.32, 0.03, 0.45),
+        ),
+    ),
+    'guitar': (
+        'wood',
+        (
+            (0.0, 0.0, 0.12, 0.4, 0.28, 0.02),
+            (0.0, 0.0, 0.12, 0.3, 0.22, 0.3),
+            (-0.02, 0.0, 0.04, 0.06, 0.5, 0.52),
+            (-0.02, 0.0, 0.03, 0.1, 0.15, 1.02),
+            (-0.12, 0.0, 0.2, 0.03, 0.04, 0.0),
+        ),
+    ),
+    'plant': (
+        'granite',
+        (
+            (0.0, 0.0, 0.3, 0.3, 0.32, 0.0),
+            (0.0, 0.0, 0.05, 0.05, 0.4, 0.32),
+            (0.0, 0.0, 0.45, 0.45, 0.5, 0.7),
+        ),
+    ),
+}
+
+
+def _furniture(thing: Furniture) -> list[Prism]:
+    if thing.kind not in FURNITURE:
+        raise InputError(f'unknown furniture {thing.kind}{suggestion(thing.kind, list(FURNITURE))}')
+    texture, parts = FURNITURE[thing.kind]
+    solids = []
+    for forward, left, length, width, height, bottom in parts:
+        x, y = _turn(thing.yaw_deg) @ (forward, left) + np.array(thing.at)
+        solids.append(
+            block((float(x), float(y)), (length, width, height), texture, thing.yaw_deg, bottom)
+        )
+    return solids
+
+
+def _turn(yaw_deg: float) -> Array:
+    c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    return np.array([[c, -s], [s, c]])
