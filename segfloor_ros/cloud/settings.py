@@ -19,3 +19,62 @@ class CloudLabellingSettings(StageSettings):
         maximum=10.0,
         live=True,
     )
+    step_height_m: float = setting(
+        0.03,
+        'Points higher than this above the floor speak for an obstacle, lower ones for floor.',
+        unit='m',
+        minimum=0.005,
+        maximum=0.5,
+        live=True,
+    )
+    drop_height_m: float = setting(
+        0.10,
+        'Points deeper than this below the floor are mismatches: neither floor nor obstacle.',
+        unit='m',
+        minimum=0.02,
+        maximum=2.0,
+        live=True,
+    )
+    height_sigma_m: float = setting(
+        0.02,
+        'Error of a point height close to the robot, one sigma.',
+        unit='m',
+        minimum=0.001,
+        maximum=0.5,
+        live=True,
+    )
+    height_sigma_per_m: float = setting(
+        0.01,
+        'Growth of the height error per metre of distance, one sigma.',
+        minimum=0.0,
+        maximum=0.2,
+        live=True,
+    )
+    mask_log_odds: float = setting(
+        0.6,
+        'Evidence of one look at the floor mask.',
+        minimum=0.05,
+        maximum=5.0,
+        live=True,
+    )
+    max_mask_log_odds: float = setting(
+        3.0,
+        'Limit of the summed evidence of the mask, so that it can change its mind.',
+        minimum=0.1,
+        maximum=20.0,
+        live=True,
+    )
+    max_height_log_odds: float = setting(
+        2.0,
+        'Limit of the evidence of the height.',
+        minimum=0.0,
+        maximum=20.0,
+        live=True,
+    )
+    label_log_odds: float = setting(
+        0.8,
+        'A label is given, or changed, when the evidence exceeds this.',
+        minimum=0.0,
+        maximum=10.0,
+        live=True,
+    )

@@ -17,12 +17,15 @@ class FloorScan:
     """How far the floor was seen without interruption, per bearing, from the base's origin in
     the base's x-y plane. Bearing i is angle_min_rad + i * angle_increment_rad, counter-
     clockwise from x forward. ranges_m: (N,) float32 in metres; 0 where something stands right
-    in front, NaN where the image shows nothing about that bearing.
+    in front, NaN where the image shows nothing about that bearing. obstacle_m: (N,) float32,
+    distance at which the nearest upright thing was measured on that bearing, NaN where none
+    was; None from a source that does not tell.
     """
 
     angle_min_rad: float
     angle_increment_rad: float
     ranges_m: NDArray[np.float32]
+    obstacle_m: NDArray[np.float32] | None = None
 
     @property
     def bearings_rad(self) -> NDArray[np.float64]:

@@ -1,0 +1,70 @@
+"""The labelling stage: which points of the sparse cloud are floor and which are obstacles.
+
+The published method takes the label from the mask at the latest look. Here every look counts:
+log-odds per point, from the mask and from the height above the local floor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.cloud.evidence import height_evidence, local_floor_m, mask_evidence
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.point_table import PointTable
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.geometry import Array
+from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
+
+
+class CloudLabelling:
+    """Labels the points of the sparse cloud by id, keyframe after keyframe."""
+
+    def __init__(self, settings: CloudLabellingSettings) -> None:
+        self._settings = settings
+        self._table = PointTable()
+
+    def update(
+        self,
+        cloud: SparseCloud,
+        features: KeyframeFeatures,
+        mask: NDArray[np.uint8],
+        T_map_base: Array | None = None,
+    ) -> LabelledPoints:
+        """Take in one keyframe and return the whole cloud with its labels.
+
+        mask: (H, W) uint8, the keyframe's floor mask. T_map_base: (4, 4) pose of the keyframe's
+        base; with it, heights are measured from the floor below that base and their error grows
+        with distance, else the distance is taken to be that of the point from the map's origin
+        of heights, i.e. the error stays that of near points.
+        """
+        table, settings = self._table, self._settings
+        table.follow(cloud.point_id)
+        seen, row = table.rows_of(features.point_id)
+        looks = mask_evidence(mask, features.uv_px[seen]) * settings.mask_log_odds
+        xyz = cloud.xyz_map[row].astype(np.float64)
+        floor_z, distance_m = local_floor_m(xyz, looks < 0, T_map_base)
+        table.look(row, looks, settings.max_mask_log_odds, floor_z, distance_m)
+        return self._labelled(cloud)
+
+    def _labelled(self, cloud: SparseCloud) -> LabelledPoints:
+        table, settings = self._table, self._settings
+        height_m = cloud.xyz_map[:, 2] - table.floor_z_m
+        sigma_m = settings.height_sigma_m + settings.height_sigma_per_m * table.distance_m
+        by_height = height_evidence(height_m, sigma_m, settings) * (table.looks > 0)
+        log_odds = table.mask_log_odds + by_height
+        table.decide(log_odds, settings.label_log_odds)
+        concerned = height_m <= settings.robot_height_m
+        concerned &= height_m >= -(settings.drop_height_m + 2 * sigma_m)
+        label = np.where(concerned, table.label, UNKNOWN).astype(np.uint8)
+        towards = np.where(label == OBSTACLE, log_odds, -log_odds)
+        certainty = np.clip(np.tanh(towards / 2), 0, 1)
+        return LabelledPoints(
+            point_id=cloud.point_id,
+            xyz_map=cloud.xyz_map,
+            label=label,
+            confidence=np.where(label == UNKNOWN, 0, certainty).astype(np.float32),
+        )
+
+
+__all__ = ['FLOOR', 'OBSTACLE', 'UNKNOWN', 'CloudLabelling']

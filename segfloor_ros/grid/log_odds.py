@@ -1,0 +1,78 @@
+"""Cells of evidence on an unbounded raster, of which the part that was touched is stored.
+
+Evidence is kept in whole steps of `QUANTUM` log-odds, 128 steps above zero being 128 of uint8:
+integers, so that the same observations give the same cells on every machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+QUANTUM = 0.05
+ZERO = 128
+CHUNK = 64
+"""The stored part grows by whole blocks of this many cells."""
+
+
+def steps(log_odds: float) -> int:
+    """Return the number of steps (at least one) of a positive amount of log-odds."""
+    return max(1, round(log_odds / QUANTUM))
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A copy of a raster at some time."""
+
+    first_cell: tuple[int, int]
+    cells: NDArray[np.uint8]
+
+
+class LogOddsRaster:
+    """uint8 cells around the origin of `map`: cell (i, j) covers x from j * resolution and y from
+    i * resolution, for any integers i, j.
+    """
+
+    def __init__(self) -> None:
+        self.first_cell = (0, 0)
+        self.cells = np.zeros((0, 0), np.uint8)
+
+    def patch(self, low: tuple[int, int], high: tuple[int, int]) -> NDArray[np.uint8]:
+        """Return the cells from `low` (row, column) up to, not including, `high`, to be written
+        to; the raster grows as needed.
+        """
+        self._include(low, high)
+        row, column = low[0] - self.first_cell[0], low[1] - self.first_cell[1]
+        return self.cells[row : row + high[0] - low[0], column : column + high[1] - low[1]]
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of the present state."""
+        return Snapshot(self.first_cell, self.cells.copy())
+
+    def restore(self, state: Snapshot) -> None:
+        """Go back to an earlier state."""
+        self.first_cell, self.cells = state.first_cell, state.cells.copy()
+
+    def _include(self, low: tuple[int, int], high: tuple[int, int]) -> None:
+        first, last = self.first_cell, self._end()
+        if self.cells.size == 0:
+            first, last = low, high
+        new_first = tuple(CHUNK * (min(a, b) // CHUNK) for a, b in zip(first, low, strict=True))
+        new_last = tuple(-CHUNK * (-max(a, b) // CHUNK) for a, b in zip(last, high, strict=True))
+        if self.cells.size and new_first == self.first_cell and new_last == self._end():
+            return
+        shape = (new_last[0] - new_first[0], new_last[1] - new_first[1])
+        cells = np.full(shape, ZERO, np.uint8)
+        if self.cells.size:
+            row, column = self.first_cell[0] - new_first[0], self.first_cell[1] - new_first[1]
+            rows, columns = self.cells.shape
+            cells[row : row + rows, column : column + columns] = self.cells
+        self.first_cell, self.cells = (new_first[0], new_first[1]), cells
+
+    def _end(self) -> tuple[int, int]:
+        return (
+            self.first_cell[0] + self.cells.shape[0],
+            self.first_cell[1] + self.cells.shape[1],
+        )

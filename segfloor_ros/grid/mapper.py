@@ -1,0 +1,78 @@
+"""The occupancy grid stage: from labelled points and floor scans to the map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.errors import MapError
+from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.evidence import gather_evidence
+from segfloor_ros.grid.fold import EvidenceFolder
+from segfloor_ros.grid.history import EvidenceHistory
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.rendering import render
+from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
+
+_LEVER_M = 2.5
+"""A turn of the base moves its evidence by the turn times this, about half a ray."""
+
+
+class OccupancyGridMapper:
+    """Builds the map from the keyframes' evidence, and lets it follow their poses."""
+
+    def __init__(self, settings: OccupancyGridSettings) -> None:
+        self._settings = settings
+        self._history = EvidenceHistory(EvidenceFolder(settings))
+        self._stamp_ns = np.zeros(0, np.int64)
+
+    def update(
+        self,
+        stamp_ns: int,
+        points: LabelledPoints,
+        features: KeyframeFeatures,
+        path: KeyframePath,
+        scan: FloorScan,
+    ) -> None:
+        """Take in one keyframe, by its stamp; keyframes come in the order of their stamps.
+
+        path: all keyframes as now optimised, this one among them; evidence of keyframes that are
+        no longer in it is forgotten. Raises MapError when the keyframe is not in the path.
+        """
+        poses = _planar(path.T_map_base)
+        self._follow(path.stamp_ns, poses)
+        at = int(np.searchsorted(path.stamp_ns, stamp_ns))
+        if at == len(path.stamp_ns) or path.stamp_ns[at] != stamp_ns:
+            raise MapError(f'keyframe {stamp_ns} ns is not in its own path of keyframes')
+        evidence = gather_evidence(points, features, path.T_map_base[at], scan, self._settings)
+        x, y, yaw = poses[at].tolist()
+        self._history.append(evidence, (x, y, yaw))
+        self._stamp_ns = np.append(self._stamp_ns, np.int64(stamp_ns))
+
+    def grid(self) -> OccupancyGrid:
+        """Return the map as of the last update."""
+        return render(self._history.raster(), self._history.poses[:, :2], self._settings)
+
+    def _follow(self, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+        """Move the evidence to the keyframes' poses (K, 3), where they moved enough to matter."""
+        row = np.minimum(np.searchsorted(stamp_ns, self._stamp_ns), len(stamp_ns) - 1)
+        gone = stamp_ns[row] != self._stamp_ns
+        if gone.any():
+            self._history.remove(gone)
+            self._stamp_ns, row = self._stamp_ns[~gone], row[~gone]
+        now, then = poses[row], self._history.poses
+        moved_m = np.hypot(now[:, 0] - then[:, 0], now[:, 1] - then[:, 1])
+        turn = np.abs(np.remainder(now[:, 2] - then[:, 2] + np.pi, 2 * np.pi) - np.pi)
+        limit_m = self._settings.move_fraction * self._settings.resolution_m
+        moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
+        if len(moved):
+            self._history.move(int(moved[0]), now[moved[0] :])
+
+
+def _planar(T_map_base: Array) -> NDArray[np.float64]:
+    """Return x, y and yaw (K, 3) of poses (K, 4, 4)."""
+    yaw = np.arctan2(T_map_base[:, 1, 0], T_map_base[:, 0, 0])
+    return np.stack([T_map_base[:, 0, 3], T_map_base[:, 1, 3], yaw], axis=1)
