@@ -31,11 +31,13 @@ def refine_disparity(
     template = sample_patches(left, uv_px)
     uv_right = uv_px.astype(np.float64)
     uv_right[:, 0] -= guess_px
-    score = correlation_along_row(template, right, uv_right, reach_px)
-    peak = score.argmax(axis=1)
-    inside = (peak > 0) & (peak < 2 * reach_px)
-    rows = np.flatnonzero(inside & (score[np.arange(len(score)), peak] >= MIN_CORRELATION))
-    uv_right[rows, 0] += peak[rows] - reach_px
+    rows = np.arange(len(uv_px))
+    if reach_px > 0:
+        score = correlation_along_row(template, right, uv_right, reach_px)
+        peak = score.argmax(axis=1)
+        inside = (peak > 0) & (peak < 2 * reach_px)
+        rows = np.flatnonzero(inside & (score[rows, peak] >= MIN_CORRELATION))
+        uv_right[rows, 0] += peak[rows] - reach_px
     found = align_patches(template[rows], right, uv_right[rows], np.ones(len(rows)), along_row=True)
     rows, found_u = rows[found.sound], found.uv_px[found.sound, 0]
     disparity[rows] = uv_px[rows, 0] - found_u

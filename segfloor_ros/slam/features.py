@@ -65,10 +65,9 @@ class FeatureExtractor:
     def _at_full_resolution(
         self, uv: NDArray[np.float32], octave: NDArray[np.uint8], image: NDArray[np.uint8]
     ) -> NDArray[np.float32]:
-        """Return exact positions (N, 2).
-         OpenCV multiplies a corner's place in its pyramid level by the nominal scale; but levels have
-        whole sizes, and what scales is the distance from the image's outer edge, half a pixel before
-        the first pixel's centre.
+        """Return exact positions (N, 2). OpenCV multiplies a corner's place in its pyramid
+        level by the nominal scale; but levels have whole sizes, and what scales is the
+        distance from the image's outer edge, half a pixel before the first pixel's centre.
         """
         nominal = self._scale ** octave.astype(np.float64)[:, None]
         size = np.array(image.shape[::-1], np.float64)

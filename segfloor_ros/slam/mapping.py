@@ -15,8 +15,9 @@ from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking import DISPARITY_REACH_PX, MIN_SIGMA_DISPARITY
+from segfloor_ros.slam.tracking import MIN_SIGMA_DISPARITY
 
+DISPARITY_REACH_PX = 4
 MIN_DISPARITY_PX = 1.0
 MIN_SHARED_POINTS = 15
 SETTLING_KEYFRAMES = 2

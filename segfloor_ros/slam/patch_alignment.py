@@ -27,6 +27,9 @@ AFFINE_SIGMA = 0.3
 GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck."""
 
+MAX_UNEXPLAINED = 0.5
+"""Share of a patch's variance that may remain after a fit."""
+
 MAX_SHIFT_PX = 2.0
 MAX_LAST_STEP_PX = 0.1
 
@@ -54,57 +57,62 @@ def align_patches(
     """Find where patches lie in an image, starting from a position that is right to a pixel or two.
      template: (N, SIDE_PX, SIDE_PX) grey levels. image: (H, W) float32. start_uv_px: (N, 2). zoom:
     (N,) how much larger the patch appears in the image than in the template. along_row: the match
-    of a rectified pair, only u is unknown. A fit is sound when it stays near its start, has
-    settled, and explains the patch better than a plain grey level.
+    of a rectified pair, where only u is unknown. Inverse compositional Gauss-Newton: slopes and
+    normal equations come from the template, once. A fit is sound when it stays near its start, has
+    settled, and explains the patch better than a plain grey level would.
     """
-    x, y, window = _raster()
-    pixels = template.reshape(len(template), -1)
-    rows = 1 if along_row else 2
-    shift = np.zeros(
-        (len(template), rows, 3), np.float32
-    )  # per row: offset, slope in x, slope in y
-    shift[:, 0, 1] = zoom
-    if not along_row:
-        shift[:, 1, 2] = zoom
-    undistorted = shift.copy()
-    prior = np.zeros(3 * rows + 2, np.float32)
-    prior[[k for k in range(3 * rows) if k % 3]] = AFFINE_SIGMA**-2
-    start = start_uv_px.astype(np.float32)
-    sound = np.ones(len(template), bool)
-    basis = np.stack([np.ones_like(x), x, y])
+    x, y, weight = _raster()
+    pixels = 1.0 / weight.max()
+    target = template.reshape(len(template), -1)
+    J = _steepest_descent(template, x, y, weight, 1 if along_row else 2)
+    weighted = J * weight
+    H = (weighted @ np.swapaxes(J, 1, 2)).astype(np.float64)
+    A = zoom[:, None, None] * np.eye(2)
+    offset = np.zeros((len(template), 2))
+    prior = np.where(np.arange(J.shape[1]) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
+    step = np.zeros((len(template), 2, 3))
     for _ in range(STEPS):
-        warped = shift @ basis
-        u = start[:, :1] + warped[:, 0]
-        v = start[:, 1:] + (warped[:, 1] if rows == 2 else zoom[:, None].astype(np.float32) * y)
-        value, slopes = _sample(image, u, v, rows)
-        gain, offset = _brightness(value, pixels, window)
-        residual = pixels - gain[:, None] * value - offset[:, None]
-        noise = np.maximum((residual**2) @ (window / window.sum()), GREY_NOISE**2)
-        J = np.empty((len(template), 3 * rows + 2, pixels.shape[1]), np.float32)
-        for row, slope in enumerate(slopes):
-            J[:, 3 * row : 3 * row + 3] = (gain[:, None] * slope)[:, None, :] * basis
-        J[:, -2], J[:, -1] = value, 1.0
-        weighted = J * (window / noise[:, None])[:, None, :]
-        normal = weighted @ np.swapaxes(J, 1, 2)
-        rhs = (weighted @ residual[..., None])[..., 0]
-        rhs[:, : 3 * rows] -= prior[: 3 * rows] * (shift - undistorted).reshape(len(template), -1)
-        covariance = np.linalg.inv(normal.astype(np.float64) + np.diag(prior + 1e-6))
-        step = np.einsum('nab,nb->na', covariance, rhs)[:, : 3 * rows].reshape(shift.shape)
-        shift += np.clip(step, -1.0, 1.0).astype(np.float32)
-    offsets = shift[:, :, 0].astype(np.float64)
-    variance = np.einsum('naa->na', covariance)[:, : 3 * rows : 3]
-    explained = noise < 0.5 * _variance(pixels, window)
-    sound = (
-        (np.abs(offsets) < MAX_SHIFT_PX).all(axis=1)
-        & (np.abs(step[:, :, 0]) < MAX_LAST_STEP_PX).all(axis=1)
-        & explained
-        & (variance > 0).all(axis=1)
-    )
-    uv = start_uv_px.astype(np.float64).copy()
-    uv[:, :rows] += offsets
+        warped = _warp(A, x, y) + (start_uv_px + offset)[:, :, None].astype(np.float32)
+        residual = _match_brightness(_remap(image, warped[:, 0], warped[:, 1]), target, weight)
+        residual -= target
+        noise = residual**2 @ weight
+        level = np.maximum(noise, GREY_NOISE**2).astype(np.float64) / pixels
+        rhs = (weighted @ residual[..., None])[..., 0].astype(np.float64)
+        deviation = (A / zoom[:, None, None] - np.eye(2))[:, : J.shape[1] // 3]
+        rhs += (
+            level[:, None] * prior * np.pad(deviation, ((0, 0), (0, 0), (1, 0))).reshape(rhs.shape)
+        )
+        covariance = np.linalg.inv(H + level[:, None, None] * np.diag(prior + 1e-9))
+        found = np.clip(np.einsum('nab,nb->na', covariance, rhs), -1.0, 1.0)
+        step[:, : J.shape[1] // 3] = found.reshape(len(found), -1, 3)
+        A = A @ np.linalg.inv(np.eye(2) + step[:, :, 1:])
+        offset -= np.einsum('nij,nj->ni', A, step[:, :, 0])
+    variance = np.einsum('naa->na', covariance)[:, ::3] * level[:, None]
     sigma = np.zeros((len(template), 2))
-    sigma[:, :rows] = np.sqrt(np.maximum(variance, 0.0))
-    return Alignment(uv, sigma, sound)
+    sigma[:, : variance.shape[1]] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
+    sound = (
+        (np.abs(offset) < MAX_SHIFT_PX).all(axis=1)
+        & (np.abs(step[:, :, 0]) < MAX_LAST_STEP_PX).all(axis=1)
+        & (noise < MAX_UNEXPLAINED * _variance(target, weight))
+    )
+    return Alignment(start_uv_px + offset, sigma, sound)
+
+
+def _steepest_descent(
+    template: Patches, x: Patches, y: Patches, weight: Patches, axes: int
+) -> Patches:
+    """Return the change of grey level (N, 3 axes, P) per unit of offset and of the two slopes
+    of each axis, freed of what a change of brightness could explain.
+    """
+    slope_v, slope_u = np.gradient(template, axis=(1, 2))
+    basis = np.stack([np.ones_like(x), x, y])
+    slopes = np.stack([slope_u, slope_v][:axes], axis=1).reshape(len(template), axes, 1, -1)
+    J = (slopes * basis).reshape(len(template), 3 * axes, -1)
+    return J - (J @ weight)[..., None]
+
+
+def _warp(A: Array, x: Patches, y: Patches) -> Patches:
+    return A.astype(np.float32) @ np.stack([x, y])
 
 
 def correlation_along_row(
@@ -143,38 +151,23 @@ def sample_patches(
     return _remap(image, u, v).reshape(shape)
 
 
-def _raster() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return x, y (P,) of a patch's pixels from its centre, and a Gaussian window (P,)."""
+def _raster() -> tuple[Patches, Patches, Patches]:
+    """Return x, y (P,) of a patch's pixels from its centre, and Gaussian weights (P,) of sum 1."""
     steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
     y, x = np.meshgrid(steps, steps, indexing='ij')
     window = np.exp(-0.5 * (x**2 + y**2) / (0.6 * HALF_PATCH_PX) ** 2)
-    return x.ravel(), y.ravel(), window.ravel()
+    return x.ravel(), y.ravel(), (window / window.sum()).ravel()
 
 
-def _brightness(value: Patches, target: Patches, window: Patches) -> tuple[Patches, Patches]:
-    """Return gain and offset (N,) that bring patches (N, P) nearest to their targets."""
-    weight = window / window.sum()
+def _match_brightness(value: Patches, target: Patches, weight: Patches) -> Patches:
+    """Return patches (N, P) with the gain and offset that bring them nearest to their targets."""
     centred = value - (value @ weight)[:, None]
-    gain = (centred * target) @ weight / np.maximum((centred**2) @ weight, 1e-3)
-    return gain, target @ weight - gain * (value @ weight)
+    gain = (centred * target) @ weight / np.maximum(centred**2 @ weight, 1e-3)
+    return gain[:, None] * centred + (target @ weight)[:, None]
 
 
-def _variance(patches: Patches, window: Patches) -> Patches:
-    weight = window / window.sum()
+def _variance(patches: Patches, weight: Patches) -> Patches:
     return (patches - (patches @ weight)[:, None]) ** 2 @ weight
-
-
-def _sample(
-    image: NDArray[np.float32], u: Patches, v: Patches, axes: int
-) -> tuple[Patches, list[Patches]]:
-    """Return grey values at (N, P) positions and their slopes along u and, with two axes,
-    along v.
-    """
-    half = np.float32(0.5)
-    slopes = [_remap(image, u + half, v) - _remap(image, u - half, v)]
-    if axes == 2:
-        slopes.append(_remap(image, u, v + half) - _remap(image, u, v - half))
-    return _remap(image, u, v), slopes
 
 
 def _remap(image: NDArray[np.float32], u: Patches, v: Patches) -> Patches:

@@ -26,7 +26,6 @@ level.
 
 MIN_SIGMA_PIXEL = 0.15
 MIN_SIGMA_DISPARITY = 0.1
-DISPARITY_REACH_PX = 4
 WIDE_SEARCH = 3.0
 """Factor on the search radius when the first search finds too little."""
 
@@ -258,7 +257,7 @@ class Tracker:
         guess_px: Array,
     ) -> None:
         disparity, sigma = refine_disparity(
-            left, right, observations.uvd_px[rows, :2], guess_px, DISPARITY_REACH_PX
+            left, right, observations.uvd_px[rows, :2], guess_px, reach_px=0
         )
         observations.uvd_px[rows, 2] = disparity
         observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
