@@ -13,7 +13,12 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation.floor_plan import is_map_file, scene_of_map
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import read_yaml, scene_from_mapping, shipped_scenes
+from segfloor_ros.simulation.scene_file import (
+    read_scene_values,
+    read_yaml,
+    scene_from_mapping,
+    shipped_scenes,
+)
 
 
 def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
@@ -28,9 +33,10 @@ def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
     file = path if path.exists() else shipped[name]
     if file.is_dir():
         raise InputError(f'{name}: is a folder; name a scene file or a map YAML')
-    values = read_yaml(file)
-    if is_map_file(values):
+    if is_map_file(read_yaml(file)):
         values = scene_of_map(file, assigned({}, assignments))
+    else:
+        values = read_scene_values(file)
     return scene_from_mapping(assigned(values, assignments), name)
 
 

@@ -81,7 +81,7 @@ def _side_uv(
     """Return texture coordinates of the sides' vertices. Flat sides take the position along them,
     so that a pattern runs on over adjoining solids; round ones the way around.
     """
-    if prism.fit:
+    if prism.is_sheet:
         return np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (len(lengths), 1))
     start = np.cumsum(lengths) - lengths
     if not prism.smooth:

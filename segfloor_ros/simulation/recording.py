@@ -126,7 +126,7 @@ def write_truth(folder: Path, simulation: Simulation) -> None:
 def _write_calibration(folder: Path, simulation: Simulation) -> None:
     left, right = simulation.imaging.raw
     if simulation.scene.camera.rectified:
-        rows = [f'P{i}: ' + ' '.join(f'{v:.12g}' for v in side.P.ravel())
+        rows = [f'P{i}: ' + ' '.join(f'{v:.12g}' for v in side.P.ravel() + 0.0)
                 for i, side in enumerate((left, right))]  # fmt: skip
         (folder / 'calib.txt').write_text('\n'.join(rows) + '\n')
         return

@@ -24,7 +24,29 @@ def shipped_scenes() -> dict[str, Path]:
 
 def load_scene(path: Path) -> Scene:
     """Read a scene file. Raises InputError naming the file, the entry and what is wrong with it."""
-    return scene_from_mapping(read_yaml(path), str(path))
+    return scene_from_mapping(read_scene_values(path), str(path))
+
+
+def read_scene_values(path: Path) -> dict[str, Any]:
+    """Return what a scene file says. `like: NAME` takes over everything from a shipped scene that
+    the file does not say itself; lists are replaced as a whole. Raises InputError.
+    """
+    values = read_yaml(path)
+    if 'like' not in values:
+        return values
+    name, shipped = str(values.pop('like')), shipped_scenes()
+    if name not in shipped or shipped[name] == path:
+        raise InputError(f'{path}: like: {name} is no shipped scene{suggestion(name, [*shipped])}')
+    return _merged(read_scene_values(shipped[name]), values)
+
+
+def _merged(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    result = dict(values)
+    for key, change in changes.items():
+        inner = result.get(key)
+        both = isinstance(inner, dict) and isinstance(change, dict)
+        result[key] = _merged(inner, change) if both else change  # type: ignore[arg-type]
+    return result
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

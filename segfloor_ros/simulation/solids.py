@@ -32,8 +32,8 @@ POSTER_VARIANTS = 6
 @dataclass(frozen=True)
 class Prism:
     """A solid over a convex footprint (K, 2), counter-clockwise, between the heights bottom_m and
-    top_m (K,) of its corners. is_floor: its top can be driven on. fit: stretch the texture once
-    over each side rather than repeat it. smooth: shade the sides as one round surface.
+    top_m (K,) of its corners. is_floor: its top can be driven on. is_sheet: a sheet on a wall,
+    its picture shown once on each side; no obstacle. smooth: shade the sides as one round surface.
     """
 
     footprint: Array
@@ -41,7 +41,7 @@ class Prism:
     top_m: Array
     texture: str
     is_floor: bool = False
-    fit: bool = False
+    is_sheet: bool = False
     smooth: bool = False
 
 
@@ -51,12 +51,14 @@ def block(
     texture: str,
     yaw_deg: float = 0.0,
     bottom_m: float = 0.0,
-    fit: bool = False,
+    is_sheet: bool = False,
 ) -> Prism:
     """Return a box of length, width and height."""
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size[:2]
     footprint = corners @ _turn(yaw_deg).T + np.array(at)
-    return Prism(footprint, np.full(4, bottom_m), np.full(4, bottom_m + size[2]), texture, fit=fit)
+    return Prism(
+        footprint, np.full(4, bottom_m), np.full(4, bottom_m + size[2]), texture, is_sheet=is_sheet
+    )
 
 
 def cylinder(
@@ -121,7 +123,7 @@ def _posters(scene: Scene) -> list[Prism]:
             bottom_m = min(rng.uniform(0.2, 1.2), wall.height_m - tall)
             texture = f'poster:{rng.integers(POSTER_VARIANTS)}'
             size = (wide, POSTER_THICKNESS_M, tall)
-            solids.append(block((at[0], at[1]), size, texture, yaw_deg, bottom_m, fit=True))
+            solids.append(block((at[0], at[1]), size, texture, yaw_deg, bottom_m, is_sheet=True))
     return solids
 
 

@@ -42,9 +42,10 @@ def true_map(
 
     Raises InputError when the start is on an obstacle.
     """
-    grid = _empty_grid(scene, obstacles, start)
+    standing = [prism for prism in obstacles if not prism.is_sheet]
+    grid = _empty_grid(scene, standing, start)
     blocked = np.zeros(grid.cells.shape, bool)
-    for prism in obstacles:
+    for prism in standing:
         _mark(blocked, grid, scene, prism, floors)
     column, row = ((start - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(int)
     if blocked[row, column]:
