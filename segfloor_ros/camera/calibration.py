@@ -181,7 +181,7 @@ class StereoCalibration:
         rectification as in `cv2.stereoRectify`, cropped to the pixels both images have.
         """
         size = (left.width, left.height)
-        rotation, translation = T_right_left[:3, :3].copy(), T_right_left[:3, 3].copy()
+        rotation, translation = T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()
         eyes = (left.K, left.D, right.K, right.D, size, rotation, translation)
         if left.distortion_model != right.distortion_model:
             raise CalibrationError(

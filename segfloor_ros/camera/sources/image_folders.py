@@ -12,11 +12,10 @@ from segfloor_ros.camera.sources.files import (
     FilePairSource,
     check_equal_numbers,
     images_in,
-    read_times,
-    stamps_of_rate,
 )
 from segfloor_ros.camera.sources.found_calibration import find_calibration
 from segfloor_ros.camera.sources.sides import is_side, side_pairs
+from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
 from segfloor_ros.errors import InputError
 
 TIME_FILES = ('times.txt', 'timestamps.txt')

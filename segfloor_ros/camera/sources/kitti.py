@@ -16,10 +16,9 @@ from segfloor_ros.camera.sources.files import (
     check_equal_numbers,
     first_image_size,
     images_in,
-    read_times,
-    stamps_of_rate,
 )
 from segfloor_ros.camera.sources.found_calibration import given_calibration
+from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
 from segfloor_ros.errors import InputError
 
 CAMERAS = ((0, 1), (2, 3))

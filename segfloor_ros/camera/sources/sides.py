@@ -37,5 +37,5 @@ def side_pairs(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def is_side(name: str, side: int) -> bool:
-    """Whether `name` holds a word for the left (0) or the right (1) side."""
-    return any(words[side] in name for words in SIDES)
+    """Whether `name` says, in letters, that it is the left (0) or the right (1) side."""
+    return ('left', 'right')[side] in name.lower()
