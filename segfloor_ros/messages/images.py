@@ -1,4 +1,4 @@
-"""Images as messages. Sizes are checked against the data before anything is copied."""
+"""Images as messages."""
 
 from __future__ import annotations
 
@@ -8,67 +8,61 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
+from segfloor_ros.camera.images import Grey, decode_raw
+from segfloor_ros.errors import InputError
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
 
 MAX_PIXELS = 50_000_000
-
-_ENCODINGS: dict[str, tuple[str, int]] = {
-    'mono8': ('u1', 1),
-    '8UC1': ('u1', 1),
-    'mono16': ('u2', 1),
-    '16UC1': ('u2', 1),
-    '32FC1': ('f4', 1),
-    'bgr8': ('u1', 3),
-    'rgb8': ('u1', 3),
-    '8UC3': ('u1', 3),
-    'bgra8': ('u1', 4),
-    'rgba8': ('u1', 4),
-    'bayer_rggb8': ('u1', 1),
-    'bayer_bggr8': ('u1', 1),
-    'bayer_gbrg8': ('u1', 1),
-    'bayer_grbg8': ('u1', 1),
-}
+ENCODINGS = {'mono8': np.uint8, 'mono16': np.uint16, '32FC1': np.float32}
+"""What this package publishes."""
 
 
 def image_message(
-    stamp_ns: int, frame_id: str, image: NDArray[np.generic], encoding: str = 'mono8'
+    stamp_ns: int, frame_id: str, image: NDArray[np.generic], encoding: str = ''
 ) -> Image:
-    """Return an image (H, W) or (H, W, C) as a message. The array's type must suit the encoding."""
-    code, channels = _ENCODINGS[encoding]
-    pixels = np.ascontiguousarray(image, np.dtype('<' + code))
-    height, width = pixels.shape[:2]
+    """Return an image (H, W) as a message; grey images of 8 and 16 bits need no encoding."""
+    if not encoding:
+        encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
+    assert image.dtype == ENCODINGS[encoding], (image.dtype, encoding)
+    pixels = np.ascontiguousarray(image)
+    height, width = pixels.shape
     return Image(
         header=make_header(stamp_ns, frame_id),
         height=height,
         width=width,
         encoding=encoding,
         is_bigendian=0,
-        step=width * channels * pixels.itemsize,
+        step=width * pixels.itemsize,
         data=array.array('B', pixels.tobytes()),
     )
 
 
-def image_array(message: Image, topic: str) -> NDArray[np.generic]:
-    """Return the pixels (H, W) or (H, W, C) of a message, without padding.
+def grey_image(message: Image, topic: str) -> Grey:
+    """Return the grey image (H, W) of a message, uint8 or uint16; colour becomes grey.
 
-    Raises MessageError, naming the topic, for an unknown encoding or sizes that contradict.
+    Raises MessageError, naming the topic, for an encoding that is no picture or sizes that
+    contradict the data.
     """
-    if message.encoding not in _ENCODINGS:
-        raise MessageError(
-            f'{topic}: images of encoding {message.encoding!r} are not taken; publish one of '
-            + ', '.join(_ENCODINGS)
+    width, height = int(message.width), int(message.height)
+    if width * height > MAX_PIXELS:
+        raise MessageError(f'{topic}: an image of {width}x{height} pixels is not taken')
+    try:
+        return decode_raw(
+            np.frombuffer(message.data, np.uint8),
+            width=width,
+            height=height,
+            encoding=message.encoding,
+            step=int(message.step),
+            is_bigendian=bool(message.is_bigendian),
         )
-    code, channels = _ENCODINGS[message.encoding]
-    dtype = np.dtype(('>' if message.is_bigendian else '<') + code)
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    row_bytes = width * channels * dtype.itemsize
-    if not 0 < height * width <= MAX_PIXELS or step < row_bytes:
-        raise MessageError(f'{topic}: an image of {width}x{height} with rows of {step} bytes')
-    if len(message.data) != height * step:
-        raise MessageError(
-            f'{topic}: {len(message.data)} bytes do not make {height} rows of {step} bytes'
-        )
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, :row_bytes]
-    pixels = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder('='), copy=False)
-    return pixels if channels == 1 else pixels.reshape(height, width, channels)
+    except InputError as error:
+        raise MessageError(f'{topic}: {error}') from None
+
+
+def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
+    """Return the grey image (H, W) of a message of 8 bits. Raises MessageError."""
+    image = grey_image(message, topic)
+    if image.dtype != np.uint8:
+        raise MessageError(f'{topic}: {message.encoding} has 16 bits, expected mono8')
+    return image.astype(np.uint8, copy=False)

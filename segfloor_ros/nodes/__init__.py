@@ -1,1 +1,1 @@
-"""The ROS nodes: parameters and topics, nothing else."""
+"""The five ROS 2 nodes: parameters and topics around the stages."""

@@ -1,0 +1,52 @@
+"""Calibrations as messages."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from sensor_msgs.msg import CameraInfo
+
+from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.messages.headers import make_header
+
+
+def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
+    """Return the calibration of one eye; both eyes carry the left optical frame (REP-104: the
+    right one's offset stands in P[3]).
+    """
+    return CameraInfo(
+        header=make_header(stamp_ns, frame_id),
+        width=int(eye.width),
+        height=int(eye.height),
+        distortion_model=eye.distortion_model,
+        d=array.array('d', np.asarray(eye.D, np.float64).tobytes()),
+        k=np.asarray(eye.K, np.float64).ravel(),
+        r=np.asarray(eye.R, np.float64).ravel(),
+        p=np.asarray(eye.P, np.float64).ravel(),
+    )
+
+
+def eye_calibration(message: CameraInfo, topic: str) -> EyeCalibration:
+    """Return the calibration of one eye. Raises CalibrationError, naming the topic."""
+    return EyeCalibration(
+        int(message.width),
+        int(message.height),
+        np.array(message.k, np.float64),
+        np.array(message.d, np.float64),
+        np.array(message.r, np.float64),
+        np.array(message.p, np.float64),
+        message.distortion_model,
+        topic,
+    )
+
+
+def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
+    """Return the calibration of rectified images of a camera."""
+    P = np.zeros((3, 4))
+    P[:, :3] = camera.K
+    left = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    P[0, 3] = -camera.disparity_times_depth
+    right = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    return StereoCalibration(left, right)

@@ -1,0 +1,210 @@
+"""The topics between the nodes: name, type, quality of service, who publishes and who listens.
+
+The nodes, the documentation and the replay take them from here. Names are relative, so that
+namespaces and remapping apply. Every message about one keyframe carries that keyframe's stamp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image, LaserScan, PointCloud2
+from stereo_msgs.msg import DisparityImage
+
+from segfloor_ros.messages import qos
+
+CAMERA, SLAM = 'stereo_camera', 'stereo_slam'
+FLOOR, CLOUD, GRID = 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'
+NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
+"""The nodes in the order of the data flow."""
+
+OTHERS = ''
+"""In place of a publisher: nodes outside of this package."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic. about: what its messages hold, with units and frames."""
+
+    name: str
+    type: type[Any]
+    profile: QoSProfile
+    publisher: str
+    subscribers: tuple[str, ...]
+    about: str
+
+    @property
+    def type_name(self) -> str:
+        """The type as in `ros2 topic info`, e.g. `sensor_msgs/msg/Image`."""
+        return f'{self.type.__module__.split(".")[0]}/msg/{self.type.__name__}'
+
+
+def _images() -> list[Topic]:
+    topics = []
+    for side in ('left', 'right'):
+        image, info = f'{side}/image_raw', f'{side}/camera_info'
+        topics += [
+            Topic(image, Image, qos.IMAGES, CAMERA, (SLAM,), f'{side.capitalize()} image, raw.'),
+            Topic(
+                f'{side}/image_rect',
+                Image,
+                qos.IMAGES,
+                OTHERS,
+                (SLAM,),
+                f'{side.capitalize()} image, rectified; taken instead of {image} by parameter.',
+            ),
+            Topic(info, CameraInfo, qos.IMAGES, CAMERA, (SLAM,), f'Calibration for {image}.'),
+        ]
+    return topics
+
+
+def _keyframe_images() -> list[Topic]:
+    topics = []
+    for side in ('left', 'right'):
+        image, info = f'keyframe/{side}/image_rect', f'keyframe/{side}/camera_info'
+        about = f'{side.capitalize()} image of the keyframe, rectified, mono8.'
+        topics += [
+            Topic(image, Image, qos.KEYFRAMES, SLAM, (FLOOR,), about),
+            Topic(info, CameraInfo, qos.KEYFRAMES, SLAM, (FLOOR,), f'Calibration for {image}.'),
+        ]
+    return topics
+
+
+_ALL = [
+    *_images(),
+    Topic(
+        'odometry',
+        Odometry,
+        qos.ODOMETRY,
+        SLAM,
+        (),
+        'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
+        'lost.',
+    ),
+    Topic(
+        'camera_mount',
+        TransformStamped,
+        qos.LATCHED,
+        SLAM,
+        (FLOOR,),
+        'Left optical frame in base_link: given, from tf, or measured from the floor.',
+    ),
+    Topic(
+        'keyframe/odometry',
+        Odometry,
+        qos.KEYFRAMES,
+        SLAM,
+        (FLOOR, GRID),
+        'base_link in map at the keyframe.',
+    ),
+    *_keyframe_images(),
+    Topic(
+        'keyframe/features',
+        PointCloud2,
+        qos.KEYFRAMES,
+        SLAM,
+        (CLOUD, GRID),
+        'Features of the keyframe: x y z in map (m, NaN where unknown), u v (px), id (-1: none).',
+    ),
+    Topic(
+        'keyframe/path',
+        Path,
+        qos.KEYFRAMES,
+        SLAM,
+        (GRID,),
+        'base_link in map of all keyframes as now optimised; each pose with its own stamp.',
+    ),
+    Topic(
+        'map_points',
+        PointCloud2,
+        qos.KEYFRAMES,
+        SLAM,
+        (CLOUD,),
+        'The whole sparse map: x y z in map (m) and id; a removed point disappears.',
+    ),
+    Topic(
+        'keyframe/disparity',
+        DisparityImage,
+        qos.KEYFRAMES,
+        FLOOR,
+        (),
+        'Disparity of the keyframe, 0 where there is no match. Published while someone listens.',
+    ),
+    Topic(
+        'keyframe/floor_mask',
+        Image,
+        qos.KEYFRAMES,
+        FLOOR,
+        (CLOUD,),
+        'mono8 on the rectified left image: 255 floor, 127 no evidence, 0 not floor.',
+    ),
+    Topic(
+        'keyframe/floor_scan',
+        LaserScan,
+        qos.KEYFRAMES,
+        FLOOR,
+        (GRID,),
+        "How far the floor was seen per bearing, in the base's plane (m); 0: blocked right in "
+        'front, NaN: not seen.',
+    ),
+    Topic(
+        'labelled_points',
+        PointCloud2,
+        qos.KEYFRAMES,
+        CLOUD,
+        (GRID,),
+        'The sparse map with labels: x y z in map (m), id, confidence (0 to 1), label (0 unknown, '
+        '1 floor, 2 obstacle).',
+    ),
+    Topic(
+        'floor_points',
+        PointCloud2,
+        qos.KEYFRAMES,
+        CLOUD,
+        (),
+        'The floor points alone: x y z id. Published while someone listens.',
+    ),
+    Topic(
+        'obstacle_points',
+        PointCloud2,
+        qos.KEYFRAMES,
+        CLOUD,
+        (),
+        'The obstacle points alone: x y z id. Published while someone listens.',
+    ),
+    Topic(
+        'map',
+        OccupancyGrid,
+        qos.LATCHED,
+        GRID,
+        (),
+        'The map: 0 free to 100 occupied, -1 unknown; its stamp is that of the latest keyframe.',
+    ),
+]
+TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ALL}
+"""All topics by name, in the order of the data flow."""
+
+DIAGNOSTICS = Topic(
+    '/diagnostics',
+    DiagnosticArray,
+    qos.DIAGNOSTICS,
+    '',
+    (),
+    'Status of the node; the header carries the stamp of the frame or keyframe it is about.',
+)
+"""Published by every node."""
+
+
+def published_by(node: str) -> list[Topic]:
+    """Return the topics of a node's publishers, without diagnostics."""
+    return [topic for topic in TOPICS.values() if topic.publisher == node]
+
+
+def subscribed_by(node: str) -> list[Topic]:
+    """Return the topics a node may subscribe to, without diagnostics."""
+    return [topic for topic in TOPICS.values() if node in topic.subscribers]

@@ -1,0 +1,115 @@
+"""Parameters that only the ROS nodes have: frames, rates and topics' quality of service.
+
+They are declared like the settings of the stages, which know nothing of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from segfloor_ros.settings import StageSettings, setting
+
+
+@dataclass(frozen=True)
+class NodeSettings(StageSettings):
+    """Base of the settings of one node."""
+
+    @classmethod
+    def stage_name(cls) -> str:
+        """Return the node's name: `StereoSlamNodeSettings` → `stereo_slam`."""
+        return super().stage_name().removesuffix('_node')
+
+
+@dataclass(frozen=True)
+class StereoCameraNodeSettings(NodeSettings):
+    """How a recording is played."""
+
+    rate: float = setting(
+        1.0,
+        'Speed of a recording against real time; 0: as fast as the chain takes it, without loss.',
+        minimum=0.0,
+        maximum=100.0,
+    )
+    start_paused: bool = setting(False, 'Wait for the service ~/pause before the first frame.')
+    left_frame: str = setting('left_camera_optical_frame', 'Optical frame of the left camera.')
+    right_frame: str = setting('right_camera_optical_frame', 'Optical frame of the right camera.')
+
+
+@dataclass(frozen=True)
+class StereoSlamNodeSettings(NodeSettings):
+    """Frames, images and tf."""
+
+    map_frame: str = setting('map', 'Frame of the map.')
+    odom_frame: str = setting('odom', 'Continuous frame of the odometry.')
+    base_frame: str = setting('base_link', 'Frame of the robot, on the floor.')
+    publish_tf: bool = setting(True, 'Broadcast map to odom (needs tf2_ros).')
+    publish_odom_tf: bool = setting(
+        True, 'Broadcast odom to base_link; off where another node owns it.'
+    )
+    tf_wait_s: float = setting(
+        1.0,
+        'How long to wait for the mount of the camera on tf before measuring it.',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
+    rectified_input: bool = setting(
+        False, 'Take left/image_rect and right/image_rect instead of the raw images.'
+    )
+    image_reliability: str = setting(
+        'reliable',
+        'Quality of service of the image subscriptions; best_effort where a driver offers no more.',
+        choices=('reliable', 'best_effort'),
+    )
+    sync_tolerance_s: float = setting(
+        0.005,
+        'Largest difference of stamps of a left and a right image of one pair.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.5,
+    )
+
+
+@dataclass(frozen=True)
+class FloorSegmentationNodeSettings(NodeSettings):
+    """Nothing beyond the stage's own settings."""
+
+
+@dataclass(frozen=True)
+class CloudLabellingNodeSettings(NodeSettings):
+    """Nothing beyond the stage's own settings."""
+
+
+@dataclass(frozen=True)
+class OccupancyGridNodeSettings(NodeSettings):
+    """When the map is published and where it is saved."""
+
+    publish_period_s: float = setting(
+        1.0,
+        'The map is published at most this often; a change is never held back for longer.',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    map_file: str = setting(
+        'map.yaml', 'File that the service save_map writes, with the image beside it.', live=True
+    )
+
+
+NODE_SETTINGS: dict[str, type[NodeSettings]] = {
+    cls.stage_name(): cls
+    for cls in (
+        StereoCameraNodeSettings,
+        StereoSlamNodeSettings,
+        FloorSegmentationNodeSettings,
+        CloudLabellingNodeSettings,
+        OccupancyGridNodeSettings,
+    )
+}
+"""The settings of the five nodes by name."""
+
+
+def is_node_parameter(node: str, name: str) -> bool:
+    """Return whether a node has a parameter of this name beside its stage's settings."""
+    return any(spec.name == name for spec in NODE_SETTINGS[node].specs())

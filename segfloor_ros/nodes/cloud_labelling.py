@@ -1,0 +1,63 @@
+"""Node `cloud_labelling`: sparse map, features and floor mask in, labelled points out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from segfloor_ros.cloud.labelled_cloud import CloudLabelling
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.messages.clouds import (
+    features_arrays,
+    labelled_message,
+    points_of_label,
+    sparse_cloud_arrays,
+)
+from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.node_settings import CloudLabellingNodeSettings
+from segfloor_ros.nodes.stage_node import StageNode, run_node
+
+MAP_POINTS, FEATURES, MASK = 'map_points', 'keyframe/features', 'keyframe/floor_mask'
+
+
+class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
+    """Labels the sparse map at every keyframe."""
+
+    def __init__(self) -> None:
+        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
+        self._stage = CloudLabelling(self.parameters.stage)
+        self._labelled = self.output('labelled_points')
+        self._by_label = {
+            FLOOR: self.output('floor_points'),
+            OBSTACLE: self.output('obstacle_points'),
+        }
+        self.join((MAP_POINTS, FEATURES, MASK), self._take)
+
+    def on_settings_changed(self) -> None:
+        """Label the next keyframe with the new settings."""
+        self._stage.settings = self.parameters.stage
+
+    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        self.work(stamp_ns, lambda: self._label(stamp_ns, parts))
+
+    def _label(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
+        cloud = sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
+        features = features_arrays(parts[FEATURES], FEATURES)
+        mask = grey8_image(parts[MASK], MASK)
+        labelled = self._stage.update(cloud, features, mask)
+        frame_id = parts[MAP_POINTS].header.frame_id
+        self._labelled.publish(labelled_message(stamp_ns, frame_id, labelled))
+        for label, output in self._by_label.items():
+            if output.get_subscription_count():
+                output.publish(points_of_label(stamp_ns, frame_id, labelled, label))
+        return {'points': len(labelled.point_id)}
+
+
+def main() -> None:
+    """Run the node."""
+    run_node(CloudLabellingNode)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,89 @@
+"""Node `floor_segmentation`: keyframe images in, disparity, floor mask and floor scan out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+
+from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.messages.camera_info import eye_calibration
+from segfloor_ros.messages.floor import disparity_message, scan_message
+from segfloor_ros.messages.images import grey8_image, image_message
+from segfloor_ros.messages.poses import pose_array, transform_array
+from segfloor_ros.node_settings import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.stage_node import StageNode, run_node
+
+LEFT, RIGHT = 'keyframe/left/image_rect', 'keyframe/right/image_rect'
+LEFT_INFO, RIGHT_INFO = 'keyframe/left/camera_info', 'keyframe/right/camera_info'
+POSE = 'keyframe/odometry'
+MAX_WAITING_FOR_MOUNT = 100
+
+
+class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentationNodeSettings]):
+    """Segments the floor of every keyframe."""
+
+    def __init__(self) -> None:
+        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings)
+        self._mount: Mount | None = None
+        self._base_frame = ''
+        self._camera: StereoCamera | None = None
+        self._stage: FloorSegmentation | None = None
+        self._waiting: list[tuple[int, dict[str, Any]]] = []
+        self._disparity = self.output('keyframe/disparity')
+        self._mask = self.output('keyframe/floor_mask')
+        self._scan = self.output('keyframe/floor_scan')
+        self.listen('camera_mount', self._take_mount)
+        self.join((LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE), self._take)
+
+    def on_settings_changed(self) -> None:
+        """Segment the next keyframe with the new settings."""
+        self._stage = None
+
+    def _take_mount(self, message: TransformStamped) -> None:
+        self._mount = Mount.from_transform(transform_array(message))
+        self._base_frame = message.header.frame_id
+        waiting, self._waiting = self._waiting, []
+        for stamp_ns, parts in waiting:
+            self._take(stamp_ns, parts)
+
+    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        if self._mount is None:
+            # The mount travels on a topic of its own and may come a moment later.
+            self._waiting = [*self._waiting, (stamp_ns, parts)][-MAX_WAITING_FOR_MOUNT:]
+            return
+        self.work(stamp_ns, lambda: self._segment(stamp_ns, parts))
+
+    def _segment(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
+        assert self._mount is not None
+        stage, camera = self._stage_for(parts)
+        frame_id = parts[LEFT].header.frame_id
+        left, right = grey8_image(parts[LEFT], LEFT), grey8_image(parts[RIGHT], RIGHT)
+        T_map_base = pose_array(parts[POSE].pose.pose)
+        floor = stage.process(left, right, self._mount, T_map_base)
+        self._mask.publish(image_message(stamp_ns, frame_id, floor.mask))
+        self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
+        if self._disparity.get_subscription_count():
+            self._disparity.publish(disparity_message(stamp_ns, frame_id, camera, floor))
+        return {}
+
+    def _stage_for(self, parts: Mapping[str, Any]) -> tuple[FloorSegmentation, StereoCamera]:
+        eyes = (eye_calibration(parts[topic], topic) for topic in (LEFT_INFO, RIGHT_INFO))
+        camera = StereoCalibration(*eyes).camera
+        if self._stage is None or camera != self._camera:
+            self._camera = camera
+            self._stage = FloorSegmentation(camera, self.parameters.stage)
+        return self._stage, camera
+
+
+def main() -> None:
+    """Run the node."""
+    run_node(FloorSegmentationNode)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,119 @@
+"""ROS parameters from settings: descriptors, ranges, checks and changes while running."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from segfloor_ros.configuration import ROS_PARAMETERS, STAGE_SETTINGS
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.node_settings import NODE_SETTINGS, NodeSettings
+from segfloor_ros.settings import SettingSpec, StageSettings, suggestion
+
+Settings = TypeVar('Settings', bound=StageSettings)
+Stage = TypeVar('Stage', bound=StageSettings)
+Own = TypeVar('Own', bound=NodeSettings)
+
+INT_RANGE = (-(2**63), 2**63 - 1)
+FLOAT_RANGE = (-sys.float_info.max, sys.float_info.max)
+
+
+def descriptor(spec: SettingSpec) -> ParameterDescriptor:
+    """Return the descriptor of a setting. The type stays open, so that `1` is taken for 1.0 as on
+    the command line; the check of the setting decides.
+    """
+    unit = f' [{spec.unit}]' if spec.unit else ''
+    result = ParameterDescriptor(
+        name=spec.name,
+        description=spec.description + unit,
+        additional_constraints=spec.range_text(),
+        read_only=not spec.live,
+        dynamic_typing=True,
+    )
+    bounded = spec.minimum is not None or spec.maximum is not None
+    if bounded and spec.type is int:
+        low, high = _bounds(spec, INT_RANGE)
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+    # rclpy holds not-a-number ("to be measured") to be out of every range.
+    if bounded and spec.type is float and spec.default == spec.default:
+        low, high = _bounds(spec, FLOAT_RANGE)
+        result.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
+        ]
+    return result
+
+
+class NodeParameters(Generic[Stage, Own]):
+    """The parameters of one node: those of its stage and its own.
+
+    The node must have been created with `automatically_declare_parameters_from_overrides`, which
+    is how unknown names are found. Raises SettingsError naming parameter, value and range.
+    """
+
+    def __init__(self, node: Node, stage: Stage, own: Own) -> None:
+        self.stage = stage
+        self.own = own
+        self._read_overrides(node)
+        both: tuple[StageSettings, StageSettings] = (self.stage, self.own)
+        for settings in both:
+            for spec in settings.specs():
+                node.declare_parameter(
+                    spec.name, getattr(settings, spec.name), descriptor(spec), True
+                )
+
+    def change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Take over new values of live parameters, or none of them with the reason."""
+        values = {parameter.name: parameter.value for parameter in parameters}
+        try:
+            stage, own = _changed(self.stage, values), _changed(self.own, values)
+        except SettingsError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.stage, self.own = stage, own
+        return SetParametersResult(successful=True)
+
+    def _read_overrides(self, node: Node) -> None:
+        names = [
+            name
+            for name in node.get_parameters_by_prefix('')
+            if name.partition('.')[0] not in ROS_PARAMETERS
+        ]
+        given = {name: node.get_parameter(name).value for name in names}
+        self._refuse_unknown(given)
+        self.stage, self.own = _changed(self.stage, given), _changed(self.own, given)
+        for name in given:
+            node.undeclare_parameter(name)
+
+    def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
+        known = [spec.name for spec in (*self.stage.specs(), *self.own.specs())]
+        # A section `/**` of a parameter file reaches every node; names of other nodes are fine.
+        of_all: tuple[type[StageSettings], ...] = (
+            *STAGE_SETTINGS.values(),
+            *NODE_SETTINGS.values(),
+        )
+        elsewhere = {spec.name for settings in of_all for spec in settings.specs()}
+        for name in given:
+            if name not in known and name not in elsewhere:
+                node = self.stage.stage_name()
+                raise SettingsError(f'unknown parameter {node}.{name}{suggestion(name, known)}')
+
+
+def _changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
+    names = {field.name for field in dataclasses.fields(settings)}
+    return settings.replaced(**{name: values[name] for name in names & values.keys()})
+
+
+def _bounds(spec: SettingSpec, widest: tuple[float, float]) -> tuple[float, float]:
+    low = widest[0] if spec.minimum is None else spec.minimum
+    high = widest[1] if spec.maximum is None else spec.maximum
+    return low, high

@@ -1,0 +1,189 @@
+"""What the five nodes have in common: parameters, topics by name, status, and a clean end."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+from segfloor_ros.errors import SegfloorError
+from segfloor_ros.memory import rss_mb
+from segfloor_ros.messages.diagnostics import Level, Status, status_message
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.node_settings import NodeSettings
+from segfloor_ros.nodes.parameters import NodeParameters
+from segfloor_ros.settings import StageSettings
+
+Stage = TypeVar('Stage', bound=StageSettings)
+Own = TypeVar('Own', bound=NodeSettings)
+
+CONNECTION_CHECK_S = 0.1
+HEARTBEAT_S = 1.0
+REPEAT_FAULT_S = 5.0
+CONNECTIONS = 'connections'
+"""Kind of the status that says how many subscribers each topic of the node has."""
+
+
+class StageNode(Node, Generic[Stage, Own]):
+    """A node around one stage. Subclasses create the topics and hand messages to the stage.
+
+    Callbacks run one after the other; the depth of the subscriptions is the queue. A fault of a
+    message or of the stage is one line in the log and one status; the node lives on.
+    """
+
+    def __init__(self, stage: type[Stage], own: type[Own]) -> None:
+        super().__init__(stage.stage_name(), automatically_declare_parameters_from_overrides=True)
+        self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
+        self.add_on_set_parameters_callback(self._change_parameters)
+        self._diagnostics = self.create_publisher(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
+        )
+        self._outputs: dict[str, Publisher] = {}
+        self._connections: dict[str, str] = {}
+        self._last_heartbeat_s = 0.0
+        self._faults: dict[str, float] = {}
+        self.create_timer(CONNECTION_CHECK_S, self._report_connections)
+
+    def on_settings_changed(self) -> None:
+        """Take over changed live parameters; the next message is processed with them."""
+
+    def output(self, name: str) -> Publisher:
+        """Create the publisher of a topic of `TOPICS`."""
+        topic = TOPICS[name]
+        self._outputs[name] = self.create_publisher(topic.type, name, topic.profile)
+        return self._outputs[name]
+
+    def listen(
+        self, name: str, callback: Callable[[Any], None], profile: QoSProfile | None = None
+    ) -> None:
+        """Subscribe to a topic of `TOPICS`; faults in the callback are logged with its name."""
+        topic = TOPICS[name]
+
+        def guarded(message: Any) -> None:
+            try:
+                callback(message)
+            except Exception as error:
+                self.say_fault(name, error)
+
+        self.create_subscription(topic.type, name, guarded, profile or topic.profile)
+
+    def join(self, parts: Sequence[str], process: Callable[[int, dict[str, Any]], None]) -> None:
+        """Subscribe to topics whose messages belong together; `process` gets the stamp and the
+        messages by topic once all with one stamp have arrived. Those that remain alone are
+        reported.
+        """
+        joiner = StampJoiner(parts)
+
+        def take(part: str, message: Any) -> None:
+            stamp_ns = to_ns(message.header.stamp)
+            complete = joiner.add(part, stamp_ns, message)
+            self.say_dropped(joiner)
+            if complete is not None:
+                process(stamp_ns, complete)
+
+        for part in parts:
+            self.listen(part, partial(take, part))
+
+    def work(self, stamp_ns: int, step: Callable[[], Mapping[str, Any]]) -> None:
+        """Run the stage's step for one stamp and report how it went, with the values it returns."""
+        start = time.perf_counter()
+        try:
+            values = step()
+        except Exception as error:
+            self.say_fault(f'stamp {stamp_ns}', error)
+            self.report(stamp_ns, Level.ERROR, one_line(error))
+            return
+        milliseconds = 1e3 * (time.perf_counter() - start)
+        self.report(stamp_ns, Level.OK, 'running', processing_ms=f'{milliseconds:.3f}', **values)
+
+    def report(self, stamp_ns: int, level: Level, message: str, **values: Any) -> None:
+        """Publish a status about one stamp."""
+        self.publish_status('', stamp_ns, level, message, {**values, 'rss_mb': f'{rss_mb():.2f}'})
+
+    def publish_status(
+        self, kind: str, stamp_ns: int, level: Level, message: str, values: Mapping[str, Any]
+    ) -> None:
+        """Publish a status of a kind of its own."""
+        name = self.get_fully_qualified_name() + (f': {kind}' if kind else '')
+        texts = {key: str(value) for key, value in values.items()}
+        self._diagnostics.publish(status_message(Status(stamp_ns, name, level, message, texts)))
+
+    def say_dropped(self, joiner: StampJoiner) -> None:
+        """Warn about sets that were given up, naming the topics of the missing parts."""
+        for dropped in joiner.take_dropped():
+            names = ', '.join(dropped.missing)
+            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped'
+            self.get_logger().warning(text)
+            self.report(dropped.stamp_ns, Level.ERROR, text)
+
+    def say_fault(self, where: str, error: Exception) -> None:
+        """Log a fault in one line, at most every few seconds; the traceback of an unexpected
+        one goes to the debug log.
+        """
+        text, now_s = one_line(error), time.monotonic()
+        self._faults = {t: s for t, s in self._faults.items() if now_s - s < REPEAT_FAULT_S}
+        if text in self._faults:
+            return
+        self._faults[text] = now_s
+        self.get_logger().error(f'{where}: {text}')
+        if not isinstance(error, SegfloorError):
+            self.get_logger().debug(''.join(traceback.format_exception(error)))
+
+    def say_waiting(self, what: str) -> None:
+        """Warn that something does not arrive, unless it comes at once."""
+        self.get_logger().warning(
+            f'waiting for {what}', throttle_duration_sec=REPEAT_FAULT_S, skip_first=True
+        )
+
+    def _change_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        result = self.parameters.change(parameters)
+        if result.successful:
+            self.on_settings_changed()
+        return result
+
+    def _report_connections(self) -> None:
+        counts = {
+            name: str(output.get_subscription_count()) for name, output in self._outputs.items()
+        }
+        now = time.monotonic()
+        if counts != self._connections or now - self._last_heartbeat_s >= HEARTBEAT_S:
+            self._connections, self._last_heartbeat_s = counts, now
+            stamp_ns = self.get_clock().now().nanoseconds
+            self.publish_status(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
+
+
+def one_line(error: Exception) -> str:
+    """Return an error in one line; unexpected ones with their type."""
+    text = ' '.join(str(error).split())
+    return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
+
+
+def run_node(make_node: Callable[[], Node]) -> None:
+    """Run a node until it is interrupted (status 0); bad parameters or input end it with one
+    line and status 2.
+    """
+    status = 0
+    try:
+        rclpy.init()
+        rclpy.spin(make_node())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except SegfloorError as error:
+        print(f'segfloor: {error}', file=sys.stderr)
+        status = 2
+    finally:
+        rclpy.try_shutdown()
+    sys.exit(status)

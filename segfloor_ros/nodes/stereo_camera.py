@@ -1,0 +1,144 @@
+"""Node `stereo_camera`: a recording or device as stereo images with calibration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from diagnostic_msgs.msg import DiagnosticArray
+from std_srvs.srv import SetBool
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources.source import RawPair, StereoSource
+from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.messages.camera_info import camera_info_message
+from segfloor_ros.messages.diagnostics import Level, Status, statuses
+from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.topics import CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM
+from segfloor_ros.node_settings import StereoCameraNodeSettings
+from segfloor_ros.nodes.pacing import ChainPace, ClockPace
+from segfloor_ros.nodes.stage_node import StageNode, run_node
+
+TICK_S = 0.004
+SAY_WAITING_S = 5.0
+RECORDING = 'recording'
+"""Kind of the status that says that the recording has ended."""
+
+
+class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]):
+    """Publishes every pair with its own stamp, once somebody listens."""
+
+    def __init__(self) -> None:
+        super().__init__(StereoCameraSettings, StereoCameraNodeSettings)
+        if not self.parameters.stage.input:
+            raise InputError('stereo_camera.input is empty; name a recording or a device')
+        own = self.parameters.own
+        self._source: StereoSource = open_source(self.parameters.stage)
+        self._pairs: Iterator[RawPair] = self._source.raw_pairs()
+        self._next: RawPair | None = None
+        self._frames_sent = 0
+        self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
+        self._images = {side: self.output(f'{side}/image_raw') for side in self._frame_ids}
+        self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
+        self._paused = own.start_paused
+        self._connected = self._finished = False
+        self._said_waiting_s = time.monotonic()
+        self._pace: ClockPace | ChainPace = ChainPace() if own.rate == 0 else ClockPace(own.rate)
+        if own.rate == 0:
+            self.create_subscription(
+                DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
+            )
+        self.create_service(SetBool, '~/pause', self._pause)
+        self.create_timer(TICK_S, self._advance)
+
+    def _advance(self) -> None:
+        """Send the next pairs as far as they may go now."""
+        try:
+            while self._may_play() and self._fetch() and self._next is not None:
+                if not self._pace.ready(self._next.stamp_ns):
+                    self._say_waiting_for(self._pace.waits_for())
+                    return
+                self._send(self._next)
+                self._next = None
+        except SegfloorError as error:
+            self.say_fault(self._source.name, error)
+            self._finish(Level.ERROR, str(error))
+
+    def _may_play(self) -> bool:
+        if self._finished or self._paused:
+            return False
+        if not self._connected:
+            outputs = (*self._images.values(), *self._infos.values())
+            silent = [out.topic_name for out in outputs if not out.get_subscription_count()]
+            self._connected = not silent
+            if silent:
+                self._say_waiting_for('subscribers of ' + ', '.join(silent))
+        return self._connected
+
+    def _fetch(self) -> bool:
+        """Read the next pair if none is at hand; False at the end of the recording."""
+        if self._next is None:
+            self._next = next(self._pairs, None)
+            if self._next is None:
+                self._finish(Level.OK, 'finished')
+        return self._next is not None
+
+    def _send(self, pair: RawPair) -> None:
+        calibration = self._source.calibration
+        eyes = {'left': (pair.left, calibration.left), 'right': (pair.right, calibration.right)}
+        # Taken as sent first: the answer may come at once.
+        self._pace.sent(pair.stamp_ns)
+        self._said_waiting_s = time.monotonic()
+        for side, (image, eye) in eyes.items():
+            frame_id = self._frame_ids[side]
+            self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))
+            self._images[side].publish(image_message(pair.stamp_ns, frame_id, image))
+        self._frames_sent += 1
+        self.report(pair.stamp_ns, Level.OK, 'sent', frame_index=pair.index)
+
+    def _finish(self, level: Level, message: str) -> None:
+        self._finished = True
+        self.get_logger().info(f'{self._source.name}: {self._frames_sent} pairs sent')
+        stamp_ns = self.get_clock().now().nanoseconds
+        values = {'frames': self._frames_sent, 'skipped': self._source.skipped_frames}
+        self.publish_status(RECORDING, stamp_ns, level, message, values)
+
+    def _take_status(self, message: DiagnosticArray) -> None:
+        assert isinstance(self._pace, ChainPace)
+        namespace = self.get_namespace().rstrip('/')
+        for status in statuses(message):
+            if status.name.startswith(f'{namespace}/') and not status.kind:
+                note_status(self._pace, status)
+        self._advance()
+
+    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = bool(request.data)
+        self._pace.restart()
+        response.success, response.message = True, 'paused' if self._paused else 'playing'
+        return response
+
+    def _say_waiting_for(self, what: str) -> None:
+        now_s = time.monotonic()
+        if what and now_s - self._said_waiting_s > SAY_WAITING_S:
+            self._said_waiting_s = now_s
+            self.get_logger().warning(f'waiting for {what}')
+
+
+def note_status(pace: ChainPace, status: Status) -> None:
+    """Tell the pace what the status of a node means for the frames under way."""
+    if status.node == SLAM:
+        if status.values.get('keyframe') == '1':
+            pace.keyframe_began(status.stamp_ns)
+        pace.answered(status.stamp_ns)
+    elif status.node == GRID or (status.node in (FLOOR, CLOUD) and status.level is Level.ERROR):
+        pace.keyframe_ended(status.stamp_ns)
+
+
+def main() -> None:
+    """Run the node."""
+    run_node(StereoCameraNode)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,169 @@
+"""Node `stereo_slam`: stereo images in; odometry, tf, keyframes and the sparse map out."""
+
+from __future__ import annotations
+
+import math
+import time
+from functools import partial
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo, Image
+
+from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.images import EightBitScale
+from segfloor_ros.camera.model import Mount, StereoFrame
+from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.camera_info import eye_calibration
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey_image
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
+from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
+from segfloor_ros.nodes.transforms import Transforms
+from segfloor_ros.slam.results import FrameResult
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.stages import make_slam
+
+MAX_WAITING_PAIRS = 30
+
+
+class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
+    """Tracks every stereo pair and publishes what comes of it."""
+
+    def __init__(self) -> None:
+        super().__init__(StereoSlamSettings, StereoSlamNodeSettings)
+        own = self.parameters.own
+        self._outputs_of_slam = SlamOutputs(self, own)
+        self._transforms = Transforms(self, own)
+        self._eyes: dict[str, EyeCalibration] = {}
+        self._calibration: StereoCalibration | None = None
+        self._frames = CameraFrames('', '')
+        self._rectifier: StereoRectifier | None = None
+        self._eight_bit = EightBitScale()
+        self._slam: StereoSlam | None = None
+        self._mount: Mount | None = None
+        self._mount_from_tf = False
+        self._frame_count = 0
+        self._waiting: list[dict[str, Any]] = []
+        self._left, self._right = self._subscribe(own)
+        tolerance_ns = round(own.sync_tolerance_s * 1e9)
+        self._pairs = StampJoiner((self._left, self._right), MAX_WAITING_PAIRS, tolerance_ns)
+
+    def _subscribe(self, own: StereoSlamNodeSettings) -> tuple[str, str]:
+        kind = 'image_rect' if own.rectified_input else 'image_raw'
+        left, right = f'left/{kind}', f'right/{kind}'
+        profile = qos.images(own.image_reliability)
+        for info in ('left/camera_info', 'right/camera_info'):
+            self.listen(info, partial(self._take_info, info), profile)
+        for image in (left, right):
+            self.listen(image, partial(self._take_image, image), profile)
+        return left, right
+
+    def _take_info(self, topic: str, message: CameraInfo) -> None:
+        if topic in self._eyes:
+            return
+        self._eyes[topic] = eye_calibration(message, topic)
+        waiting, self._waiting = self._waiting, []
+        for pair in waiting:
+            self._take_pair(pair)
+
+    def _take_image(self, topic: str, message: Image) -> None:
+        pair = self._pairs.add(topic, to_ns(message.header.stamp), message)
+        self.say_dropped(self._pairs)
+        if pair is not None:
+            self._take_pair(pair)
+
+    def _take_pair(self, pair: dict[str, Any]) -> None:
+        if len(self._eyes) < 2:
+            # The calibration travels on topics of its own and may come a moment later.
+            self._waiting = [*self._waiting, pair][-MAX_WAITING_PAIRS:]
+            self.say_waiting('left/camera_info and right/camera_info')
+            return
+        stamp_ns = to_ns(pair[self._left].header.stamp)
+        start = time.perf_counter()
+        try:
+            results = self._process(stamp_ns, pair)
+        except Exception as error:
+            self.say_fault(f'stamp {stamp_ns}', error)
+            self.report(stamp_ns, Level.ERROR, one_line(error))
+            return
+        milliseconds = 1e3 * (time.perf_counter() - start)
+        for result in results:
+            self._publish(result, milliseconds / len(results))
+        if not results:
+            self.report(
+                stamp_ns,
+                Level.WARN,
+                'waiting for the floor, to measure the mount of the camera',
+                processing_ms=f'{milliseconds:.3f}',
+            )
+
+    def _process(self, stamp_ns: int, pair: dict[str, Any]) -> list[FrameResult]:
+        if self._slam is None:
+            self._start(pair)
+        assert self._slam is not None and self._rectifier is not None
+        images = (grey_image(pair[topic], topic) for topic in (self._left, self._right))
+        left, right = self._rectifier.rectify(*self._eight_bit(*images))
+        frame = StereoFrame(self._frame_count, stamp_ns, left, right)
+        self._frame_count += 1
+        results = self._slam.process(frame)
+        if self._mount is None and self._slam.mount is not None:
+            self._announce_mount(results[0].stamp_ns if results else stamp_ns, self._slam.mount)
+        return results
+
+    def _start(self, pair: dict[str, Any]) -> None:
+        """Build the stage, now that the calibration is known."""
+        calibration = StereoCalibration(*(self._eyes[topic] for topic in sorted(self._eyes)))
+        self._calibration = calibration.rectified()
+        if self.parameters.own.rectified_input:
+            calibration = self._calibration
+        self._rectifier = StereoRectifier(calibration)
+        self._frames = CameraFrames(
+            pair[self._left].header.frame_id, pair[self._right].header.frame_id
+        )
+        settings = self.parameters.stage
+        given = (settings.camera_height_m, settings.camera_pitch_rad, settings.camera_roll_rad)
+        mount = None
+        if all(math.isnan(value) for value in given):
+            mount = self._transforms.find_mount(self._frames.left)
+        self._mount_from_tf = mount is not None
+        self._slam = make_slam(self._rectifier.camera, settings, mount)
+
+    def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
+        self._mount = mount
+        self.get_logger().info(
+            f'camera {mount.height_m:.3f} m above the floor, pitch '
+            f'{math.degrees(mount.pitch_rad):.2f} deg, roll {math.degrees(mount.roll_rad):.2f} deg'
+        )
+        self._outputs_of_slam.publish_mount(stamp_ns, self._frames, mount)
+        if not self._mount_from_tf:
+            self._transforms.broadcast_mount(stamp_ns, self._frames.left, mount)
+
+    def _publish(self, result: FrameResult, milliseconds: float) -> None:
+        assert self._calibration is not None
+        self._outputs_of_slam.publish(result, self._calibration, self._frames)
+        if result.tracked:
+            self._transforms.broadcast(result)
+        self.report(
+            result.stamp_ns,
+            Level.OK if result.tracked else Level.ERROR,
+            result.state,
+            tracked=int(result.tracked),
+            keyframe=int(result.keyframe is not None),
+            matches=result.num_matches,
+            reference_keyframe_ns=result.reference_keyframe_ns,
+            processing_ms=f'{milliseconds:.3f}',
+        )
+
+
+def main() -> None:
+    """Run the node."""
+    run_node(StereoSlamNode)
+
+
+if __name__ == '__main__':
+    main()
