@@ -21,7 +21,7 @@ class CloudLabelling:
     """Labels the points of the sparse cloud by id, keyframe after keyframe."""
 
     def __init__(self, settings: CloudLabellingSettings) -> None:
-        self._settings = settings
+        self.settings = settings
         self._table = PointTable()
 
     def update(
@@ -38,7 +38,7 @@ class CloudLabelling:
         with distance, else the distance is taken to be that of the point from the map's origin
         of heights, i.e. the error stays that of near points.
         """
-        table, settings = self._table, self._settings
+        table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
         looks = mask_evidence(mask, features.uv_px[seen]) * settings.mask_log_odds
@@ -48,7 +48,7 @@ class CloudLabelling:
         return self._labelled(cloud)
 
     def _labelled(self, cloud: SparseCloud) -> LabelledPoints:
-        table, settings = self._table, self._settings
+        table, settings = self._table, self.settings
         height_m = cloud.xyz_map[:, 2] - table.floor_z_m
         sigma_m = settings.height_sigma_m + settings.height_sigma_per_m * table.distance_m
         by_height = height_evidence(height_m, sigma_m, settings) * (table.looks > 0)

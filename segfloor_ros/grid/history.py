@@ -56,6 +56,11 @@ class EvidenceHistory:
         self._poses = self._poses[~gone]
         self._return_to(first)
 
+    def fold_anew(self, folder: EvidenceFolder) -> None:
+        """Fold all evidence again by other rules."""
+        self._folder = folder
+        self._return_to(0)
+
     def raster(self) -> LogOddsRaster:
         """Return the raster of all keyframes."""
         while self._done < len(self._evidence):

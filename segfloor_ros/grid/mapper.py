@@ -29,6 +29,11 @@ class OccupancyGridMapper:
         self._history = EvidenceHistory(EvidenceFolder(settings))
         self._stamp_ns = np.zeros(0, np.int64)
 
+    def change_settings(self, settings: OccupancyGridSettings) -> None:
+        """Map with changed live settings from now on, old evidence included."""
+        self._settings = settings
+        self._history.fold_anew(EvidenceFolder(settings))
+
     def update(
         self,
         stamp_ns: int,

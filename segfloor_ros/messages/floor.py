@@ -35,8 +35,11 @@ def disparity_message(
 
 
 def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
-    """Return the floor scan in the base's plane: how far the floor was seen, per bearing."""
+    """Return the floor scan in the base's plane: how far the floor was seen, per bearing. The
+    distances of upright things go into `intensities`, which stay empty where they are not known.
+    """
     ranges = np.ascontiguousarray(scan.ranges_m, np.float32)
+    obstacles = scan.obstacle_m if scan.obstacle_m is not None else np.zeros(0, np.float32)
     steps = max(len(ranges) - 1, 0)
     return LaserScan(
         header=make_header(stamp_ns, frame_id),
@@ -46,6 +49,7 @@ def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
         range_min=0.0,
         range_max=MAX_RANGE_M,
         ranges=array.array('f', ranges.tobytes()),
+        intensities=array.array('f', np.ascontiguousarray(obstacles, np.float32).tobytes()),
     )
 
 
@@ -54,4 +58,12 @@ def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
     if not np.isfinite([message.angle_min, message.angle_increment]).all():
         raise MessageError(f'{topic}: the angles of the scan are not finite')
     ranges = np.frombuffer(message.ranges, np.float32).copy()
-    return FloorScan(float(message.angle_min), float(message.angle_increment), ranges)
+    obstacles = np.frombuffer(message.intensities, np.float32).copy()
+    if len(obstacles) not in (0, len(ranges)):
+        raise MessageError(f'{topic}: {len(ranges)} ranges, but {len(obstacles)} intensities')
+    return FloorScan(
+        float(message.angle_min),
+        float(message.angle_increment),
+        ranges,
+        obstacles if len(obstacles) else None,
+    )

@@ -150,7 +150,7 @@ _ALL = [
         FLOOR,
         (GRID,),
         "How far the floor was seen per bearing, in the base's plane (m); 0: blocked right in "
-        'front, NaN: not seen.',
+        'front, NaN: not seen. Intensities: distance of the nearest upright thing (m) or NaN.',
     ),
     Topic(
         'labelled_points',

@@ -41,7 +41,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
 
     def on_settings_changed(self) -> None:
         """Map the next keyframe with the new settings."""
-        self._stage.settings = self.parameters.stage
+        self._stage.change_settings(self.parameters.stage)
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         self.work(stamp_ns, lambda: self._update(stamp_ns, parts))
