@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.grid.fan import unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
@@ -19,19 +20,20 @@ QUARTILE = 0.675
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """Free spokes and hits of one keyframe, in metres and radians in its base's x-y plane.
+    """Free floor and hits of one keyframe, in metres and radians in its base's x-y plane.
 
-    fan: (S, 2) float32, unit vectors of neighbouring bearings of the floor scan. fan_m: (S,)
-    float32, how far the floor is free along them. rays: (R, 2) float32 and rays_m: (R,), the same
-    for single rays to floor points that reach farther than the fan. hits: (H, 2) float32,
-    positions of obstacles.
+    fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad. rays_m:
+    (R, 2) float32, ends of single rays to floor points that reach farther than the fan.
+    contacts_m: (C, 2) float32, where the floor ends at something upright. points_m: (P, 2)
+    float32, obstacle points at any height that concerns the robot.
     """
 
-    fan: NDArray[np.float32]
+    first_rad: float
+    step_rad: float
     fan_m: NDArray[np.float32]
-    rays: NDArray[np.float32]
     rays_m: NDArray[np.float32]
-    hits: NDArray[np.float32]
+    contacts_m: NDArray[np.float32]
+    points_m: NDArray[np.float32]
 
 
 def gather_evidence(
@@ -42,16 +44,21 @@ def gather_evidence(
     settings: OccupancyGridSettings,
 ) -> KeyframeEvidence:
     """Return what the keyframe at T_map_base (4, 4) says, by its features and its floor scan."""
+    if not settings.use_scan:
+        scan = FloorScan(0.0, 1.0, np.zeros(0, np.float32))
     floor, obstacles = _seen_points(points, features, T_map_base)
     if not settings.use_points:
         floor, obstacles = floor[:0], obstacles[:0]
-    fan, fan_m, contacts = _fan(scan, settings)
-    if not settings.use_scan:
-        fan, fan_m, contacts = fan[:0], fan_m[:0], contacts[:0]
-    rays, rays_m = _rays(floor, scan if settings.use_scan else None, settings)
-    hits = np.concatenate([obstacles, contacts])
-    hits = hits[np.linalg.norm(hits, axis=1) <= hit_range_m(settings)]
-    return KeyframeEvidence(fan, fan_m, rays, rays_m, hits.astype(np.float32))
+    seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
+    free_m = np.minimum(_certain(seen_m, settings), settings.max_range_m)
+    return KeyframeEvidence(
+        first_rad=scan.angle_min_rad,
+        step_rad=scan.angle_increment_rad,
+        fan_m=free_m.astype(np.float32),
+        rays_m=_rays(floor, scan, settings).astype(np.float32),
+        contacts_m=_well_placed(_contacts(scan), settings),
+        points_m=_well_placed(obstacles, settings),
+    )
 
 
 def hit_range_m(settings: OccupancyGridSettings) -> float:
@@ -84,19 +91,19 @@ def _seen_points(
     return in_base[label == FLOOR, :2], in_base[label == OBSTACLE, :2]
 
 
-def _fan(
-    scan: FloorScan, settings: OccupancyGridSettings
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
-    """Return unit vectors (S, 2), free lengths (S,) and contacts (C, 2) of the scan."""
-    bearing = scan.bearings_rad
-    directions = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
-    free_m = np.minimum(_certain(seen_m, settings), settings.max_range_m)
-    contacts = np.zeros((0, 2))
-    if scan.obstacle_m is not None:
-        hit = np.isfinite(scan.obstacle_m)
-        contacts = directions[hit] * scan.obstacle_m[hit, None]
-    return directions.astype(np.float32), free_m.astype(np.float32), contacts
+def _contacts(scan: FloorScan) -> Array:
+    """Return the positions (C, 2) of what the scan's bearings end at, in the base frame."""
+    if scan.obstacle_m is None:
+        return np.zeros((0, 2))
+    standing = np.isfinite(scan.obstacle_m)
+    directions = unit_vectors(scan.bearings_rad[standing])
+    return directions * scan.obstacle_m[standing, None].astype(np.float64)
+
+
+def _well_placed(hits: Array, settings: OccupancyGridSettings) -> NDArray[np.float32]:
+    """Return those of the positions (N, 2) that are near enough to mark a cell."""
+    near = np.hypot(hits[:, 0], hits[:, 1]) <= hit_range_m(settings)
+    return hits[near].astype(np.float32)
 
 
 def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:
@@ -104,33 +111,28 @@ def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:
     return np.maximum(range_m - settings.range_error_per_m * range_m**2, 0.0)
 
 
-def _rays(
-    floor: Array, scan: FloorScan | None, settings: OccupancyGridSettings
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return unit vectors (R, 2) and free lengths (R,) of the rays to floor points (N, 2).
+def _rays(floor: Array, scan: FloorScan, settings: OccupancyGridSettings) -> Array:
+    """Return the ends (R, 2) of the rays to floor points (N, 2), shortened by their error.
 
     Rays within the scan's free area add nothing, and rays that pass through what the scan saw
     standing there are wrong.
     """
-    length = np.linalg.norm(floor, axis=1)
-    usable = (length > 0.05) & (length <= settings.max_range_m)
-    floor, length = floor[usable], length[usable]
-    if len(length):
-        usable = length <= ray_length_limit(length)
-        floor, length = floor[usable], length[usable]
-    free_m = _certain(length, settings)
-    if scan is not None and len(scan.ranges_m):
-        scanned_m, standing_m = _scan_at(scan, floor)
-        usable = (free_m > _certain(scanned_m, settings)) & (length < standing_m)
-        floor, length, free_m = floor[usable], length[usable], free_m[usable]
-    directions = floor / length[:, None]
-    return directions.astype(np.float32), free_m.astype(np.float32)
+    length_m = np.hypot(floor[:, 0], floor[:, 1])
+    usable = (length_m > 0) & (length_m <= settings.max_range_m)
+    if usable.any():
+        usable &= length_m <= ray_length_limit(length_m[usable])
+    scanned_m, standing_m = _scan_at(scan, floor)
+    usable &= (length_m > scanned_m) & (length_m < standing_m)
+    floor, length_m = floor[usable], length_m[usable]
+    return floor * (_certain(length_m, settings) / length_m)[:, None]
 
 
 def _scan_at(scan: FloorScan, points: Array) -> tuple[Array, Array]:
     """Return the scan's range (N,), 0 where unknown, and the distance (N,) of what it saw
     standing, infinite where nothing, at the bearings of points (N, 2).
     """
+    if len(scan.ranges_m) == 0:
+        return np.zeros(len(points)), np.full(len(points), np.inf)
     offset = np.arctan2(points[:, 1], points[:, 0]) - scan.angle_min_rad
     index = np.rint(offset / scan.angle_increment_rad).astype(np.intp)
     inside = (index >= 0) & (index < len(scan.ranges_m))
