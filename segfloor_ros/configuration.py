@@ -17,6 +17,7 @@ from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.node_settings import is_node_parameter
 from segfloor_ros.settings import StageSettings, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 
@@ -87,7 +88,8 @@ def resolve(
 
 def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
     """Return the values of a ROS 2 parameter file by stage.
-     `/**` applies to every stage that has the parameter; names of nodes outside this package are
+
+    `/**` applies to every stage that has the parameter; names of nodes outside this package are
     passed over. Raises SettingsError when the file is missing or not of that form.
     """
     try:
@@ -112,7 +114,9 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
 def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, dict[str, Any]]:
     stage = node.rsplit('/', 1)[-1]
     if stage in STAGE_SETTINGS:
-        return {stage: parameters}
+        # What only the node has (frames, rates) is no concern of the stage.
+        own = {k: v for k, v in parameters.items() if not is_node_parameter(stage, k)}
+        return {stage: own}
     if stage != '**':
         return {}
     values: dict[str, dict[str, Any]] = {}
@@ -122,7 +126,7 @@ def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, di
             for stage, cls in STAGE_SETTINGS.items()
             if any(spec.name == name for spec in cls.specs())
         ]
-        if not owners:
+        if not owners and not any(is_node_parameter(stage, name) for stage in STAGE_SETTINGS):
             raise SettingsError(f'{path}: no stage has a parameter {name}')
         for owner in owners:
             values.setdefault(owner, {})[name] = value

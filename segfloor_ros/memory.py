@@ -4,33 +4,39 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-_STATM = Path('/proc/self/statm')
+_PROC = Path('/proc')
 
 
-def rss_mb() -> float:
-    """Return the resident memory of this process in MB (10^6 bytes); the peak so far where
-    only that is known.
+def rss_mb(process_id: int | None = None) -> float:
+    """Return the resident memory of this process, or of another one, in MB (10^6 bytes).
+
+    Where there is no /proc, it is the peak of this process so far, and 0 for others.
     """
-    if _STATM.exists():
-        return int(_STATM.read_text().split()[1]) * resource.getpagesize() / 1e6
+    statm = _PROC / str(process_id or 'self') / 'statm'
+    if statm.exists():
+        return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
+    if process_id is not None:
+        return 0.0
     unit = 1 if sys.platform == 'darwin' else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
 class MemoryLog:
-    """Memory at the start and at every map update."""
+    """Memory at the start and at every map update: of this process, or what `measure` returns."""
 
-    def __init__(self) -> None:
-        self.start_mb = rss_mb()
+    def __init__(self, measure: Callable[[], float] = rss_mb) -> None:
+        self._measure = measure
+        self.start_mb = measure()
         self._samples_mb: list[float] = []
 
     def sample(self) -> None:
         """Note the memory at a map update."""
-        self._samples_mb.append(rss_mb())
+        self._samples_mb.append(self._measure())
 
     def summary(self) -> dict[str, float]:
         """Return start, peak and growth per map update (slope of a line over the second half,

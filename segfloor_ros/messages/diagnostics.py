@@ -10,7 +10,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from segfloor_ros.messages.headers import make_header, to_ns
 
-TOPIC = '/diagnostics'
+CONNECTIONS = 'connections'
+"""Kind of the status that says how many subscribers each topic of a node has."""
+
+RECORDING = 'recording'
+"""Kind of the status of the camera that says that its recording has ended."""
 
 
 class Level(enum.Enum):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 import traceback
@@ -19,7 +20,7 @@ from rclpy.qos import QoSProfile
 
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.memory import rss_mb
-from segfloor_ros.messages.diagnostics import Level, Status, status_message
+from segfloor_ros.messages.diagnostics import CONNECTIONS, Level, Status, status_message
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
@@ -33,8 +34,6 @@ Own = TypeVar('Own', bound=NodeSettings)
 CONNECTION_CHECK_S = 0.1
 HEARTBEAT_S = 1.0
 REPEAT_FAULT_S = 5.0
-CONNECTIONS = 'connections'
-"""Kind of the status that says how many subscribers each topic of the node has."""
 
 
 class StageNode(Node, Generic[Stage, Own]):
@@ -158,6 +157,7 @@ class StageNode(Node, Generic[Stage, Own]):
         counts = {
             name: str(output.get_subscription_count()) for name, output in self._outputs.items()
         }
+        counts[DIAGNOSTICS.name] = str(self._diagnostics.get_subscription_count())
         now = time.monotonic()
         if counts != self._connections or now - self._last_heartbeat_s >= HEARTBEAT_S:
             self._connections, self._last_heartbeat_s = counts, now
@@ -175,6 +175,7 @@ def run_node(make_node: Callable[[], Node]) -> None:
     """Run a node until it is interrupted (status 0); bad parameters or input end it with one
     line and status 2.
     """
+    logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     status = 0
     try:
         rclpy.init()

@@ -13,7 +13,7 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.messages.camera_info import camera_info_message
-from segfloor_ros.messages.diagnostics import Level, Status, statuses
+from segfloor_ros.messages.diagnostics import RECORDING, Level, Status, statuses
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.messages.topics import CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM
 from segfloor_ros.node_settings import StereoCameraNodeSettings
@@ -22,8 +22,6 @@ from segfloor_ros.nodes.stage_node import StageNode, run_node
 
 TICK_S = 0.004
 SAY_WAITING_S = 5.0
-RECORDING = 'recording'
-"""Kind of the status that says that the recording has ended."""
 
 
 class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]):

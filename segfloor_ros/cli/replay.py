@@ -1,0 +1,68 @@
+"""`segfloor replay`: a recording through the five nodes, each a process of its own."""
+
+from __future__ import annotations
+
+import signal
+from typing import Annotated
+
+import typer
+
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
+from segfloor_ros.cli.output import console, print_error, print_summary, progress_bar
+from segfloor_ros.configuration import resolve
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.lockstep import SaveMasks
+from segfloor_ros.recording import OutputFolder
+
+
+def replay(
+    input: InputArgument,
+    out: OutOption,
+    rate: Annotated[
+        float,
+        typer.Option(
+            help='Speed against real time; 0: as fast as the nodes take it, without loss.'
+        ),
+    ] = 1.0,
+    params: ParamsOption = None,
+    assignments: SetOption = None,
+    save_masks: Annotated[
+        SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
+    ] = SaveMasks.keyframes,
+) -> None:
+    """Map a recording with the five ROS 2 nodes over DDS."""
+    try:
+        from segfloor_ros.cli.replay_session import ReplaySession
+    except ImportError as error:
+        raise SettingsError(
+            f'replay needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
+            "pip install 'segfloor_ros[ros]'"
+        ) from None
+    if save_masks is SaveMasks.all:
+        raise SettingsError(
+            '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
+        )
+    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
+    # The camera node reads the recording; here it is opened so that bad input ends at once.
+    frame_count = open_source(configuration.stereo_camera).frame_count
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with OutputFolder(out) as folder:
+        on_mask = folder.add_mask if save_masks is SaveMasks.keyframes else None
+        with progress_bar('replaying', frame_count) as progress:
+            result, report = ReplaySession(
+                configuration,
+                params,
+                rate,
+                on_mask,
+                lambda done, state: progress.update(0, completed=done, note=state),
+            ).execute()
+        folder.write(result)
+    for notice in report.notices:
+        print_error(notice)
+    print_summary(input, result.summary)
+    console.print(
+        f'nodes connected in {report.discovery_s:.1f} s, stopped in {report.shutdown_s:.1f} s; '
+        f'lost between them: {report.lost_frames} frames, {report.lost_keyframes} keyframes'
+    )
+    console.print(f'map: {out / "map.yaml"}', highlight=False)

@@ -1,0 +1,81 @@
+"""The ROS graph of a replay: a domain of its own, and which topics must be connected."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping, Sequence
+
+from segfloor_ros.errors import SegfloorError
+from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, TOPICS, published_by
+
+# DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
+# into the ports that Linux hands out to clients.
+FIRST_PORT, PORTS_PER_DOMAIN, DOMAINS = 7400, 250, 101
+PARTICIPANT_OFFSET = 10
+PARTICIPANTS_TRIED = 8
+
+RECORDED = (
+    'odometry',
+    'camera_mount',
+    'keyframe/path',
+    'keyframe/floor_mask',
+    'labelled_points',
+)
+"""Topics that the replay itself listens to."""
+
+
+def isolated_environment() -> dict[str, str]:
+    """Return the environment of a graph that no other node on the network sees or disturbs.
+
+    A domain or a discovery range that the user has set is kept.
+    """
+    environment = dict(os.environ)
+    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    if not environment.get('ROS_DOMAIN_ID'):
+        environment['ROS_DOMAIN_ID'] = str(free_domain())
+    return environment
+
+
+def free_domain() -> int:
+    """Return a ROS domain id without participants on this machine."""
+    for attempt in range(DOMAINS):
+        domain = 1 + (os.getpid() + attempt) % DOMAINS
+        first = FIRST_PORT + PORTS_PER_DOMAIN * domain + PARTICIPANT_OFFSET
+        if all(_is_free(first + 2 * i) for i in range(PARTICIPANTS_TRIED)):
+            return domain
+    raise SegfloorError('every ROS domain id is in use on this machine; set ROS_DOMAIN_ID')
+
+
+def unconnected(counts: Mapping[str, Mapping[str, int]], listeners: Sequence[str]) -> list[str]:
+    """Return what is missing before the first frame can be sent without loss, in words.
+
+    counts: subscribers by node and topic, as each publisher sees them. listeners: further nodes
+    that listen to the statuses besides the replay.
+    """
+    missing = []
+    for node in NODES:
+        if node not in counts:
+            missing.append(f'{node} (no sign of life)')
+            continue
+        needed = {topic.name: _listeners_of(topic.name) for topic in published_by(node)}
+        needed[DIAGNOSTICS.name] = 1 + len(listeners)
+        missing += [
+            f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'
+            for topic, number in needed.items()
+            if counts[node].get(topic, 0) < number
+        ]
+    return missing
+
+
+def _listeners_of(topic: str) -> int:
+    return len(TOPICS[topic].subscribers) + (topic in RECORDED)
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(('', port))
+        except OSError:
+            return False
+    return True

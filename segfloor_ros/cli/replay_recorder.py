@@ -1,0 +1,155 @@
+"""The listener of a replay: collects what the nodes publish and knows when all is done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry, Path
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.node import Node
+from sensor_msgs.msg import Image, PointCloud2
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.cli.replay_graph import RECORDED
+from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.geometry import Array
+from segfloor_ros.memory import MemoryLog
+from segfloor_ros.messages.clouds import labelled_arrays
+from segfloor_ros.messages.diagnostics import CONNECTIONS, RECORDING, Level, Status, statuses
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
+from segfloor_ros.messages.topics import CAMERA, CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM, TOPICS
+from segfloor_ros.slam.results import KeyframePath
+from segfloor_ros.timing import StageTimes
+from segfloor_ros.trajectory import TrackedPose
+
+MaskListener = Callable[[int, NDArray[np.uint8]], None]
+
+
+class ReplayRecorder(Node):
+    """Subscribes to the results of the chain; everything is filed under its stamp."""
+
+    def __init__(
+        self, context: Context, measure_mb: Callable[[], float], on_mask: MaskListener | None
+    ) -> None:
+        super().__init__('replay_recorder', context=context)
+        self.times = StageTimes()
+        self.memory = MemoryLog(measure_mb)
+        self.connections: dict[str, dict[str, int]] = {}
+        self.frame_index: dict[int, int] = {}
+        self.answers: dict[int, Status] = {}
+        self.finished: Status | None = None
+        self.updated: set[int] = set()
+        self.failed: dict[int, Status] = {}
+        self.path: KeyframePath | None = None
+        self.labelled: LabelledPoints | None = None
+        self.mount: Mount | None = None
+        self.last_sign_s = time.monotonic()
+        self._T_odom_base: dict[int, Array] = {}
+        self._on_mask = on_mask
+        self._masks: dict[int, NDArray[np.uint8]] = {}
+        self._subscribe()
+
+    @property
+    def tracked(self) -> list[TrackedPose]:
+        """The tracked frames in order of their stamps."""
+        poses = []
+        for stamp_ns in sorted(self._T_odom_base.keys() & self.answers.keys()):
+            reference_ns = int(self.answers[stamp_ns].values['reference_keyframe_ns'])
+            poses.append(TrackedPose(stamp_ns, self._T_odom_base[stamp_ns], reference_ns))
+        return poses
+
+    @property
+    def keyframes(self) -> set[int]:
+        """Stamps of the keyframes that SLAM has published."""
+        return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get('keyframe') == '1'}
+
+    def unanswered(self) -> set[int]:
+        """Return the stamps of frames that SLAM has not answered."""
+        return self.frame_index.keys() - self.answers.keys()
+
+    def unmapped(self) -> set[int]:
+        """Return the stamps of keyframes that have not reached the map, nor failed on the way."""
+        return self.keyframes - self.updated - self.failed.keys()
+
+    def is_drained(self) -> bool:
+        """Whether the recording has ended and all that was sent has come to its end."""
+        if self.finished is None or len(self.frame_index) < int(self.finished.values['frames']):
+            return False
+        if self.unanswered() or self.unmapped() or self._masks:
+            return False
+        tracked = {t for t, s in self.answers.items() if s.values.get('tracked') == '1'}
+        newest = max(self.keyframes, default=0)
+        path_ns = int(self.path.stamp_ns[-1]) if self.path is not None else 0
+        return tracked <= self._T_odom_base.keys() and path_ns >= newest
+
+    def _subscribe(self) -> None:
+        callbacks: dict[str, Callable[[Any], None]] = {
+            'odometry': self._take_odometry,
+            'camera_mount': self._take_mount,
+            'keyframe/path': self._take_path,
+            'keyframe/floor_mask': self._take_mask,
+            'labelled_points': self._take_labelled,
+        }
+        assert set(callbacks) == set(RECORDED)
+        for name, callback in callbacks.items():
+            self.create_subscription(TOPICS[name].type, name, callback, TOPICS[name].profile)
+        self.create_subscription(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_statuses, DIAGNOSTICS.profile
+        )
+
+    def _take_odometry(self, message: Odometry) -> None:
+        self._T_odom_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
+
+    def _take_mount(self, message: TransformStamped) -> None:
+        self.mount = Mount.from_transform(transform_array(message))
+
+    def _take_path(self, message: Path) -> None:
+        self.path = path_arrays(message)
+
+    def _take_labelled(self, message: PointCloud2) -> None:
+        self.labelled = labelled_arrays(message, 'labelled_points')
+
+    def _take_mask(self, message: Image) -> None:
+        if self._on_mask is not None:
+            mask = grey8_image(message, 'keyframe/floor_mask')
+            self._masks[to_ns(message.header.stamp)] = mask
+            self._hand_on_masks()
+
+    def _hand_on_masks(self) -> None:
+        """Masks are filed by frame number, which the camera's status tells."""
+        for stamp_ns in sorted(self._masks.keys() & self.frame_index.keys()):
+            assert self._on_mask is not None
+            self._on_mask(self.frame_index[stamp_ns], self._masks.pop(stamp_ns))
+
+    def _take_statuses(self, message: DiagnosticArray) -> None:
+        for status in statuses(message):
+            if status.kind == CONNECTIONS:
+                counts = {topic: int(count) for topic, count in status.values.items()}
+                self.connections[status.node] = counts
+            elif status.kind == RECORDING:
+                self.finished = status
+            elif not status.kind:
+                self._take_status(status)
+
+    def _take_status(self, status: Status) -> None:
+        self.last_sign_s = time.monotonic()
+        if 'processing_ms' in status.values:
+            self.times.add(status.node, 1e-3 * float(status.values['processing_ms']))
+        if status.node == CAMERA:
+            self.frame_index[status.stamp_ns] = int(status.values['frame_index'])
+            self._hand_on_masks()
+        elif status.node == SLAM:
+            self.answers[status.stamp_ns] = status
+        elif status.node == GRID and status.level is Level.OK:
+            self.updated.add(status.stamp_ns)
+            self.memory.sample()
+        elif status.node in (FLOOR, CLOUD, GRID) and status.level is Level.ERROR:
+            self.failed[status.stamp_ns] = status

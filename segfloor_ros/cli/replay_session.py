@@ -1,0 +1,233 @@
+"""A recording through the five node processes, to the same results as a lockstep run."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool, Trigger
+
+from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
+from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
+from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES
+from segfloor_ros.recording import RunResult, RunSummary, lost_intervals
+from segfloor_ros.trajectory import Trajectory, corrected_trajectory
+
+DISCOVERY_S = 30.0
+STALL_S = 60.0
+DRAIN_S = 10.0
+SERVICE_S = 10.0
+SPIN_S = 0.1
+
+ProgressListener = Callable[[int, str], None]
+"""Told every now and then: how many frames are done, and the state in words."""
+
+
+@dataclass(frozen=True)
+class ReplayReport:
+    """What there is to say beside the results. lost_frames, lost_keyframes: how many were sent
+    and never reached their end. notices: warnings of the nodes.
+    """
+
+    discovery_s: float
+    shutdown_s: float
+    lost_frames: int
+    lost_keyframes: int
+    notices: list[str]
+
+
+class ReplaySession:
+    """One replay: starts the nodes in a graph of their own, follows them, and stops them."""
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        params_file: Path | None,
+        rate: float,
+        on_mask: MaskListener | None,
+        on_progress: ProgressListener,
+    ) -> None:
+        self._configuration = configuration
+        self._params_file = params_file
+        self._rate = rate
+        self._on_mask = on_mask
+        self._on_progress = on_progress
+
+    def execute(self) -> tuple[RunResult, ReplayReport]:
+        """Run the replay. Raises ReplayError naming the node that died or what is stuck, MapError
+        when no map came of it, InputError when the recording breaks off.
+        """
+        environment = isolated_environment()
+        # This process takes part in the same graph.
+        os.environ.update(environment)
+        context = rclpy.Context()
+        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            with tempfile.TemporaryDirectory(prefix='segfloor-replay-') as folder:
+                arguments = self._node_arguments(Path(folder))
+                processes = NodeProcesses(NODES, arguments, environment, Path(folder))
+                with processes:
+                    recorder = ReplayRecorder(context, processes.rss_mb, self._on_mask)
+                    return self._follow(_Graph(recorder, processes), Path(folder))
+        finally:
+            rclpy.try_shutdown(context=context)
+
+    def _node_arguments(self, folder: Path) -> list[str]:
+        """Write the parameters as resolved and return the arguments of every node. What only the
+        nodes have (frames, rates) comes from the user's file.
+        """
+        parameters = self._configuration.as_ros_parameters()
+        parameters[CAMERA]['ros__parameters'].update(rate=float(self._rate), start_paused=True)
+        parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
+        resolved = folder / 'parameters.yaml'
+        resolved.write_text(yaml.safe_dump(parameters))
+        files = [str(file) for file in (self._params_file, resolved) if file is not None]
+        options = [word for file in files for word in ('--params-file', file)]
+        return ['--ros-args', '--disable-external-lib-logs', *options]
+
+    def _follow(self, graph: _Graph, folder: Path) -> tuple[RunResult, ReplayReport]:
+        discovery_s = graph.connect(['the camera'] if self._rate == 0 else [])
+        start_s = time.perf_counter()
+        graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+        graph.play(self._on_progress, lossless=self._rate == 0)
+        wall_s = time.perf_counter() - start_s
+        self._check_result(graph.recorder)
+        graph.call(Trigger, 'save_map', Trigger.Request())
+        result = self._result(graph.recorder, folder / 'map.yaml', wall_s)
+        stop_s = time.perf_counter()
+        graph.processes.stop()
+        report = ReplayReport(
+            discovery_s,
+            time.perf_counter() - stop_s,
+            len(graph.recorder.unanswered()),
+            len(graph.recorder.unmapped() | graph.recorder.failed.keys()),
+            graph.processes.notices(),
+        )
+        return result, report
+
+    def _check_result(self, recorder: ReplayRecorder) -> None:
+        name, sent = self._configuration.stereo_camera.input, len(recorder.frame_index)
+        finished = recorder.finished
+        if finished is not None and finished.level is Level.ERROR:
+            raise InputError(finished.message)
+        if recorder.mount is None:
+            raise MapError(
+                f'{name}: no floor was recognised in {sent} frames, so the height of the camera is '
+                'unknown; give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad'
+            )
+        if not recorder.updated:
+            words = next((s.message for s in recorder.failed.values()), 'none could be tracked')
+            raise MapError(f'{name}: no map came of {sent} frames: {words}')
+
+    def _result(self, recorder: ReplayRecorder, map_file: Path, wall_s: float) -> RunResult:
+        mount, labelled, path = recorder.mount, recorder.labelled, recorder.path
+        assert mount is not None and labelled is not None and path is not None
+        return RunResult(
+            load_map(map_file),
+            corrected_trajectory(recorder.tracked, path),
+            Trajectory(path.stamp_ns, path.T_map_base),
+            labelled,
+            mount,
+            self._summary(recorder, wall_s),
+            self._configuration,
+        )
+
+    def _summary(self, recorder: ReplayRecorder, wall_s: float) -> RunSummary:
+        stamps = sorted(recorder.frame_index)
+        answers = [recorder.answers.get(stamp) for stamp in stamps]
+        tracked = np.array([bool(s and s.values.get('tracked') == '1') for s in answers], bool)
+        mount, finished, path = recorder.mount, recorder.finished, recorder.path
+        assert mount is not None and finished is not None and path is not None
+        return RunSummary(
+            frames=len(stamps),
+            tracked_frames=int(tracked.sum()),
+            skipped_frames=int(finished.values['skipped']),
+            lost_intervals=lost_intervals([recorder.frame_index[s] for s in stamps], tracked),
+            keyframes=len(path.stamp_ns),
+            loops=0,
+            map_updates=len(recorder.updated),
+            wall_s=round(wall_s, 3),
+            frames_per_s=round(len(stamps) / wall_s, 2),
+            camera_height_m=round(mount.height_m, 4),
+            camera_pitch_rad=round(mount.pitch_rad, 5),
+            camera_roll_rad=round(mount.roll_rad, 5),
+            stages=recorder.times.summary(),
+            rss_mb=recorder.memory.summary(),
+        )
+
+
+class _Graph:
+    """The running nodes and the one that listens to them."""
+
+    def __init__(self, recorder: ReplayRecorder, processes: NodeProcesses) -> None:
+        self.recorder = recorder
+        self.processes = processes
+        self._executor = SingleThreadedExecutor(context=recorder.context)
+        self._executor.add_node(recorder)
+
+    def connect(self, listeners: list[str]) -> float:
+        """Wait until every topic has its subscribers; returns the seconds it took."""
+        start_s = time.monotonic()
+        while missing := unconnected(self.recorder.connections, listeners):
+            if time.monotonic() - start_s > DISCOVERY_S:
+                raise ReplayError(
+                    f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '
+                    'the loopback interface up, and does a firewall block UDP?'
+                )
+            self._spin()
+        return time.monotonic() - start_s
+
+    def call(self, kind: Any, name: str, request: Any) -> None:
+        """Call a service. Raises ReplayError with its answer when it fails."""
+        client = self.recorder.create_client(kind, name)
+        deadline_s = time.monotonic() + SERVICE_S
+        while not client.service_is_ready() and time.monotonic() < deadline_s:
+            self._spin()
+        future = client.call_async(request)
+        while not future.done() and time.monotonic() < deadline_s:
+            self._spin()
+        if not future.done():
+            raise ReplayError(f'the service {name} does not answer')
+        response = future.result()
+        if not response.success:
+            raise ReplayError(f'{name}: {response.message}')
+
+    def play(self, on_progress: ProgressListener, lossless: bool) -> None:
+        """Follow the nodes until the recording has ended and everything sent has arrived."""
+        recorder = self.recorder
+        recorder.last_sign_s = time.monotonic()
+        while not recorder.is_drained():
+            self._spin()
+            last = recorder.answers.get(max(recorder.answers, default=0))
+            on_progress(len(recorder.answers), last.message if last else '')
+            quiet_s = time.monotonic() - recorder.last_sign_s
+            ended = recorder.finished is not None
+            if quiet_s > (DRAIN_S if ended else STALL_S):
+                if ended and not lossless:
+                    return
+                raise ReplayError(
+                    f'nothing has happened for {quiet_s:.0f} s; {len(recorder.unanswered())} '
+                    f'frames are not tracked and {len(recorder.unmapped())} keyframes not mapped'
+                )
+
+    def _spin(self) -> None:
+        """Handle what arrives within a moment, then see that all nodes live."""
+        end_s = time.monotonic() + SPIN_S
+        while (left_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left_s)
+        self.processes.check()
