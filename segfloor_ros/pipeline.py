@@ -28,7 +28,8 @@ KeyframeListener = Callable[[Keyframe, FloorObservation], None]
 class Pipeline:
     """SLAM on the calling thread; segmentation, labelling and grid follow on one worker,
         keyframe by keyframe.
-     The worker sees the keyframes in order and nothing flows back, so the result does not depend
+
+    The worker sees the keyframes in order and nothing flows back, so the result does not depend
     on timing.
     """
 

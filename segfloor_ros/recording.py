@@ -45,7 +45,8 @@ OUTPUT_NAMES = (
 @dataclasses.dataclass(frozen=True)
 class RunSummary:
     """The figures of a run, as written to summary.json.
-     lost_intervals: first and last frame number of every stretch without a pose. stages: by name
+
+    lost_intervals: first and last frame number of every stretch without a pose. stages: by name
     count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update in MB.
     """
 

@@ -30,7 +30,8 @@ def setting(
     live: bool = False,
 ) -> Any:
     """Declare one setting of a stage.
-     `minimum` and `maximum` are inclusive. `live` settings may change while a node runs; the others
+
+    `minimum` and `maximum` are inclusive. `live` settings may change while a node runs; the others
     are read-only after start.
     """
     metadata = {

@@ -28,7 +28,8 @@ from segfloor_ros.slam.residuals import (
 @dataclass(frozen=True)
 class BundleProblem:
     """A bundle adjustment problem.
-     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
+
+    T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
     most once.
     """

@@ -19,7 +19,8 @@ def refine_disparity(
     reach_px: int,
 ) -> tuple[Array, Array]:
     """Find the disparity of each feature within `reach_px` of a guess.
-     left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image. guess_px:
+
+    left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image. guess_px:
     (N,). First the best whole-pixel shift by normalised correlation, then the affine alignment of
     the patch along the row. Returns disparity (N,) and its standard deviation (N,) in pixels, NaN
     where there is no clear peak inside the reach.

@@ -16,7 +16,8 @@ SEEN_BY_SEVERAL = 2
 @dataclass(frozen=True)
 class View:
     """What the policy looks at.
-     frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
+
+    frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
     points of the reference keyframe that several keyframes see. T_last_now: motion (4, 4) since
     the last keyframe. median_depth_m: of the tracked points. mapper_idle: whether the mapper could
     take a keyframe at once.

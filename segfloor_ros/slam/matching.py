@@ -39,7 +39,8 @@ def match_predicted(
     ratio: float = 0.85,
 ) -> Matches:
     """Match map points to the features around their predicted pixels.
-     predicted_uv_px: (M, 2), predicted_octave: (M,), descriptor: (M, 32), radius_px: (M,). A match
+
+    predicted_uv_px: (M, 2), predicted_octave: (M,), descriptor: (M, 32), radius_px: (M,). A match
     must lie within one octave of the prediction and be clearly better than the second best of the
     same octave. Returns (point rows, feature rows), one to one.
     """

@@ -55,7 +55,8 @@ def align_patches(
     along_row: bool = False,
 ) -> Alignment:
     """Find where patches lie in an image, starting from a position that is right to a pixel or two.
-     template: (N, SIDE_PX, SIDE_PX) grey levels. image: (H, W) float32. start_uv_px: (N, 2). zoom:
+
+    template: (N, SIDE_PX, SIDE_PX) grey levels. image: (H, W) float32. start_uv_px: (N, 2). zoom:
     (N,) how much larger the patch appears in the image than in the template. along_row: the match
     of a rectified pair, where only u is unknown. Inverse compositional Gauss-Newton: slopes and
     normal equations come from the template, once. A fit is sound when it stays near its start, has
@@ -63,7 +64,7 @@ def align_patches(
     """
     x, y, weight = _raster()
     pixels = 1.0 / weight.max()
-    target = template.reshape(len(template), -1)
+    target = template.reshape(len(template), SIDE_PX**2)
     J = _steepest_descent(template, x, y, weight, 1 if along_row else 2)
     weighted = J * weight
     H = (weighted @ np.swapaxes(J, 1, 2)).astype(np.float64)
@@ -84,7 +85,7 @@ def align_patches(
         )
         covariance = np.linalg.inv(H + level[:, None, None] * np.diag(prior + 1e-9))
         found = np.clip(np.einsum('nab,nb->na', covariance, rhs), -1.0, 1.0)
-        step[:, : J.shape[1] // 3] = found.reshape(len(found), -1, 3)
+        step[:, : J.shape[1] // 3] = found.reshape(len(found), J.shape[1] // 3, 3)
         A = A @ np.linalg.inv(np.eye(2) + step[:, :, 1:])
         offset -= np.einsum('nij,nj->ni', A, step[:, :, 0])
     variance = np.einsum('naa->na', covariance)[:, ::3] * level[:, None]
@@ -106,8 +107,8 @@ def _steepest_descent(
     """
     slope_v, slope_u = np.gradient(template, axis=(1, 2))
     basis = np.stack([np.ones_like(x), x, y])
-    slopes = np.stack([slope_u, slope_v][:axes], axis=1).reshape(len(template), axes, 1, -1)
-    J = (slopes * basis).reshape(len(template), 3 * axes, -1)
+    slopes = np.stack([slope_u, slope_v][:axes], axis=1).reshape(len(template), axes, 1, SIDE_PX**2)
+    J = (slopes * basis).reshape(len(template), 3 * axes, SIDE_PX**2)
     return J - (J @ weight)[..., None]
 
 

@@ -32,7 +32,8 @@ RANSAC_REPROJECTION_PX = 4.0
 @dataclass(frozen=True)
 class PoseEstimate:
     """A refined pose.
-     T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
+
+    T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
     twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
     """
 
@@ -46,7 +47,8 @@ def solve_pnp(
     camera: StereoCamera, points_world: Array, uv_px: NDArray[np.floating]
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """Find T_camera_world from points (N, 3) and pixels (N, 2) by PnP in RANSAC, or None.
-     Fischler and Bolles, Random sample consensus (1981), on OpenCV's EPnP; its generator is
+
+    Fischler and Bolles, Random sample consensus (1981), on OpenCV's EPnP; its generator is
     seeded, so that the same input gives the same pose. Also returns the inliers (N,).
     """
     if len(points_world) < 6:
@@ -77,7 +79,8 @@ def refine_pose(
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
         between rounds.
-     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
+
+    points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
     and a poor calibration make errors larger than the single measurements tell; the median
     residual shows by how much, and the bound on outliers follows it.
     """

@@ -26,7 +26,8 @@ MIN_DEPTH_M = 0.05
 @dataclass(frozen=True)
 class Observations:
     """Stereo measurements of N features.
-     uvd_px: (N, 3) float64 = (u, v, disparity), disparity NaN where there is none. sigma_px: (N,
+
+    uvd_px: (N, 3) float64 = (u, v, disparity), disparity NaN where there is none. sigma_px: (N,
     3) standard deviations.
     """
 

@@ -82,7 +82,8 @@ class _Outcome:
 
 class StereoSlam:
     """Tracks a stereo camera and maps what it sees.
-     One call of `process` per frame, in order. Results are held back until the camera's mount is
+
+    One call of `process` per frame, in order. Results are held back until the camera's mount is
     known, since frame `map` lies on the floor; then all of them come at once, none is lost.
     """
 

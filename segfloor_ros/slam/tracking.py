@@ -39,7 +39,8 @@ MIN_VIEW_COSINE = 0.5
 @dataclass(frozen=True)
 class Track:
     """A frame with a pose.
-     feature_rows, point_ids: (N,) the inlier matches. observations: of all features of the frame,
+
+    feature_rows, point_ids: (N,) the inlier matches. observations: of all features of the frame,
     (F, 3) px, with a disparity where one was measured. visible_ids: the points that should have
     been seen.
     """

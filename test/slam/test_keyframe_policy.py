@@ -1,0 +1,55 @@
+"""Conditions A1, A2, A3 and B, one at a time."""
+
+import numpy as np
+import pytest
+
+from segfloor_ros.geometry import make_transform, se3_exp
+from segfloor_ros.slam.image_check import image_fault
+from segfloor_ros.slam.keyframe_policy import View, is_keyframe
+from segfloor_ros.slam.settings import StereoSlamSettings
+
+SETTINGS = StereoSlamSettings(
+    keyframe_max_frames=30,
+    keyframe_min_frames=3,
+    keyframe_tracked_ratio=0.25,
+    keyframe_min_tracked=15,
+    keyframe_motion_ratio=0.05,
+    keyframe_turn_rad=0.1,
+)
+STILL = np.eye(4)
+MOVED = make_transform(np.eye(3), np.array([0.0, 0.0, 0.2]))
+TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
+
+
+@pytest.mark.parametrize(
+    ('view', 'expected'),
+    [
+        (View(10, 200, 300, STILL, 2.0), False),  # nothing new
+        (View(10, 200, 300, MOVED, 2.0), True),  # A2: moved 0.2 > 0.05 · 2
+        (View(10, 200, 300, MOVED, 8.0), False),  # moved little for a scene that far away
+        (View(10, 200, 300, TURNED, 2.0), True),  # A2: turned
+        (View(2, 200, 300, MOVED, 2.0), False),  # too soon
+        (View(10, 200, 300, MOVED, 2.0, mapper_idle=False), False),  # mapper busy
+        (View(30, 200, 300, MOVED, 2.0, mapper_idle=False), True),  # A1: too many frames
+        (View(500, 200, 300, STILL, 2.0), False),  # standing still adds nothing
+        (View(1, 74, 300, STILL, 2.0), True),  # A3: 74 < 0.25 · 300
+        (View(1, 76, 300, STILL, 2.0), False),
+        (View(1, 15, 300, MOVED, 2.0), False),  # B: not more than 15 tracked
+    ],
+)
+def test_conditions(view, expected):
+    assert is_keyframe(view, SETTINGS) is expected
+
+
+def textured():
+    return np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8)
+
+
+def test_image_faults_are_named():
+    good = textured()
+    assert image_fault(good, good) == ''
+    assert 'left image without contrast' in image_fault(np.zeros_like(good), good)
+    assert 'right image without contrast' in image_fault(good, np.full_like(good, 255))
+    half = good.copy()
+    half[24:] = 128
+    assert 'left image incomplete' in image_fault(half, good)

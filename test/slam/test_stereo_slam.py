@@ -1,0 +1,159 @@
+"""The whole SLAM stage on a rendered room with known motion."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.geometry import invert, rotation_angle
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+SETTINGS = StereoSlamSettings(num_features=800)
+
+
+def drive(count=30):
+    """Base poses: 4 cm a frame along an arc that turns 1.2 degrees a frame."""
+    poses = [planar_pose(0, 0, 0)]
+    for k in range(1, count):
+        yaw = np.radians(1.2) * k
+        last = poses[-1][:2, 3]
+        poses.append(planar_pose(last[0] + 0.04 * np.cos(yaw), last[1] + 0.04 * np.sin(yaw), yaw))
+    return poses
+
+
+@pytest.fixture(scope='module')
+def frames():
+    room = StereoRoom()
+    return [room.frame(i, pose) for i, pose in enumerate(drive())]
+
+
+@pytest.fixture(scope='module')
+def results(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    return [result for frame in frames for result in slam.process(frame)]
+
+
+def pose_of(result):
+    return result.T_map_odom @ result.T_odom_base
+
+
+def test_every_frame_is_tracked_to_the_centimetre(results):
+    assert all(result.tracked for result in results)
+    for result, truth in zip(results, drive(), strict=True):
+        error = invert(truth) @ pose_of(result)
+        assert np.linalg.norm(error[:3, 3]) < 0.01
+        assert rotation_angle(error[:3, :3]) < np.radians(0.3)
+
+
+def test_the_map_starts_at_the_base_on_the_floor(results):
+    np.testing.assert_allclose(pose_of(results[0]), np.eye(4), atol=1e-9)
+    heights = results[-1].keyframe or [r.keyframe for r in results if r.keyframe][-1]
+    z = heights.cloud.xyz_map[:, 2]
+    # The room: most points on floor, walls and ceiling between 0 and 2.4 m.
+    assert (np.abs(z) < 0.03).sum() > 50
+    assert ((z > -0.15) & (z < 2.6)).mean() > 0.97
+
+
+def test_points_lie_on_the_walls_of_the_room(results):
+    cloud = [r.keyframe for r in results if r.keyframe][-1].cloud.xyz_map
+    to_face = np.abs(np.concatenate([cloud - [-3, -2.5, 0], cloud - [6, 2.5, 2.4]], axis=1)).min(
+        axis=1
+    )
+    assert np.median(to_face) < 0.03
+
+
+def test_keyframes_carry_what_the_next_stages_need(results):
+    keyframes = [r.keyframe for r in results if r.keyframe]
+    assert 4 <= len(keyframes) <= 15
+    for keyframe in keyframes:
+        known = keyframe.features.point_id != NO_POINT
+        assert known.sum() > 100
+        assert np.isnan(keyframe.features.xyz_map[~known]).all()
+        assert np.isin(keyframe.features.point_id[known], keyframe.cloud.point_id).all()
+        assert (np.diff(keyframe.cloud.point_id) > 0).all()
+        assert keyframe.path.stamp_ns[-1] == keyframe.stamp_ns
+        np.testing.assert_allclose(keyframe.path.T_map_base[-1], keyframe.T_map_base)
+
+
+def test_odom_is_continuous_at_keyframes(results):
+    steps = [
+        np.linalg.norm((invert(a.T_odom_base) @ b.T_odom_base)[:3, 3]) for a, b in pairwise(results)
+    ]
+    assert max(steps) < 0.05  # 4 cm a frame
+
+
+def test_repeats_to_the_bit(frames, results):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    again = [result for frame in frames for result in slam.process(frame)]
+    for a, b in zip(results, again, strict=True):
+        np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
+        np.testing.assert_array_equal(a.T_map_odom, b.T_map_odom)
+
+
+def test_covariance_is_a_covariance(results):
+    for result in results[1:]:
+        assert (np.linalg.eigvalsh(result.covariance) > 0).all()
+        assert np.sqrt(result.covariance[0, 0]) < 0.02
+
+
+def test_black_frames_are_lost_and_tracking_returns(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    results = []
+    for frame in frames:
+        if 10 <= frame.index < 14:
+            black = np.zeros_like(frame.left)
+            frame = StereoFrame(frame.index, frame.stamp_ns, black, black)
+        results += slam.process(frame)
+    assert [r.index for r in results if not r.tracked] == [10, 11, 12, 13]
+    assert 'without contrast' in results[10].state
+    assert results[10].keyframe is None
+    assert results[10].covariance[0, 0] > 1e3
+    for result, truth in zip(results[14:], drive()[14:], strict=True):
+        assert result.tracked
+        assert np.linalg.norm((invert(truth) @ pose_of(result))[:3, 3]) < 0.02
+
+
+def test_teleported_camera_is_lost_not_wrong(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    other = StereoRoom(seed=99)
+    results = []
+    for frame in frames[:15]:
+        if frame.index >= 10:
+            frame = other.frame(frame.index, planar_pose(1.0, 1.0, 2.0))
+        results += slam.process(frame)
+    assert [r.tracked for r in results] == [True] * 10 + [False] * 5
+
+
+def test_standing_still_adds_nothing(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    for k in range(60):
+        still = StereoFrame(k, k * 100_000_000, frames[0].left, frames[0].right)
+        result = slam.process(still)[0]
+    assert len(slam.map.keyframes) == 1
+    assert np.linalg.norm(pose_of(result)[:3, 3]) < 1e-3
+
+
+def test_results_wait_for_the_mount_and_none_is_lost(frames):
+    class LateMeter:
+        """Knows the mount at the third keyframe."""
+
+        def __init__(self):
+            self.seen = 0
+            self.mount = None
+
+        def add(self, left, right, T_world_left):
+            self.seen += 1
+            self.mount = MOUNT if self.seen == 3 else None
+
+    slam = StereoSlam(CAMERA, SETTINGS, None, LateMeter())
+    batches = [slam.process(frame) for frame in frames]
+    sizes = [len(batch) for batch in batches]
+    first = next(i for i, size in enumerate(sizes) if size)
+    assert first >= 2
+    assert sizes[first] == first + 1
+    assert sizes[first + 1 :] == [1] * (len(frames) - first - 1)
+    assert [r.index for batch in batches for r in batch] == list(range(len(frames)))
