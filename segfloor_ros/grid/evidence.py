@@ -22,18 +22,18 @@ QUARTILE = 0.675
 class KeyframeEvidence:
     """Free floor and hits of one keyframe, in metres and radians in its base's x-y plane.
 
-    fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad. rays_m:
-    (R, 2) float32, ends of single rays to floor points that reach farther than the fan.
-    contacts_m: (C, 2) float32, where the floor ends at something upright. points_m: (P, 2)
-    float32, obstacle points at any height that concerns the robot.
+    fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad.
+    positions_m: (M, 2) float32; the first num_rays are the ends of single rays to floor points
+    that reach farther than the fan, then num_contacts where the floor ends at something upright,
+    the others obstacle points at any height that concerns the robot.
     """
 
     first_rad: float
     step_rad: float
     fan_m: NDArray[np.float32]
-    rays_m: NDArray[np.float32]
-    contacts_m: NDArray[np.float32]
-    points_m: NDArray[np.float32]
+    positions_m: NDArray[np.float32]
+    num_rays: int
+    num_contacts: int
 
 
 def gather_evidence(
@@ -51,13 +51,16 @@ def gather_evidence(
         floor, obstacles = floor[:0], obstacles[:0]
     seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
     free_m = np.minimum(_certain(seen_m, settings), settings.max_range_m)
+    rays = _rays(floor, scan, settings)
+    contacts = _well_placed(_contacts(scan), settings)
+    obstacles = _well_placed(obstacles, settings)
     return KeyframeEvidence(
         first_rad=scan.angle_min_rad,
         step_rad=scan.angle_increment_rad,
         fan_m=free_m.astype(np.float32),
-        rays_m=_rays(floor, scan, settings).astype(np.float32),
-        contacts_m=_well_placed(_contacts(scan), settings),
-        points_m=_well_placed(obstacles, settings),
+        positions_m=np.concatenate([rays, contacts, obstacles]).astype(np.float32),
+        num_rays=len(rays),
+        num_contacts=len(contacts),
     )
 
 
@@ -100,10 +103,9 @@ def _contacts(scan: FloorScan) -> Array:
     return directions * scan.obstacle_m[standing, None].astype(np.float64)
 
 
-def _well_placed(hits: Array, settings: OccupancyGridSettings) -> NDArray[np.float32]:
+def _well_placed(hits: Array, settings: OccupancyGridSettings) -> Array:
     """Return those of the positions (N, 2) that are near enough to mark a cell."""
-    near = np.hypot(hits[:, 0], hits[:, 1]) <= hit_range_m(settings)
-    return hits[near].astype(np.float32)
+    return hits[np.hypot(hits[:, 0], hits[:, 1]) <= hit_range_m(settings)]
 
 
 def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:

@@ -8,21 +8,20 @@ through it.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.evidence import KeyframeEvidence
-from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
+from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
 from segfloor_ros.grid.log_odds import ZERO, LogOddsRaster, steps
+from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
-Pose2d = tuple[float, float, float]
-"""x and y in metres, yaw in radians."""
-
 _SEARCH_STEP_M = 0.03
-_BEHIND_CELLS = (0.0, 0.5, 1.0)
 
 
 class EvidenceFolder:
@@ -48,23 +47,21 @@ class EvidenceFolder:
         """Add the evidence of a keyframe with its base at `pose`; the base came there from
         `previous` in a straight line.
         """
-        placed = _Placed.at(evidence, pose, previous, self._resolution_m)
-        low, high = placed.bounds(self._radius_m / self._resolution_m + 2)
-        cells = raster.patch(low, high)
-        placed = placed.seen_from(low)
+        placed = place(evidence, pose, previous, self._resolution_m, self._radius_m)
+        cells = raster.patch(placed.low, placed.high)
         free = self._draw_free(cells, placed)
         hits = _hit_cells(free, placed)
         self._lower(cells, free, hits)
         self._raise(cells, hits)
         self._drive(cells, placed)
 
-    def _draw_free(self, cells: NDArray[np.uint8], placed: _Placed) -> NDArray[np.uint8]:
+    def _draw_free(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the cells that this keyframe sees to be free, 1, in a raster like `cells`."""
         occupied = self._occupied_mask(cells)
         fan = placed.fan
         if occupied is not None and len(fan.lengths):
-            lengths = self._blocked(occupied, placed.base, fan.directions(), fan.lengths)
-            fan = Fan(fan.centre, fan.first_rad, fan.step_rad, lengths)
+            lengths = self._blocked(occupied, placed.base, fan.directions, fan.lengths)
+            fan = replace(fan, lengths=lengths)
         free = fan.draw(cells.shape)
         if len(placed.rays):
             offset = placed.rays - placed.base
@@ -95,13 +92,10 @@ class EvidenceFolder:
         """
         along = np.arange(1, lengths.max() / self._search_step + 2) * self._search_step
         scaled = directions.astype(np.float32)
-        distance = along.astype(np.float32)
+        distance = np.minimum(along.astype(np.float32), lengths.astype(np.float32)[:, None])
         column = (np.float32(base[0]) + scaled[:, :1] * distance).astype(np.int32)
         row = (np.float32(base[1]) + scaled[:, 1:] * distance).astype(np.int32)
-        rows, columns = occupied.shape
-        np.clip(column, 0, columns - 1, out=column)
-        np.clip(row, 0, rows - 1, out=row)
-        block = occupied.ravel().take(row * columns + column)
+        block = occupied.ravel().take(row * occupied.shape[1] + column)
         first = block.argmax(axis=1)
         found = block[np.arange(len(block)), first] > 0
         return np.minimum(lengths, np.where(found, along[first] + 1, np.inf))
@@ -118,70 +112,16 @@ class EvidenceFolder:
         raised = cells[row, column].astype(np.int16) + self._hit
         cells[row, column] = np.minimum(raised, self._most).astype(np.uint8)
 
-    def _drive(self, cells: NDArray[np.uint8], placed: _Placed) -> None:
+    def _drive(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
         """Free the cells below the base on its way here."""
         if self._radius_m == 0:
             return
-        way = fixed_point(np.stack([placed.previous, placed.base]))
+        way = fixed_point(np.array([placed.previous, placed.base])).tolist()
         width = max(1, int(2 * self._radius_m / self._resolution_m) - 1)
-        driven = np.zeros(cells.shape, np.uint8)
-        cv2.line(driven, way[0].tolist(), way[1].tolist(), 1, width, shift=SUBPIXEL_BITS)
-        cells[driven > 0] = self._least
+        cv2.line(cells, way[0], way[1], self._least, width, shift=SUBPIXEL_BITS)
 
 
-class _Placed:
-    """A keyframe's evidence in cells of a raster, x and y by column and row."""
-
-    def __init__(
-        self, fan: Fan, previous: Array, rays: Array, contacts: Array, points: Array
-    ) -> None:
-        self.fan, self.previous = fan, previous
-        self.rays, self.contacts, self.points = rays, contacts, points
-
-    @property
-    def base(self) -> Array:
-        return self.fan.centre
-
-    @classmethod
-    def at(
-        cls, evidence: KeyframeEvidence, pose: Pose2d, previous: Pose2d | None, resolution_m: float
-    ) -> _Placed:
-        yaw = pose[2]
-        base: Array = np.array(pose[:2]) / resolution_m
-        turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]) / resolution_m
-        lengths = evidence.fan_m.astype(np.float64) / resolution_m
-        return cls(
-            Fan(base, evidence.first_rad + yaw, evidence.step_rad, lengths),
-            base if previous is None else np.array(previous[:2]) / resolution_m,
-            base + evidence.rays_m @ turn,
-            base + evidence.contacts_m @ turn,
-            base + evidence.points_m @ turn,
-        )
-
-    def bounds(self, margin: float) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Return first (row, column), and one beyond the last, of all the evidence touches."""
-        outline = self.base + self.fan.directions() * self.fan.lengths[:, None]
-        way = np.stack([self.base, self.previous])
-        parts = [way - margin, way + margin, outline, self.rays, self.contacts, self.points]
-        everything = np.concatenate(parts)
-        low = np.floor(everything.min(axis=0)).astype(int) - 2
-        high = np.floor(everything.max(axis=0)).astype(int) + 3
-        return (int(low[1]), int(low[0])), (int(high[1]), int(high[0]))
-
-    def seen_from(self, low: tuple[int, int]) -> _Placed:
-        """Return the same with cell `low` (row, column) as the first one."""
-        corner = np.array([low[1], low[0]], np.float64)
-        fan = self.fan
-        return _Placed(
-            Fan(fan.centre - corner, fan.first_rad, fan.step_rad, fan.lengths),
-            self.previous - corner,
-            self.rays - corner,
-            self.contacts - corner,
-            self.points - corner,
-        )
-
-
-def _hit_cells(free: NDArray[np.uint8], placed: _Placed) -> NDArray[np.intp]:
+def _hit_cells(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.intp]:
     """Return the cells, as ascending indices without repetition, that hold an obstacle.
 
     What is seen is an obstacle's near face. A cell that the face leaves mostly free stays free,
@@ -190,13 +130,13 @@ def _hit_cells(free: NDArray[np.uint8], placed: _Placed) -> NDArray[np.intp]:
     """
     hits = np.concatenate([placed.contacts, placed.points])
     offset = hits - placed.base
-    direction = offset / np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-9)[:, None]
-    column, row = np.floor(hits.T).astype(np.intp)
-    cell = row * free.shape[1] + column
-    marks = np.arange(len(hits)) >= len(placed.contacts)
-    for behind in reversed(_BEHIND_CELLS):
-        column, row = np.floor((hits + behind * direction).T).astype(np.intp)
-        solid = free[row, column] == 0
-        cell = np.where(solid, row * free.shape[1] + column, cell)
-        marks |= solid
-    return np.unique(cell[marks])
+    distance = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
+    step = offset * (0.5 / np.maximum(distance, 1.0))[:, None]
+    candidates = np.concatenate([hits, hits + step, hits + 2 * step]).astype(np.intp)
+    cell = (candidates[:, 1] * free.shape[1] + candidates[:, 0]).reshape(3, -1)
+    solid = free.ravel()[cell] == 0
+    choice = solid.argmax(axis=0)
+    chosen = cell[choice, np.arange(len(hits))]
+    marks = solid[choice, np.arange(len(hits))]
+    marks[len(placed.contacts) :] = True
+    return np.unique(chosen[marks])

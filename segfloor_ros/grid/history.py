@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.grid.evidence import KeyframeEvidence
-from segfloor_ros.grid.fold import EvidenceFolder, Pose2d
+from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.log_odds import LogOddsRaster, Snapshot
+from segfloor_ros.grid.placing import Pose2d
 
 CHECKPOINT_EVERY = 16
 _KEEP_GROWTH = 8

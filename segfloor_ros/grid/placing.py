@@ -1,0 +1,72 @@
+"""A keyframe's evidence laid on the raster at the keyframe's pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.evidence import KeyframeEvidence
+from segfloor_ros.grid.fan import Fan, unit_vectors
+
+Pose2d = tuple[float, float, float]
+"""x and y in metres, yaw in radians."""
+
+
+@dataclass(frozen=True)
+class PlacedEvidence:
+    """Evidence in cells, x along columns and y along rows, seen from the corner of cell `low`.
+
+    low, high: (row, column) of the first cell and of one beyond the last that the evidence
+    touches. previous: (2,), where the base came from. rays, contacts, points: as in
+    `KeyframeEvidence`.
+    """
+
+    low: tuple[int, int]
+    high: tuple[int, int]
+    fan: Fan
+    previous: Array
+    rays: Array
+    contacts: Array
+    points: Array
+
+    @property
+    def base(self) -> Array:
+        """Where the base is, (2,)."""
+        return self.fan.centre
+
+
+def place(
+    evidence: KeyframeEvidence,
+    pose: Pose2d,
+    previous: Pose2d | None,
+    resolution_m: float,
+    margin_m: float,
+) -> PlacedEvidence:
+    """Lay evidence on the raster with the base at `pose`, and `margin_m` around its way there."""
+    yaw = pose[2]
+    scale = 1 / resolution_m
+    way = np.array([pose[:2], (previous or pose)[:2]]) * scale
+    lengths = evidence.fan_m * np.float64(scale)
+    first_rad = evidence.first_rad + yaw
+    directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
+    cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
+    positions = evidence.positions_m @ np.array([[cos, sin], [-sin, cos]]) + way[0]
+    margin = margin_m * scale + 2
+    ends = directions * lengths[:, None] + way[0]
+    touched = np.concatenate([ends, positions, way - margin, way + margin])
+    low = np.floor(touched.min(axis=0)).astype(np.intp) - 2
+    high = np.floor(touched.max(axis=0)).astype(np.intp) + 3
+    positions -= low
+    way -= low
+    rays, contacts = evidence.num_rays, evidence.num_rays + evidence.num_contacts
+    return PlacedEvidence(
+        low=(int(low[1]), int(low[0])),
+        high=(int(high[1]), int(high[0])),
+        fan=Fan(way[0], first_rad, evidence.step_rad, directions, lengths),
+        previous=way[1],
+        rays=positions[:rays],
+        contacts=positions[rays:contacts],
+        points=positions[contacts:],
+    )
