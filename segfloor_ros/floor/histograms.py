@@ -1,0 +1,52 @@
+"""u- and v-disparity, and the removal of obstacles from the latter.
+
+Labayrie, Aubert, Tarel, Real Time Obstacle Detection in Stereovision on Non Flat Road Geometry
+Through V-disparity Representation (2002); Hu, Uchimura, U-V-Disparity (2005).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:
+    """Return how often each disparity bin occurs per column, (num_bins, W).
+
+    bins: (H, W) disparity bin per pixel; bin 0 is `no match` and stays 0.
+    """
+    width = bins.shape[1]
+    counts = np.bincount((bins * width + np.arange(width)).ravel(), minlength=num_bins * width)
+    counts = counts[: num_bins * width].reshape(num_bins, width)
+    counts[0] = 0
+    return counts
+
+
+def obstacle_rows(
+    disparity_px: NDArray[np.floating],
+    height_m: float,
+    rows_per_m_px: float,
+    floor_rows_per_px: float,
+) -> NDArray[np.float64]:
+    """Return the count at which a u-disparity cell is an obstacle, per disparity.
+
+    An upright surface of `height_m` covers `height_m * rows_per_m_px * d` rows (with
+    rows_per_m_px = fy / (fx * baseline)). The floor itself puts `floor_rows_per_px` rows into
+    each bin of one pixel, so the threshold never falls below twice that.
+    """
+    return np.maximum(height_m * rows_per_m_px * disparity_px, 2 * floor_rows_per_px + 2)
+
+
+def v_disparity(
+    rows: NDArray[np.intp],
+    bins: NDArray[np.intp],
+    keep: NDArray[np.bool_],
+    shape: tuple[int, int],
+) -> NDArray[np.intp]:
+    """Return how often each disparity bin occurs per row, `shape` = (rows, bins).
+
+    rows, bins, keep: (H, W); rows may be fractional rows of a de-rolled image rounded to whole
+    ones.
+    """
+    index = rows[keep] * shape[1] + bins[keep]
+    return np.bincount(index, minlength=shape[0] * shape[1])[: shape[0] * shape[1]].reshape(shape)

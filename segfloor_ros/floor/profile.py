@@ -1,0 +1,165 @@
+"""The floor profile: floor disparity as a function of the image row, a uniform cubic B-spline.
+
+Wedel, Badino, Rabe, Loose, Franke, Cremers, B-Spline Modeling of Road Surfaces With an
+Application to Free-Space Estimation (2009).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.geometry import Array
+
+SEGMENTS = 5
+_CONTROLS = SEGMENTS + 3
+_CORRELATED_PIXELS = 200.0
+"""Neighbouring disparities err together: so many of them count as one measurement."""
+
+
+@dataclass(frozen=True)
+class FloorLine:
+    """A plane floor in v-disparity: `d = slope * (v - horizon)` at the de-rolled row v.
+
+    The de-rolled row of pixel (u, v) is `v + shear * (u - cx)`; a plane's disparity depends on it
+    alone, whatever the roll. metres_per_row: a point with disparity d that lies one row above the
+    floor's row of that disparity is `metres_per_row / d` metres above the floor.
+    """
+
+    slope: float
+    horizon: float
+    shear: float
+    metres_per_row: float
+
+    @classmethod
+    def of(cls, camera: StereoCamera, mount: Mount) -> FloorLine:
+        """Return the line of a plane floor seen from `mount`."""
+        up = mount.up_in_camera
+        scale = camera.disparity_times_depth
+        return cls(
+            slope=float(-up[1] / camera.fy * scale / mount.height_m),
+            horizon=float(camera.cy - camera.fy * up[2] / up[1]),
+            shear=float(up[0] / camera.fx * camera.fy / up[1]),
+            metres_per_row=float(-up[1] / camera.fy * scale),
+        )
+
+
+@dataclass(frozen=True)
+class FloorProfile:
+    """The fitted profile. line: the prior. first_row, rows: the de-rolled rows it is sampled on.
+
+    disparity_px: (R,) float64 strictly increasing, at rows first_row, first_row + 1, ...
+    support: number of pixels that carry the fit.
+    """
+
+    line: FloorLine
+    first_row: float
+    disparity_px: Array
+    support: float
+
+    def at_rows(self, rows: NDArray[np.floating]) -> Array:
+        """Return the floor's disparity at de-rolled rows, NaN above the first row."""
+        rows = np.asarray(rows, np.float64)
+        end = self.first_row + len(self.disparity_px) - 1
+        grid = self.first_row + np.arange(len(self.disparity_px))
+        values = np.interp(rows, grid, self.disparity_px)
+        values += np.maximum(rows - end, 0) * self.line.slope
+        return np.where(rows < self.first_row, np.nan, values)
+
+    def row_of_disparity(self, disparity_px: NDArray[np.floating]) -> Array:
+        """Return the de-rolled row at which the floor has a disparity."""
+        d = np.asarray(disparity_px, np.float64)
+        grid = self.first_row + np.arange(len(self.disparity_px))
+        rows = np.interp(d, self.disparity_px, grid)
+        rows += np.maximum(d - self.disparity_px[-1], 0) / self.line.slope
+        return rows - np.maximum(self.disparity_px[0] - d, 0) / self.line.slope
+
+
+def spline_basis(positions: NDArray[np.floating]) -> Array:
+    """Return the basis (N, 8) of the uniform cubic B-spline of five segments over [0, 5]."""
+    x = np.clip(np.asarray(positions, np.float64), 0.0, SEGMENTS)
+    segment = np.minimum(x.astype(np.intp), SEGMENTS - 1)
+    t = x - segment
+    weights = np.stack(
+        [
+            (1 - t) ** 3,
+            3 * t**3 - 6 * t**2 + 4,
+            -3 * t**3 + 3 * t**2 + 3 * t + 1,
+            t**3,
+        ],
+        axis=1,
+    )
+    basis = np.zeros((len(x), _CONTROLS))
+    basis[np.arange(len(x))[:, None], segment[:, None] + np.arange(4)] = weights / 6
+    return basis
+
+
+def fit_profile(
+    counts: NDArray[np.integer],
+    first_row: int,
+    bin_px: float,
+    line: FloorLine,
+    camera: StereoCamera,
+    settings: FloorSegmentationSettings,
+) -> FloorProfile:
+    """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
+
+    counts: (R, B), row i is the de-rolled row first_row + i, bin j the disparity j * bin_px.
+    Tukey's biweight, its scale shrinking to `profile_scale_px`; first as a line, then as a
+    spline. The result rises strictly with the row and is never above the line's horizon.
+    """
+    rows, bins = np.nonzero(counts)
+    disparity = bins * bin_px
+    height = counts.shape[0]
+    start = max(float(first_row), line.horizon)
+    to_position = SEGMENTS / max(first_row + height - 1 - start, 1.0)
+    below = rows + first_row >= start
+    rows, bins, disparity = rows[below], bins[below], disparity[below]
+    basis = spline_basis((rows + first_row - start) * to_position)
+    weight = counts[rows, bins] / (_CORRELATED_PIXELS * settings.disparity_noise_px**2)
+    # The control points of a straight line lie on it, at their own abscissae.
+    abscissae = start + (np.arange(_CONTROLS) - 1) / to_position
+    prior = line.slope * (abscissae - line.horizon)
+    information = _prior_information(prior, line, camera, settings)
+    controls = prior.copy()
+    bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
+    scale = settings.profile_scale_px
+    support = 0.0
+    for factor, stiffness in ((4, 1e4), (2, 1e4), (1, 1e4), (1.5, 1), (1.5, 1), (1, 1), (1, 1)):
+        residual = disparity - basis @ controls
+        ratio = np.clip(residual / (3 * factor * scale), -1, 1)
+        robust = weight * (1 - ratio**2) ** 2
+        normal = basis.T @ (basis * robust[:, None]) + information
+        normal += settings.profile_stiffness * stiffness * bend.T @ bend
+        controls = prior + np.linalg.solve(normal, basis.T @ (robust * (disparity - basis @ prior)))
+        support = float(robust.sum())
+    controls = np.maximum.accumulate(controls)
+    grid = np.arange(np.ceil(start), first_row + height)
+    values = spline_basis((grid - start) * to_position) @ controls
+    values = np.maximum(values, 0) + 1e-6 * np.arange(len(grid))
+    return FloorProfile(line, float(grid[0]), values, support)
+
+
+def _prior_information(
+    prior: Array, line: FloorLine, camera: StereoCamera, settings: FloorSegmentationSettings
+) -> Array:
+    """Return the information (8, 8) that the mount gives on the control points.
+
+    The pitch shifts the line, the height scales it.
+    """
+    ends = np.array([0, _CONTROLS - 1])
+    jacobian = np.zeros((2, _CONTROLS))
+    jacobian[0, ends[0]] = 1.0
+    jacobian[1, ends] = (-1.0, 1.0)
+    sigma = np.array(
+        [
+            line.slope * camera.fy * settings.pitch_sigma_rad,
+            settings.height_sigma * float(prior[-1] - prior[0]),
+        ]
+    )
+    scaled = jacobian / sigma[:, None]
+    return scaled.T @ scaled
