@@ -7,8 +7,13 @@ import sys
 
 import typer
 
+from segfloor_ros.cli.calibrate import calibrate
+from segfloor_ros.cli.convert import convert
+from segfloor_ros.cli.evaluate import app as evaluate
 from segfloor_ros.cli.output import print_error
+from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
+from segfloor_ros.cli.simulate import simulate
 from segfloor_ros.errors import MapError, SegfloorError
 
 app = typer.Typer(
@@ -17,7 +22,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command()(run)
+for command in (run, replay, simulate, calibrate, convert):
+    app.command()(command)
+app.add_typer(evaluate, name='evaluate')
 
 
 @app.callback()

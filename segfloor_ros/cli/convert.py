@@ -1,0 +1,36 @@
+"""`segfloor convert`: any recording to a rosbag2 file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import TaskID
+
+from segfloor_ros.camera.bag_writer import ImageCoding
+from segfloor_ros.camera.bag_writer import convert as write_bag
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.options import InputArgument, ParamsOption, SetOption
+from segfloor_ros.cli.output import console, progress_bar
+from segfloor_ros.configuration import resolve
+
+
+def convert(
+    input: InputArgument,
+    out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
+    images: Annotated[
+        ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
+    ] = ImageCoding.raw,
+    params: ParamsOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Convert a recording to a rosbag2 (mcap) with images and CameraInfo."""
+    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
+    source = open_source(configuration.stereo_camera)
+    with progress_bar('converting', source.frame_count) as progress:
+        pairs = write_bag(
+            source, out, images, lambda done: progress.update(TaskID(0), completed=done)
+        )
+    size_mb = sum(f.stat().st_size for f in [out, *out.rglob('*')] if f.is_file()) / 1e6
+    console.print(f'{pairs} pairs, {size_mb:.1f} MB: {out}', highlight=False)
