@@ -23,7 +23,7 @@ class KeyframeEvidence:
     """Free floor and hits of one keyframe, in metres and radians in its base's x-y plane.
 
     fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad.
-    positions_m: (M, 2) float32; the first num_rays are the ends of single rays to floor points
+    positions_m: (2, M) float32; the first num_rays are the ends of single rays to floor points
     that reach farther than the fan, then num_contacts where the floor ends at something upright,
     the others obstacle points at any height that concerns the robot.
     """
@@ -58,7 +58,7 @@ def gather_evidence(
         first_rad=scan.angle_min_rad,
         step_rad=scan.angle_increment_rad,
         fan_m=free_m.astype(np.float32),
-        positions_m=np.concatenate([rays, contacts, obstacles]).astype(np.float32),
+        positions_m=np.concatenate([rays, contacts, obstacles]).T.astype(np.float32),
         num_rays=len(rays),
         num_contacts=len(contacts),
     )
@@ -100,7 +100,7 @@ def _contacts(scan: FloorScan) -> Array:
         return np.zeros((0, 2))
     standing = np.isfinite(scan.obstacle_m)
     directions = unit_vectors(scan.bearings_rad[standing])
-    return directions * scan.obstacle_m[standing, None].astype(np.float64)
+    return (directions * scan.obstacle_m[standing]).T
 
 
 def _well_placed(hits: Array, settings: OccupancyGridSettings) -> Array:

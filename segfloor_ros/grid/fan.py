@@ -19,7 +19,7 @@ _JUMP_SHARE = 0.15
 class Fan:
     """A star-shaped area around `centre` (x, y), in cells, x along columns and y along rows.
 
-    Bearing i is first_rad + i * step_rad; directions: (S, 2), their unit vectors; lengths: (S,),
+    Bearing i is first_rad + i * step_rad; directions: (2, S), their unit vectors; lengths: (S,),
     how far the area reaches. Where two neighbours end at different things, the area between them
     ends at the nearer one.
     """
@@ -36,9 +36,9 @@ class Fan:
         if len(self.lengths) < 2:
             return area
         left, right = self._ends()
-        outline = np.zeros((2 * len(left) + 1, 2))
-        outline[1::2], outline[2::2] = left, right
-        pixels = fixed_point(self.centre + outline)
+        outline = np.zeros((2, 2 * left.shape[1] + 1))
+        outline[:, 1::2], outline[:, 2::2] = left, right
+        pixels = fixed_point(self.centre[:, None] + outline)
         cv2.fillPoly(area, [pixels], 1, shift=SUBPIXEL_BITS)
         # Filled shapes include every cell their border passes through: decide those by centre.
         border = np.zeros(shape, np.uint8)
@@ -51,36 +51,39 @@ class Fan:
         return area
 
     def _ends(self) -> tuple[Array, Array]:
-        """Return where the S - 1 wedges end at their first and at their second bearing."""
+        """Return where the S - 1 wedges end at their first and second bearing, (2, S - 1) each."""
         first, second = self.lengths[:-1], self.lengths[1:]
         nearer = np.minimum(first, second)
         jump = np.abs(first - second) > _JUMP_SHARE * nearer
-        left = np.where(jump, nearer, first)[:, None] * self.directions[:-1]
-        right = np.where(jump, nearer, second)[:, None] * self.directions[1:]
+        left = np.where(jump, nearer, first) * self.directions[:, :-1]
+        right = np.where(jump, nearer, second) * self.directions[:, 1:]
         return left, right
 
     def _contains(self, x: Array, y: Array, left: Array, right: Array) -> NDArray[np.bool_]:
         """Tell which points (N,), (N,), relative to the centre, lie within their wedge."""
         bearing = np.remainder(np.arctan2(y, x) - self.first_rad, 2 * np.pi)
         index = (bearing * (1 / self.step_rad)).astype(np.intp)
-        within = index < len(left)
+        within = index < left.shape[1]
         index *= within
-        edge = right - left
-        beyond = edge[:, 0] * left[:, 1] - edge[:, 1] * left[:, 0]
-        side = edge[index, 0] * y - edge[index, 1] * x
+        edge_x, edge_y = right - left
+        beyond = edge_x * left[1] - edge_y * left[0]
+        side = edge_x[index] * y - edge_y[index] * x
         return within & (side >= beyond[index])
 
 
 def unit_vectors(bearing_rad: Array) -> Array:
-    """Return unit vectors (N, 2) of bearings (N,)."""
-    directions = np.empty((len(bearing_rad), 2))
-    np.cos(bearing_rad, out=directions[:, 0])
-    np.sin(bearing_rad, out=directions[:, 1])
+    """Return unit vectors (2, N) of bearings (N,)."""
+    directions = np.empty((2, len(bearing_rad)))
+    np.cos(bearing_rad, out=directions[0])
+    np.sin(bearing_rad, out=directions[1])
     return directions
 
 
 def fixed_point(xy_cells: Array) -> NDArray[np.int32]:
-    """Return OpenCV's fixed-point coordinates of positions in cells; there, whole numbers are
-    the centres of pixels.
+    """Return OpenCV's fixed-point coordinates (N, 2) of positions (2, N) in cells; there, whole
+    numbers are the centres of pixels.
     """
-    return np.rint((xy_cells - 0.5) * (1 << SUBPIXEL_BITS)).astype(np.int32)
+    scaled = xy_cells * (1 << SUBPIXEL_BITS) - (1 << SUBPIXEL_BITS - 1)
+    pixels = np.empty((xy_cells.shape[1], 2), np.int32)
+    np.rint(scaled.T, out=pixels, casting='unsafe')
+    return pixels

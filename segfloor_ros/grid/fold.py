@@ -14,14 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.geometry import Array
+from segfloor_ros.grid.blocking import Horizon
 from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
 from segfloor_ros.grid.log_odds import ZERO, LogOddsRaster, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
-
-_SEARCH_STEP_M = 0.03
 
 
 class EvidenceFolder:
@@ -35,7 +33,6 @@ class EvidenceFolder:
         self._most = ZERO + steps(settings.max_log_odds)
         self._least = ZERO - steps(-settings.min_log_odds)
         self._occupied = ZERO + steps(settings.occupied_log_odds)
-        self._search_step = max(0.7, _SEARCH_STEP_M / settings.resolution_m)
 
     def fold(
         self,
@@ -56,49 +53,25 @@ class EvidenceFolder:
         self._drive(cells, placed)
 
     def _draw_free(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
-        """Return the cells that this keyframe sees to be free, 1, in a raster like `cells`."""
-        occupied = self._occupied_mask(cells)
-        fan = placed.fan
-        if occupied is not None and len(fan.lengths):
-            lengths = self._blocked(occupied, placed.base, fan.directions, fan.lengths)
-            fan = replace(fan, lengths=lengths)
-        free = fan.draw(cells.shape)
-        if len(placed.rays):
-            offset = placed.rays - placed.base
-            lengths = np.hypot(offset[:, 0], offset[:, 1])
-            directions = offset / np.maximum(lengths, 1e-9)[:, None]
-            if occupied is not None:
-                lengths = self._blocked(occupied, placed.base, directions, lengths)
-            ends = placed.base + directions * np.maximum(lengths - 0.5, 0)[:, None]
-            lines = np.stack([np.broadcast_to(placed.base, ends.shape), ends], axis=1)
-            cv2.polylines(free, list(fixed_point(lines)), False, 1, shift=SUBPIXEL_BITS)
-        return free
+        """Return the cells that this keyframe sees to be free, 1, in a raster like `cells`.
 
-    def _occupied_mask(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """Return the cells that are occupied so far, 1; None when there are none."""
-        occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
-        if not occupied.any():
-            return None
-        if self._search_step > 1:
-            occupied = cv2.dilate(occupied, np.ones((3, 3), np.uint8))
-        return occupied
-
-    def _blocked(
-        self, occupied: NDArray[np.uint8], base: Array, directions: Array, lengths: Array
-    ) -> Array:
-        """Return lengths (S,) in cells, ended where a cell is occupied already.
-
-        That cell still gets its share, so that what has left is cleared in the end.
+        What it sees ends in the first cell that is occupied so far. That cell still gets its
+        share, so that what has left is cleared in the end.
         """
-        along = np.arange(1, lengths.max() / self._search_step + 2) * self._search_step
-        scaled = directions.astype(np.float32)
-        distance = np.minimum(along.astype(np.float32), lengths.astype(np.float32)[:, None])
-        column = (np.float32(base[0]) + scaled[:, :1] * distance).astype(np.int32)
-        row = (np.float32(base[1]) + scaled[:, 1:] * distance).astype(np.int32)
-        block = occupied.ravel().take(row * occupied.shape[1] + column)
-        first = block.argmax(axis=1)
-        found = block[np.arange(len(block)), first] > 0
-        return np.minimum(lengths, np.where(found, along[first] + 1, np.inf))
+        occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
+        fan = placed.fan
+        horizon = Horizon(occupied, placed.base, fan.first_rad, fan.step_rad)
+        lengths = np.minimum(fan.lengths, horizon.along_fan(len(fan.lengths)) + 1)
+        free = replace(fan, lengths=lengths).draw(cells.shape)
+        offset = placed.rays - placed.base[:, None]
+        if offset.size:
+            distance = np.sqrt((offset**2).sum(axis=0))
+            reached = np.minimum(distance, horizon.towards(offset) + 1) - 0.5
+            ends = placed.base[:, None] + offset * (np.maximum(reached, 0) / distance)
+            line = np.stack([np.broadcast_to(placed.base[:, None], ends.shape), ends], axis=2)
+            pixels = fixed_point(line.reshape(2, -1)).reshape(-1, 2, 2)
+            cv2.polylines(free, list(pixels), False, 1, shift=SUBPIXEL_BITS)
+        return free
 
     def _lower(
         self, cells: NDArray[np.uint8], free: NDArray[np.uint8], hits: NDArray[np.intp]
@@ -116,7 +89,7 @@ class EvidenceFolder:
         """Free the cells below the base on its way here."""
         if self._radius_m == 0:
             return
-        way = fixed_point(np.array([placed.previous, placed.base])).tolist()
+        way = fixed_point(np.stack([placed.previous, placed.base], axis=1)).tolist()
         width = max(1, int(2 * self._radius_m / self._resolution_m) - 1)
         cv2.line(cells, way[0], way[1], self._least, width, shift=SUBPIXEL_BITS)
 
@@ -128,15 +101,15 @@ def _hit_cells(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.in
     and the cell behind it is the occupied one. Contacts without such a cell mark none; points
     hang above free floor then, and mark the cell below them.
     """
-    hits = np.concatenate([placed.contacts, placed.points])
-    offset = hits - placed.base
-    distance = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    step = offset * (0.5 / np.maximum(distance, 1.0))[:, None]
-    candidates = np.concatenate([hits, hits + step, hits + 2 * step]).astype(np.intp)
-    cell = (candidates[:, 1] * free.shape[1] + candidates[:, 0]).reshape(3, -1)
+    hits = np.concatenate([placed.contacts, placed.points], axis=1)
+    offset = hits - placed.base[:, None]
+    distance = np.sqrt((offset**2).sum(axis=0))
+    step = offset * (0.5 / np.maximum(distance, 1.0))
+    candidates = np.stack([hits, hits + step, hits + 2 * step], axis=1).astype(np.intp)
+    cell = candidates[1] * free.shape[1] + candidates[0]
     solid = free.ravel()[cell] == 0
     choice = solid.argmax(axis=0)
-    chosen = cell[choice, np.arange(len(hits))]
-    marks = solid[choice, np.arange(len(hits))]
-    marks[len(placed.contacts) :] = True
+    chosen = cell[choice, np.arange(hits.shape[1])]
+    marks = solid.any(axis=0)
+    marks[placed.contacts.shape[1] :] = True
     return np.unique(chosen[marks])

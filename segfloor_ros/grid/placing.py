@@ -19,8 +19,8 @@ class PlacedEvidence:
     """Evidence in cells, x along columns and y along rows, seen from the corner of cell `low`.
 
     low, high: (row, column) of the first cell and of one beyond the last that the evidence
-    touches. previous: (2,), where the base came from. rays, contacts, points: as in
-    `KeyframeEvidence`.
+    touches. previous: (2,), where the base came from. rays, contacts, points: (2, N) each,
+    as in `KeyframeEvidence`.
     """
 
     low: tuple[int, int]
@@ -45,28 +45,27 @@ def place(
     margin_m: float,
 ) -> PlacedEvidence:
     """Lay evidence on the raster with the base at `pose`, and `margin_m` around its way there."""
-    yaw = pose[2]
-    scale = 1 / resolution_m
-    way = np.array([pose[:2], (previous or pose)[:2]]) * scale
+    yaw, scale = pose[2], 1 / resolution_m
+    way = np.array([pose[:2], (previous or pose)[:2]]).T * scale
     lengths = evidence.fan_m * np.float64(scale)
     first_rad = evidence.first_rad + yaw
     directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
     cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
-    positions = evidence.positions_m @ np.array([[cos, sin], [-sin, cos]]) + way[0]
+    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m + way[:, :1]
     margin = margin_m * scale + 2
-    ends = directions * lengths[:, None] + way[0]
-    touched = np.concatenate([ends, positions, way - margin, way + margin])
-    low = np.floor(touched.min(axis=0)).astype(np.intp) - 2
-    high = np.floor(touched.max(axis=0)).astype(np.intp) + 3
+    ends = directions * lengths + way[:, :1]
+    touched = np.concatenate([ends, positions, way - margin, way + margin], axis=1)
+    low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - 2
+    high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + 3
     positions -= low
     way -= low
     rays, contacts = evidence.num_rays, evidence.num_rays + evidence.num_contacts
     return PlacedEvidence(
-        low=(int(low[1]), int(low[0])),
-        high=(int(high[1]), int(high[0])),
-        fan=Fan(way[0], first_rad, evidence.step_rad, directions, lengths),
-        previous=way[1],
-        rays=positions[:rays],
-        contacts=positions[rays:contacts],
-        points=positions[contacts:],
+        low=(int(low[1, 0]), int(low[0, 0])),
+        high=(int(high[1, 0]), int(high[0, 0])),
+        fan=Fan(way[:, 0], first_rad, evidence.step_rad, directions, lengths),
+        previous=way[:, 1],
+        rays=positions[:, :rays],
+        contacts=positions[:, rays:contacts],
+        points=positions[:, contacts:],
     )
