@@ -11,7 +11,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.scene import Route
 
-STEP_M = 0.01
+STEP_M = 0.0025
 MIN_SPEED_M_S = 0.02
 
 
@@ -52,7 +52,7 @@ def plan_drive(path: Route, rate_hz: float) -> Drive:
 
 
 def smooth_line(path: Route) -> Array:
-    """Return the way (N, 2) through the waypoints, a point per centimetre, corners rounded by a
+    """Return the way (N, 2) through the waypoints, a point per `STEP_M`, corners rounded by a
     Gaussian of deviation `smoothing_m`, so that its curvature is continuous.
     """
     corners = np.array(path.waypoints, np.float64).reshape(-1, 2)

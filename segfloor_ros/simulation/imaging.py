@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.rig import RawCamera, raw_cameras, rectified_camera
 from segfloor_ros.simulation.scene import Scene
@@ -15,6 +16,7 @@ from segfloor_ros.simulation.scene import Scene
 Picture = NDArray[np.float32]
 
 UNDISTORT_ITERATIONS = 60
+MAX_HALF_PX = 2000
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ def plan_imaging(scene: Scene) -> ImagingPlan:
         return ImagingPlan(camera.width, camera.height, camera.fx, raw, None)
     rays = [_rays(side, camera.width, camera.height) * camera.fx for side in raw]
     half = np.ceil(np.max([np.abs(side).max(axis=(0, 1)) for side in rays], axis=0)).astype(int) + 2
+    if (half > MAX_HALF_PX).any():
+        raise InputError('the distortion folds the image over; the lens cannot be simulated')
     left, right = ((side + half - 0.5).astype(np.float32) for side in rays)
     return ImagingPlan(2 * int(half[0]), 2 * int(half[1]), camera.fx, raw, (left, right))
 

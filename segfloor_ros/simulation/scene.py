@@ -112,7 +112,7 @@ class Lighting:
     empty keeps it at 1. ambient: share of the light that comes from everywhere.
     """
 
-    ambient: float = 0.55
+    ambient: float = 0.65
     levels: tuple[Point, ...] = ()
 
 

@@ -9,8 +9,9 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.occupancy import OCCUPIED, OccupancyGrid
 from segfloor_ros.simulation.drive import Drive, plan_drive
 from segfloor_ros.simulation.imaging import Picture, develop, plan_imaging
 from segfloor_ros.simulation.renderer import WorldRenderer
@@ -61,12 +62,11 @@ class Simulation:
         solids, ground = obstacles(scene), floors(scene)
         self.motion = RigMotion(scene, self.drive, ground)
         self.true_map: OccupancyGrid = true_map(scene, solids, ground, self.drive.xy_yaw[0, :2])
-        self._renderer = WorldRenderer(scene, build_world(scene))
-        self._pictures = self._renderer.view(
-            self.imaging.width * supersampling,
-            self.imaging.height * supersampling,
-            self.imaging.focal_px * supersampling,
-        )
+        _check_clear(self.true_map, self.drive)
+        width, height = self.imaging.width * supersampling, self.imaging.height * supersampling
+        world = build_world(scene, max(width, self.camera.width), max(height, self.camera.height))
+        self._renderer = WorldRenderer(scene, world)
+        self._pictures = self._renderer.view(width, height, self.imaging.focal_px * supersampling)
         self._truth = self._renderer.view(self.camera.width, self.camera.height, self.camera.fx)
 
     def __enter__(self) -> Simulation:
@@ -120,3 +120,11 @@ class Simulation:
             for side, camera in enumerate(CAMERAS):
                 pictures[side].append(self._pictures.grey(camera))
         return [np.mean(side, axis=0, dtype=np.float32) for side in pictures]
+
+
+def _check_clear(grid: OccupancyGrid, drive: Drive) -> None:
+    cells = ((drive.xy_yaw[:, :2] - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(int)
+    hits = np.nonzero(grid.cells[cells[:, 1], cells[:, 0]] == OCCUPIED)[0]
+    if len(hits):
+        x, y, _ = drive.xy_yaw[hits[0]]
+        raise InputError(f'the path runs into an obstacle at x {x:.2f}, y {y:.2f} m')

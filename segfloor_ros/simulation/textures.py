@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.settings import suggestion
@@ -72,8 +72,8 @@ def marble(size: int, rng: np.random.Generator) -> Image:
 
 def granite(size: int, rng: np.random.Generator) -> Image:
     """Speckled stone."""
-    coarse, fine = fractal_noise(size, 0.5, rng, 90), fractal_noise(size, 0.2, rng, 200)
-    return 118 + 26 * np.tanh(1.4 * coarse) + 14 * fine
+    clouds, specks = fractal_noise(size, 1.1, rng, 4), fractal_noise(size, 1.0, rng, 50)
+    return 122 + 10 * clouds + 26 * np.tanh(1.6 * specks) + 10 * fractal_noise(size, 0.2, rng, 200)
 
 
 def wood(size: int, rng: np.random.Generator) -> Image:
@@ -209,7 +209,7 @@ def _grid_lines(size: int, rows: int, columns: int, width: int) -> Image:
     lines[position % (size // rows) < width] = 1
     if columns > 1:
         lines[:, position % (size // columns) < width] = 1
-    return cv2.GaussianBlur(lines, (3, 3), 0.7)
+    return gaussian_filter(lines, 0.7, mode='wrap')
 
 
 def _shelves(

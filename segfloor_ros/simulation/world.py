@@ -85,15 +85,18 @@ class WorldBuilder:
         )
 
 
-def build_world(scene: Scene) -> World:
-    """Return the model of a scene. Raises InputError for an unknown texture or furniture."""
+def build_world(scene: Scene, width: int, height: int) -> World:
+    """Return the model of a scene for pictures no larger than a size in pixels.
+
+    Raises InputError for an unknown texture or furniture.
+    """
     builder = WorldBuilder(scene)
     _add_ground(builder)
     builder.bodies += builder.solids(obstacles(scene), 'solid')
     if scene.slopes or scene.floor_patches:
         builder.bodies += builder.solids(floors(scene), 'slope')
     _add_people(builder)
-    return World(_document(builder), builder.files, tuple(builder.floor_geoms))
+    return World(_document(builder, width, height), builder.files, tuple(builder.floor_geoms))
 
 
 def people_bodies(scene: Scene) -> list[str]:
@@ -135,9 +138,9 @@ def _add_people(builder: WorldBuilder) -> None:
             builder.bodies.append(f'<body name="{name}" mocap="true">{geoms}</body>')
 
 
-def _document(builder: WorldBuilder) -> str:
+def _document(builder: WorldBuilder, width: int, height: int) -> str:
     scene, camera = builder.scene, builder.scene.camera
-    diffuse = 1.0 - scene.lighting.ambient
+    diffuse = 1.1 - scene.lighting.ambient
     # MuJoCo's cameras look along -z with y up: half a turn about x from the optical frame.
     cameras = ''.join(
         f'<camera name="{name}" pos="{x} 0 0" quat="0 1 0 0"/>'
@@ -147,7 +150,7 @@ def _document(builder: WorldBuilder) -> str:
 <mujoco>
   <statistic extent="1" center="0 0 1"/>
   <visual>
-    <global offwidth="4096" offheight="4096"/>
+    <global offwidth="{width}" offheight="{height}"/>
     <map znear="{NEAR_M}" zfar="{FAR_M}"/>
     <quality offsamples="4" shadowsize="0"/>
     <headlight active="0"/>
@@ -161,7 +164,7 @@ def _document(builder: WorldBuilder) -> str:
     <light type="directional" castshadow="false" pos="0 0 2" dir="0.45 0.6 -0.75"
            ambient="{_grey(scene.lighting.ambient)}" diffuse="{_grey(diffuse)}" specular="0 0 0"/>
     <light type="directional" castshadow="false" pos="0 0 2" dir="-0.7 -0.35 -0.5"
-           ambient="0 0 0" diffuse="{_grey(0.7 * diffuse)}" specular="0 0 0"/>
+           ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
     <light type="directional" castshadow="false" pos="0 0 1" dir="0 0 1"
            ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
     {''.join(builder.bodies)}

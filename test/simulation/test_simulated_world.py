@@ -1,0 +1,246 @@
+"""Scene files, solids, meshes, textures and the true map, without rendering."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN
+from segfloor_ros.simulation.any_scene import open_scene
+from segfloor_ros.simulation.floor_plan import merged_rectangles
+from segfloor_ros.simulation.mesh import caps, merge, sides
+from segfloor_ros.simulation.people import part_poses
+from segfloor_ros.simulation.scene import Person, Scene
+from segfloor_ros.simulation.scene_file import load_scene, scene_from_mapping, shipped_scenes
+from segfloor_ros.simulation.solids import block, cylinder, floors, obstacles
+from segfloor_ros.simulation.textures import GENERATORS, make_texture
+from segfloor_ros.simulation.tour import CLEARANCE_M, plan_tour
+from segfloor_ros.simulation.truth_map import floor_height_m, true_map
+
+PATH = {'waypoints': [[0.5, 0.5], [1.5, 0.5]]}
+ROOM = [[0, 0], [4, 0], [4, 3], [0, 3]]
+
+
+def scene_with(**values) -> Scene:
+    return scene_from_mapping({'description': 'a test', 'path': PATH, **values}, 'test')
+
+
+def map_of(scene: Scene):
+    return true_map(scene, obstacles(scene), floors(scene), np.array(scene.path.waypoints[0]))
+
+
+def cell(grid, x, y):
+    column, row = ((np.array([x, y]) - grid.origin_xy_m) / grid.resolution_m).astype(int)
+    return grid.cells[row, column]
+
+
+@pytest.mark.parametrize('name', sorted(shipped_scenes()))
+def test_shipped_scenes_leave_room_for_the_robot(name):
+    scene = open_scene(name)
+    grid = map_of(scene)
+    assert (grid.cells == FREE).sum() * grid.resolution_m**2 > 5.0
+    occupied = np.argwhere(grid.cells == OCCUPIED)[:, ::-1] + 0.5
+    centres = np.array(grid.origin_xy_m) + occupied * grid.resolution_m
+    for waypoint in scene.path.waypoints:
+        assert np.hypot(*(centres - waypoint).T).min() > 0.2
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'walls': [{'texture': 'plain'}]}, 'walls 1: points is missing'),
+        ({'wals': []}, 'unknown entry wals: did you mean walls'),
+        ({'camera': {'height_m': 'high'}}, "camera, height_m: 'high' is not a number"),
+        ({'camera': {'width': 64.5}}, 'width: 64.5 is not a whole number'),
+        ({'boxes': [{'at': [1, 2], 'size': [1, 2]}]}, r'size: expected 3 numbers'),
+        ({'boxes': 3}, 'boxes: expected a list'),
+        ({'floor': 'tiles'}, 'floor: expected names and values'),
+    ],
+)
+def test_scene_errors_name_the_entry(values, message):
+    with pytest.raises(InputError, match=message):
+        scene_with(**values)
+
+
+def test_scene_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match='no such scene'):
+        open_scene('corridor_1')
+    with pytest.raises(InputError, match=r'none\.yaml: cannot be read'):
+        load_scene(tmp_path / 'none.yaml')
+    (tmp_path / 'bad.yaml').write_text('walls: [\n')
+    with pytest.raises(InputError, match=r'bad\.yaml, line 2'):
+        load_scene(tmp_path / 'bad.yaml')
+    (tmp_path / 'bad.yaml').write_text('like: halls\n')
+    with pytest.raises(InputError, match='did you mean hall'):
+        load_scene(tmp_path / 'bad.yaml')
+
+
+def test_a_scene_takes_over_what_it_does_not_say(tmp_path):
+    file = tmp_path / 'mine.yaml'
+    file.write_text('like: hall\ncamera: {height_m: 0.5, vibration: {roll_deg: 1}}\nboxes: []\n')
+    mine = open_scene(str(file), ['camera.pitch_deg=3', 'seed=9'])
+    hall = open_scene('hall')
+    assert (mine.camera.height_m, mine.camera.pitch_deg, mine.seed) == (0.5, 3.0, 9)
+    assert mine.camera.vibration.roll_deg == 1.0
+    assert (mine.walls, mine.path, mine.boxes) == (hall.walls, hall.path, ())
+
+
+@pytest.mark.parametrize('name', ['plaster', 'concrete', 'carpet', 'marble', 'granite', 'metal'])
+def test_noise_repeats_without_a_seam(name):
+    pixels = make_texture(name, 3).pixels.astype(float)
+    for axis in (0, 1):
+        steps = np.abs(np.diff(pixels, axis=axis)).mean(axis=1 - axis)
+        seam = np.abs(pixels.take(0, axis) - pixels.take(-1, axis)).mean()
+        assert seam <= steps.max()
+
+
+@pytest.mark.parametrize('name', sorted(GENERATORS))
+def test_textures_are_square_and_neither_black_nor_white(name):
+    texture = make_texture(name, 3)
+    assert texture.pixels.dtype == np.uint8
+    assert texture.pixels.shape[0] == texture.pixels.shape[1]
+    assert texture.side_m > 0
+    assert 30 < texture.pixels.mean() < 220
+
+
+def test_textures_follow_their_seed():
+    first, again, other = (make_texture('marble', seed).pixels for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first.astype(float) - other).mean() > 5
+    with pytest.raises(InputError, match='did you mean marble'):
+        make_texture('marbel', 1)
+
+
+def enclosed_volume(mesh):
+    """Return the volume by the divergence theorem, which needs every face to point outwards."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def test_meshes_are_closed_and_face_outwards():
+    box = block((3.0, -2.0), (2.0, 1.0, 0.5), 'wood', yaw_deg=30, bottom_m=0.2)
+    mesh = merge([sides(box, 1.0), caps(box, 1.0)])
+    assert enclosed_volume(mesh) == pytest.approx(1.0)
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    geometric = np.cross(b - a, c - a)
+    geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.normals[mesh.faces[:, 0]], geometric, atol=1e-9)
+    tube = cylinder((1.0, 1.0), 0.5, 2.0, 'metal')
+    mesh = merge([sides(tube, 1.0), caps(tube, 1.0)])
+    polygon = 32 / 2 * 0.25 * np.sin(2 * np.pi / 32)
+    assert enclosed_volume(mesh) == pytest.approx(2.0 * polygon)
+    radial = mesh.vertices[: 4 * 32, :2] - 1.0
+    np.testing.assert_allclose(mesh.normals[: 4 * 32, :2], radial / 0.5, atol=1e-9)
+
+
+def test_texture_coordinates_are_in_metres():
+    box = block((0.0, 0.0), (2.0, 1.0, 0.5), 'wood', bottom_m=0.25)
+    mesh = sides(box, 4.0)
+    first_side = mesh.uv[:4] * 4.0
+    np.testing.assert_allclose(np.ptp(first_side, axis=0), [2.0, 0.5])
+    # Up in the world is up in the picture, where v runs downward.
+    assert mesh.uv[mesh.vertices[:, 2] == 0.75][:, 1].max() == pytest.approx(-0.75 / 4)
+
+
+def test_true_map_of_a_box_on_the_raster():
+    walls = [{'points': ROOM, 'closed': True, 'thickness_m': 0.1}]
+    boxes = [{'at': [2.0, 2.0], 'size': [0.5, 0.2, 0.3]}]
+    grid = map_of(scene_with(walls=walls, boxes=boxes))
+    # The room is 3.9 x 2.9 m inside its walls; the box takes 10 x 4 cells of it.
+    assert (grid.cells == FREE).sum() == 78 * 58 - 10 * 4
+    assert (grid.cells == OCCUPIED).sum() == 82 * 62 - 78 * 58 + 10 * 4
+    assert cell(grid, 2.24, 2.09) == OCCUPIED
+    assert cell(grid, 2.26, 2.09) == FREE
+    assert cell(grid, 2.24, 2.11) == FREE
+    assert cell(grid, -0.3, 1.0) == UNKNOWN
+
+
+def test_true_map_knows_heights():
+    walls = [{'points': ROOM, 'closed': True}]
+    boxes = [
+        {'at': [1.0, 2.0], 'size': [0.4, 0.4, 0.2], 'bottom_m': 1.1},
+        {'at': [2.0, 2.0], 'size': [0.4, 0.4, 0.2], 'bottom_m': 0.9},
+        {'at': [3.0, 2.0], 'size': [0.4, 0.4, 0.05]},
+        {'at': [3.0, 1.0], 'size': [0.4, 0.4, 0.02]},
+    ]
+    grid = map_of(scene_with(walls=walls, boxes=boxes, robot_height_m=1.0, step_height_m=0.03))
+    seen = [cell(grid, x, y) for x, y in ((1, 2), (2, 2), (3, 2), (3, 1))]
+    assert seen == [FREE, OCCUPIED, OCCUPIED, FREE]
+
+
+def test_slopes_are_floor_and_lift_what_stands_in_the_way():
+    slopes = [{'start': [1, 1.5, 0], 'end': [3, 1.5, 0.4], 'width_m': 1.0}]
+    low = [
+        {'at': [2.0, 1.5], 'size': [0.2, 0.2, 0.15]},
+        {'at': [1.2, 1.5], 'size': [0.2, 0.2, 0.15]},
+    ]
+    scene = scene_with(walls=[{'points': ROOM, 'closed': True}], slopes=slopes, boxes=low)
+    heights = floor_height_m(floors(scene), np.array([[1, 1.5], [2, 1.6], [3, 1.5], [3.2, 1.5]]))
+    np.testing.assert_allclose(heights, [0.0, 0.2, 0.4, 0.0], atol=1e-9)
+    grid = map_of(scene)
+    # The first block lies below the ramp's surface there, the second sticks out of it.
+    assert cell(grid, 2.0, 1.5) == FREE
+    assert cell(grid, 1.2, 1.5) == OCCUPIED
+
+
+def test_posters_do_not_stand_in_the_way():
+    walls = {'points': ROOM, 'closed': True}
+    bare, hung = (map_of(scene_with(walls=[{**walls, 'posters': n}])) for n in (0, 20))
+    np.testing.assert_array_equal(bare.cells, hung.cells)
+
+
+def test_start_on_an_obstacle_is_refused():
+    with pytest.raises(InputError, match='starts on an obstacle'):
+        map_of(scene_with(boxes=[{'at': [0.5, 0.5], 'size': [1, 1, 1]}]))
+
+
+def test_rectangles_cover_exactly_what_is_occupied():
+    mask = np.random.default_rng(0).uniform(size=(40, 31)) < 0.6
+    mask[5:20, 8:14] = True
+    drawn = np.zeros(mask.shape, int)
+    for bottom, top, left, right in merged_rectangles(mask):
+        drawn[bottom:top, left:right] += 1
+    np.testing.assert_array_equal(drawn, mask.astype(int))
+    whole = merged_rectangles(np.ones((4, 7), bool))
+    np.testing.assert_array_equal(whole, [[0, 4, 0, 7]])
+
+
+@pytest.mark.parametrize('name', ['depot', 'house_map'])
+def test_floor_plan_becomes_the_same_map_again(shared_data, name):
+    file = shared_data / 'maps' / f'{name}.yaml'
+    scene = open_scene(str(file))
+    plan, grid = load_map(file), map_of(scene)
+    shift = np.round((np.array(plan.origin_xy_m) - grid.origin_xy_m) / grid.resolution_m).astype(
+        int
+    )
+    expected = {tuple(c) for c in np.argwhere(plan.cells == OCCUPIED) + shift[::-1]}
+    assert {tuple(c) for c in np.argwhere(grid.cells == OCCUPIED)} == expected
+
+
+def test_tour_keeps_clear_of_walls_and_comes_back():
+    free = np.zeros((120, 200), bool)
+    free[10:110, 10:190] = True
+    free[40:80, 60:140] = False
+    tour = plan_tour(free, 0.05, (-1.0, 2.0))
+    np.testing.assert_allclose(tour[0], tour[-1])
+    blocked = np.argwhere(~free)[:, ::-1] * 0.05 + 0.025 + np.array([-1.0, 2.0])
+    for start, end in pairwise(tour):
+        line = np.linspace(start, end, 40)
+        gaps = np.linalg.norm(blocked[None] - line[:, None], axis=2)
+        assert gaps.min() > CLEARANCE_M - 0.1
+    # All around the block in the middle.
+    assert np.ptp(tour, axis=0).min() > 2.0
+    with pytest.raises(InputError, match='no place'):
+        plan_tour(np.zeros((20, 20), bool), 0.05, (0.0, 0.0))
+
+
+def test_people_walk_to_and_fro():
+    person = Person(points=((0.0, 0.0), (2.0, 0.0), (2.0, 1.0)), speed_m_s=0.5, start_s=1.0)
+    at = {t: part_poses(person, t)[0] for t in (0.0, 3.0, 6.0, 8.0, 12.0)}
+    np.testing.assert_allclose(at[0.0], [0, 0, 0])
+    np.testing.assert_allclose(at[3.0], [1, 0, 0])
+    np.testing.assert_allclose(at[6.0], [2, 0.5, np.pi / 2])
+    np.testing.assert_allclose(at[8.0], [2, 0.5, -np.pi / 2])
+    np.testing.assert_allclose(np.abs(at[12.0]), [0.5, 0, np.pi], atol=1e-9)
