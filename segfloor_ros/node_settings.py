@@ -30,6 +30,10 @@ class StereoCameraNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=100.0,
     )
+    lossless: bool = setting(
+        False,
+        'Slow down rather than lose a frame when the nodes cannot follow; always so at rate 0.',
+    )
     start_paused: bool = setting(False, 'Wait for the service ~/pause before the first frame.')
     left_frame: str = setting('left_camera_optical_frame', 'Optical frame of the left camera.')
     right_frame: str = setting('right_camera_optical_frame', 'Optical frame of the right camera.')

@@ -6,6 +6,7 @@ import signal
 from typing import Annotated
 
 import typer
+from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
@@ -22,7 +23,7 @@ def replay(
     rate: Annotated[
         float,
         typer.Option(
-            help='Speed against real time; 0: as fast as the nodes take it, without loss.'
+            help='Speed against real time, less where the nodes cannot follow; 0: full speed.'
         ),
     ] = 1.0,
     params: ParamsOption = None,
@@ -55,7 +56,7 @@ def replay(
                 params,
                 rate,
                 on_mask,
-                lambda done, state: progress.update(0, completed=done, note=state),
+                lambda done, state: progress.update(TaskID(0), completed=done, note=state),
             ).execute()
         folder.write(result)
     for notice in report.notices:
@@ -63,6 +64,7 @@ def replay(
     print_summary(input, result.summary)
     console.print(
         f'nodes connected in {report.discovery_s:.1f} s, stopped in {report.shutdown_s:.1f} s; '
-        f'lost between them: {report.lost_frames} frames, {report.lost_keyframes} keyframes'
+        f'keyframes that failed: {report.failed_keyframes}',
+        highlight=False,
     )
     console.print(f'map: {out / "map.yaml"}', highlight=False)

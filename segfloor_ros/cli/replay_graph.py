@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, TOPICS, published_by
@@ -14,6 +14,9 @@ from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, TOPICS, published_b
 FIRST_PORT, PORTS_PER_DOMAIN, DOMAINS = 7400, 250, 101
 PARTICIPANT_OFFSET = 10
 PARTICIPANTS_TRIED = 8
+
+STATUS_LISTENERS = 2
+"""The camera, to pace its frames, and the replay itself."""
 
 RECORDED = (
     'odometry',
@@ -47,11 +50,10 @@ def free_domain() -> int:
     raise SegfloorError('every ROS domain id is in use on this machine; set ROS_DOMAIN_ID')
 
 
-def unconnected(counts: Mapping[str, Mapping[str, int]], listeners: Sequence[str]) -> list[str]:
+def unconnected(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     """Return what is missing before the first frame can be sent without loss, in words.
 
-    counts: subscribers by node and topic, as each publisher sees them. listeners: further nodes
-    that listen to the statuses besides the replay.
+    counts: subscribers by node and topic, as each publisher sees them.
     """
     missing = []
     for node in NODES:
@@ -59,7 +61,7 @@ def unconnected(counts: Mapping[str, Mapping[str, int]], listeners: Sequence[str
             missing.append(f'{node} (no sign of life)')
             continue
         needed = {topic.name: _listeners_of(topic.name) for topic in published_by(node)}
-        needed[DIAGNOSTICS.name] = 1 + len(listeners)
+        needed[DIAGNOSTICS.name] = STATUS_LISTENERS
         missing += [
             f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'
             for topic, number in needed.items()

@@ -40,14 +40,13 @@ ProgressListener = Callable[[int, str], None]
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """What there is to say beside the results. lost_frames, lost_keyframes: how many were sent
-    and never reached their end. notices: warnings of the nodes.
+    """What there is to say beside the results. failed_keyframes: how many did not reach the map
+    because a node failed on them. notices: warnings of the nodes.
     """
 
     discovery_s: float
     shutdown_s: float
-    lost_frames: int
-    lost_keyframes: int
+    failed_keyframes: int
     notices: list[str]
 
 
@@ -92,7 +91,8 @@ class ReplaySession:
         nodes have (frames, rates) comes from the user's file.
         """
         parameters = self._configuration.as_ros_parameters()
-        parameters[CAMERA]['ros__parameters'].update(rate=float(self._rate), start_paused=True)
+        playing = {'rate': float(self._rate), 'lossless': True, 'start_paused': True}
+        parameters[CAMERA]['ros__parameters'].update(playing)
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))
@@ -101,10 +101,10 @@ class ReplaySession:
         return ['--ros-args', '--disable-external-lib-logs', *options]
 
     def _follow(self, graph: _Graph, folder: Path) -> tuple[RunResult, ReplayReport]:
-        discovery_s = graph.connect(['the camera'] if self._rate == 0 else [])
+        discovery_s = graph.connect()
         start_s = time.perf_counter()
         graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
-        graph.play(self._on_progress, lossless=self._rate == 0)
+        graph.play(self._on_progress)
         wall_s = time.perf_counter() - start_s
         self._check_result(graph.recorder)
         graph.call(Trigger, 'save_map', Trigger.Request())
@@ -114,8 +114,7 @@ class ReplaySession:
         report = ReplayReport(
             discovery_s,
             time.perf_counter() - stop_s,
-            len(graph.recorder.unanswered()),
-            len(graph.recorder.unmapped() | graph.recorder.failed.keys()),
+            len(graph.recorder.failed),
             graph.processes.notices(),
         )
         return result, report
@@ -180,10 +179,10 @@ class _Graph:
         self._executor = SingleThreadedExecutor(context=recorder.context)
         self._executor.add_node(recorder)
 
-    def connect(self, listeners: list[str]) -> float:
+    def connect(self) -> float:
         """Wait until every topic has its subscribers; returns the seconds it took."""
         start_s = time.monotonic()
-        while missing := unconnected(self.recorder.connections, listeners):
+        while missing := unconnected(self.recorder.connections):
             if time.monotonic() - start_s > DISCOVERY_S:
                 raise ReplayError(
                     f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '
@@ -207,7 +206,7 @@ class _Graph:
         if not response.success:
             raise ReplayError(f'{name}: {response.message}')
 
-    def play(self, on_progress: ProgressListener, lossless: bool) -> None:
+    def play(self, on_progress: ProgressListener) -> None:
         """Follow the nodes until the recording has ended and everything sent has arrived."""
         recorder = self.recorder
         recorder.last_sign_s = time.monotonic()
@@ -216,10 +215,7 @@ class _Graph:
             last = recorder.answers.get(max(recorder.answers, default=0))
             on_progress(len(recorder.answers), last.message if last else '')
             quiet_s = time.monotonic() - recorder.last_sign_s
-            ended = recorder.finished is not None
-            if quiet_s > (DRAIN_S if ended else STALL_S):
-                if ended and not lossless:
-                    return
+            if quiet_s > (DRAIN_S if recorder.finished is not None else STALL_S):
                 raise ReplayError(
                     f'nothing has happened for {quiet_s:.0f} s; {len(recorder.unanswered())} '
                     f'frames are not tracked and {len(recorder.unmapped())} keyframes not mapped'

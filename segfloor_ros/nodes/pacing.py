@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+MAX_FRAMES_UNDER_WAY = 8
+"""Frames that may be between the camera and SLAM; less than the depth of the image topics."""
+
 MAX_KEYFRAMES_UNDER_WAY = 4
 """Keyframes that may be between SLAM and the grid while the next frame is sent."""
 
@@ -33,36 +36,31 @@ class ClockPace:
         """Start the clock anew with the next frame, e.g. after a pause."""
         self._start = None
 
-    def waits_for(self) -> str:
-        """Return '': the clock needs no report."""
-        return ''
-
 
 class ChainPace:
-    """Sends a frame when SLAM has answered the one before and few keyframes are under way, so
-    that no queue between the nodes can run over, however fast the frames come.
+    """Lets few frames and keyframes be under way at a time, so that no queue between the nodes
+    can run over, however fast the frames come.
     """
 
     def __init__(self) -> None:
-        self._unanswered: int | None = None
-        self._under_way: set[int] = set()
+        self._unanswered: set[int] = set()
+        self._keyframes: set[int] = set()
         self._ended_early: set[int] = set()
 
-    def ready(self, stamp_ns: int) -> bool:
+    def ready(self) -> bool:
         """Whether the chain has room for the next frame."""
-        return self._unanswered is None and len(self._under_way) < MAX_KEYFRAMES_UNDER_WAY
+        return (
+            len(self._unanswered) < MAX_FRAMES_UNDER_WAY
+            and len(self._keyframes) < MAX_KEYFRAMES_UNDER_WAY
+        )
 
     def sent(self, stamp_ns: int) -> None:
         """Wait for the answer to this frame from now on."""
-        self._unanswered = stamp_ns
-
-    def restart(self) -> None:
-        """Nothing depends on the time."""
+        self._unanswered.add(stamp_ns)
 
     def answered(self, stamp_ns: int) -> None:
         """SLAM has processed a frame."""
-        if stamp_ns == self._unanswered:
-            self._unanswered = None
+        self._unanswered.discard(stamp_ns)
 
     def keyframe_began(self, stamp_ns: int) -> None:
         """SLAM has published a keyframe."""
@@ -70,18 +68,17 @@ class ChainPace:
         if stamp_ns in self._ended_early:
             self._ended_early.discard(stamp_ns)
         else:
-            self._under_way.add(stamp_ns)
+            self._keyframes.add(stamp_ns)
 
     def keyframe_ended(self, stamp_ns: int) -> None:
         """A keyframe has reached the end of the chain, or failed on the way."""
-        if stamp_ns in self._under_way:
-            self._under_way.discard(stamp_ns)
+        if stamp_ns in self._keyframes:
+            self._keyframes.discard(stamp_ns)
         else:
             self._ended_early.add(stamp_ns)
 
     def waits_for(self) -> str:
         """Return what is being waited for, in words."""
-        if self._unanswered is not None:
-            return f'stereo_slam to answer the frame with stamp {self._unanswered}'
-        stamps = ', '.join(str(stamp) for stamp in sorted(self._under_way))
-        return f'the keyframes with stamps {stamps} to reach the map'
+        if self._unanswered:
+            return f'stereo_slam to answer the frame with stamp {min(self._unanswered)}'
+        return f'the keyframe with stamp {min(self._keyframes, default=0)} to reach the map'

@@ -42,8 +42,9 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._paused = own.start_paused
         self._connected = self._finished = False
         self._said_waiting_s = time.monotonic()
-        self._pace: ClockPace | ChainPace = ChainPace() if own.rate == 0 else ClockPace(own.rate)
-        if own.rate == 0:
+        self._clock_pace = ClockPace(own.rate) if own.rate else None
+        self._chain_pace = ChainPace() if own.lossless or not own.rate else None
+        if self._chain_pace is not None:
             self.create_subscription(
                 DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
             )
@@ -54,8 +55,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         """Send the next pairs as far as they may go now."""
         try:
             while self._may_play() and self._fetch() and self._next is not None:
-                if not self._pace.ready(self._next.stamp_ns):
-                    self._say_waiting_for(self._pace.waits_for())
+                if not self._is_due(self._next):
                     return
                 self._send(self._next)
                 self._next = None
@@ -74,6 +74,14 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
                 self._say_waiting_for('subscribers of ' + ', '.join(silent))
         return self._connected
 
+    def _is_due(self, pair: RawPair) -> bool:
+        if self._clock_pace is not None and not self._clock_pace.ready(pair.stamp_ns):
+            return False
+        if self._chain_pace is not None and not self._chain_pace.ready():
+            self._say_waiting_for(self._chain_pace.waits_for())
+            return False
+        return True
+
     def _fetch(self) -> bool:
         """Read the next pair if none is at hand; False at the end of the recording."""
         if self._next is None:
@@ -85,8 +93,9 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
     def _send(self, pair: RawPair) -> None:
         calibration = self._source.calibration
         eyes = {'left': (pair.left, calibration.left), 'right': (pair.right, calibration.right)}
-        # Taken as sent first: the answer may come at once.
-        self._pace.sent(pair.stamp_ns)
+        for pace in (self._clock_pace, self._chain_pace):
+            if pace is not None:
+                pace.sent(pair.stamp_ns)
         self._said_waiting_s = time.monotonic()
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
@@ -103,16 +112,17 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self.publish_status(RECORDING, stamp_ns, level, message, values)
 
     def _take_status(self, message: DiagnosticArray) -> None:
-        assert isinstance(self._pace, ChainPace)
+        assert self._chain_pace is not None
         namespace = self.get_namespace().rstrip('/')
         for status in statuses(message):
             if status.name.startswith(f'{namespace}/') and not status.kind:
-                note_status(self._pace, status)
+                note_status(self._chain_pace, status)
         self._advance()
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = bool(request.data)
-        self._pace.restart()
+        if self._clock_pace is not None:
+            self._clock_pace.restart()
         response.success, response.message = True, 'paused' if self._paused else 'playing'
         return response
 
