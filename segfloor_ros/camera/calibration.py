@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.errors import CalibrationError
-from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.geometry import Array, invert, make_transform
 
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 """Number of distortion coefficients by model (REP-104 names)."""
@@ -187,6 +187,14 @@ class StereoCalibration:
             raise CalibrationError(
                 f'{left.origin} is {left.distortion_model}, {right.origin} is '
                 f'{right.distortion_model}; both eyes need the same distortion model'
+            )
+        offset_m = invert(T_right_left)[:3, 3]
+        if offset_m[0] <= np.abs(offset_m[1:]).max():
+            x, y, z = (f'{value:g}' for value in offset_m + 0.0)
+            raise CalibrationError(
+                f'{right.origin}: the right camera is at ({x}, {y}, {z}) m in the left optical '
+                'frame, but the baseline along x must be positive and the longest: are left and '
+                'right swapped?'
             )
         if left.distortion_model == 'equidistant':
             R1, R2, P1, P2, _ = cv2.fisheye.stereoRectify(*eyes, cv2.CALIB_ZERO_DISPARITY)

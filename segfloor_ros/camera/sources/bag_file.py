@@ -77,17 +77,14 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
 @contextmanager
 def _read_errors(path: Path) -> Iterator[None]:
     """Turn what the library raises about a damaged bag into an InputError."""
-    from rosbags import rosbag1, rosbag2
-    from rosbags.serde import SerdeError
-
-    library_errors = (rosbag1.ReaderError, rosbag2.ReaderError, SerdeError, OSError)
     try:
         yield
-    except library_errors as error:
+    except Exception as error:  # damaged bytes make the library fail in any way, anywhere
+        reason = ' '.join(str(error).split()) or type(error).__name__
         raise InputError(
-            f'{path}: cannot read the bag ({error}); if its recording was interrupted, repair it '
+            f'{path}: cannot read the bag ({reason}); if its recording was interrupted, repair it '
             'with ros2 bag reindex'
-        ) from None
+        ) from error
 
 
 def _bag_path(path: Path) -> Path:
