@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.cloud.evidence import height_evidence, local_floor_m, mask_evidence
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.labels import OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.cloud.point_table import PointTable
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.geometry import Array
@@ -34,9 +34,9 @@ class CloudLabelling:
         """Take in one keyframe and return the whole cloud with its labels.
 
         mask: (H, W) uint8, the keyframe's floor mask. T_map_base: (4, 4) pose of the keyframe's
-        base; with it, heights are measured from the floor below that base and their error grows
-        with distance, else the distance is taken to be that of the point from the map's origin
-        of heights, i.e. the error stays that of near points.
+        base, where known: heights are then measured from the floor below that base, with an error
+        that grows with the distance the point was seen from; else from the plane z = 0 of the map,
+        moved to the floor points in view.
         """
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
@@ -65,6 +65,3 @@ class CloudLabelling:
             label=label,
             confidence=np.where(label == UNKNOWN, 0, certainty).astype(np.float32),
         )
-
-
-__all__ = ['FLOOR', 'OBSTACLE', 'UNKNOWN', 'CloudLabelling']

@@ -51,9 +51,11 @@ class PointTable:
         """Add one look at the points of rows (M,): evidence, floor height and distance (M,)."""
         total = self.mask_log_odds[row] + evidence
         self.mask_log_odds[row] = np.clip(total, -limit, limit)
-        self.looks[row] += 1
+        # The nearest look placed the point best.
+        nearer = (self.looks[row] == 0) | (distance_m < self.distance_m[row])
+        self.distance_m[row[nearer]] = distance_m[nearer]
         self.floor_z_m[row] = floor_z_m
-        self.distance_m[row] = distance_m
+        self.looks[row] += 1
 
     def decide(self, log_odds: Array, threshold: float) -> None:
         """Set the labels by evidence (N,); between the thresholds a label stays as it is."""

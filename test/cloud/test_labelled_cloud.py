@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+from segfloor_ros.cloud.labelled_cloud import CloudLabelling
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.geometry import make_transform
+from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, SparseCloud
+
+MASK = np.full((40, 60), 127, np.uint8)
+MASK[20:] = 255
+MASK[:10] = 0
+ON_FLOOR, ON_OBSTACLE, NOWHERE = (30.0, 30.0), (30.0, 4.0), (30.0, 15.0)
+
+
+def cloud(points: dict[int, tuple[float, float, float]]) -> SparseCloud:
+    ids = sorted(points)
+    xyz = np.array([points[i] for i in ids], np.float32).reshape(-1, 3)
+    return SparseCloud(np.array(ids, np.int32), xyz)
+
+
+def features(pixels: dict[int, tuple[float, float]]) -> KeyframeFeatures:
+    uv = np.array(list(pixels.values()), np.float32).reshape(-1, 2)
+    unused = np.full((len(pixels), 3), np.nan, np.float32)
+    return KeyframeFeatures(uv, np.array(list(pixels), np.int32), unused)
+
+
+def label_of(points: LabelledPoints) -> dict[int, int]:
+    return dict(zip(points.point_id.tolist(), points.label.tolist(), strict=True))
+
+
+def test_mask_and_height_give_the_label() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    points = {1: (1.0, 0.0, 0.0), 5: (2.0, 0.0, 0.4), 9: (1.0, 1.0, 0.02)}
+    seen = features({1: ON_FLOOR, 5: ON_OBSTACLE, NO_POINT: ON_FLOOR})
+    labelled = labelling.update(cloud(points), seen, MASK)
+    assert label_of(labelled) == {1: FLOOR, 5: OBSTACLE, 9: UNKNOWN}
+    assert labelled.confidence[0] > 0.5
+    assert labelled.confidence[1] > 0.5
+    assert labelled.confidence[2] == 0
+    assert labelled.label.dtype == np.uint8
+    assert labelled.confidence.dtype == np.float32
+
+
+def test_every_look_counts_and_one_wrong_mask_changes_nothing() -> None:
+    settings = CloudLabellingSettings(max_height_log_odds=0.0)
+    labelling = CloudLabelling(settings)
+    points = cloud({1: (1.0, 0.0, 0.0)})
+    # One look, 0.6, is less than the 0.8 a label takes; two are enough.
+    assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK)) == {1: UNKNOWN}
+    labelled = labelling.update(points, features({1: ON_FLOOR}), MASK)
+    assert label_of(labelled) == {1: FLOOR}
+    assert labelled.confidence[0] == pytest.approx(np.tanh(0.6))
+    # Contradicted, it keeps its label until the evidence for the other exceeds 0.8: 1.2 - 4 * 0.6.
+    for expected in (FLOOR, FLOOR, FLOOR, OBSTACLE):
+        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK)
+        assert label_of(labelled) == {1: expected}
+
+
+def test_evidence_of_the_mask_is_bounded() -> None:
+    settings = CloudLabellingSettings(max_height_log_odds=0.0, max_mask_log_odds=1.2)
+    labelling = CloudLabelling(settings)
+    points = cloud({1: (1.0, 0.0, 0.0)})
+    for _ in range(50):
+        labelling.update(points, features({1: ON_FLOOR}), MASK)
+    for _ in range(4):
+        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK)
+    assert label_of(labelled) == {1: OBSTACLE}
+
+
+def test_borders_of_the_mask_say_nothing() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings(max_height_log_odds=0.0))
+    mask = np.full((40, 60), 0, np.uint8)
+    mask[20:] = 255
+    points = cloud({1: (1.0, 0.0, 0.0), 2: (1.0, 0.2, 0.0)})
+    for _ in range(5):
+        labelled = labelling.update(points, features({1: (30.0, 20.0), 2: (30.0, 21.0)}), mask)
+    assert label_of(labelled) == {1: UNKNOWN, 2: FLOOR}
+
+
+def test_points_above_the_robot_and_far_below_the_floor_are_neither() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings(robot_height_m=0.8))
+    points = cloud({1: (1.0, 0.0, 0.9), 2: (1.0, 0.0, 0.7), 3: (1.0, 0.0, -0.5)})
+    seen = features({1: ON_OBSTACLE, 2: ON_OBSTACLE, 3: ON_FLOOR})
+    assert label_of(labelling.update(points, seen, MASK)) == {1: UNKNOWN, 2: OBSTACLE, 3: UNKNOWN}
+
+
+def test_removed_points_disappear_moved_ones_move_ids_stay() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    start = {2: (1.0, 0.0, 0.0), 4: (2.0, 0.0, 0.5), 7: (3.0, 0.0, 0.3)}
+    seen = features({2: ON_FLOOR, 4: ON_OBSTACLE, 7: ON_OBSTACLE})
+    labelling.update(cloud(start), seen, MASK)
+    after = {1: (9.0, 0.0, 0.0), 4: (2.5, 0.1, 0.5), 7: (3.0, 0.0, 2.0)}
+    labelled = labelling.update(cloud(after), features({}), MASK)
+    # 7 was corrected to above the robot; 1 was never looked at; 2 is gone.
+    assert label_of(labelled) == {1: UNKNOWN, 4: OBSTACLE, 7: UNKNOWN}
+    np.testing.assert_allclose(labelled.xyz_map[1], [2.5, 0.1, 0.5])
+
+
+def test_heights_are_those_above_the_floor_below_the_base() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    points = cloud({1: (1.0, 0.0, 2.0), 2: (1.0, 0.0, 2.3)})
+    seen = features({1: NOWHERE, 2: NOWHERE})
+    upstairs = make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    labelled = labelling.update(points, seen, MASK, upstairs)
+    assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE}
+
+
+def test_without_a_pose_the_floor_in_view_is_the_level() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    points = {i: (1.0, 0.1 * i, -0.2) for i in range(20)} | {30: (1.0, 0.0, 0.0)}
+    seen = features({**dict.fromkeys(range(20), ON_FLOOR), 30: NOWHERE})
+    labels = label_of(labelling.update(cloud(points), seen, MASK))
+    assert labels[3] == FLOOR
+    assert labels[30] == OBSTACLE
+
+
+def test_heights_of_far_points_count_less() -> None:
+    far, near = CloudLabelling(CloudLabellingSettings()), CloudLabelling(CloudLabellingSettings())
+    at_base = np.eye(4)
+    seen = features({1: NOWHERE})
+    close = near.update(cloud({1: (1.0, 0.0, 0.07)}), seen, MASK, at_base)
+    distant = far.update(cloud({1: (9.0, 0.0, 0.07)}), seen, MASK, at_base)
+    assert label_of(close) == {1: OBSTACLE}
+    assert label_of(distant) == {1: UNKNOWN}
+
+
+def test_empty_cloud() -> None:
+    labelled = CloudLabelling(CloudLabellingSettings()).update(cloud({}), features({}), MASK)
+    assert labelled.label.shape == (0,)
+    assert labelled.xyz_map.shape == (0, 3)
