@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.cloud.settings import CloudLabellingSettings

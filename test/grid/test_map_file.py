@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+
 from segfloor_ros.errors import MapError
 from segfloor_ros.grid.map_file import load_map, save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
