@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from segfloor_ros.messages.join import Dropped, StampJoiner
+
+
+def test_a_set_is_complete_with_its_last_part_in_any_order() -> None:
+    joiner = StampJoiner(('a', 'b', 'c'))
+    assert joiner.add('c', 5, 'c5') is None
+    assert joiner.add('a', 6, 'a6') is None
+    assert joiner.add('a', 5, 'a5') is None
+    assert joiner.add('b', 5, 'b5') == {'a': 'a5', 'b': 'b5', 'c': 'c5'}
+    assert joiner.take_dropped() == []
+
+
+def test_a_set_that_was_overtaken_is_dropped_and_says_what_it_lacked() -> None:
+    joiner = StampJoiner(('image', 'mask'))
+    joiner.add('image', 1, None)
+    joiner.add('image', 2, None)
+    assert joiner.add('mask', 2, None) is not None
+    assert joiner.take_dropped() == [Dropped(1, ('mask',))]
+    assert joiner.take_dropped() == []
+
+
+def test_at_most_the_capacity_waits() -> None:
+    joiner = StampJoiner(('a', 'b'), capacity=3)
+    for stamp_ns in range(5):
+        joiner.add('a', stamp_ns, stamp_ns)
+    assert joiner.take_dropped() == [Dropped(0, ('b',)), Dropped(1, ('b',))]
+    assert joiner.waiting_for() == ('b',)
+    assert joiner.add('b', 2, None) == {'a': 2, 'b': None}
+
+
+def test_a_repeated_message_does_not_make_a_second_set() -> None:
+    joiner = StampJoiner(('a', 'b'))
+    joiner.add('a', 1, 'first')
+    assert joiner.add('b', 1, 'first') is not None
+    assert joiner.add('a', 1, 'again') is None
+    assert joiner.add('b', 1, 'again') is None
+    assert joiner.waiting_for() == ()
+
+
+def test_stamps_that_jump_back_are_joined_like_any_other() -> None:
+    joiner = StampJoiner(('a', 'b'))
+    for stamp_ns in (1000, 10):
+        joiner.add('a', stamp_ns, stamp_ns)
+        assert joiner.add('b', stamp_ns, stamp_ns) == {'a': stamp_ns, 'b': stamp_ns}
+
+
+def test_within_the_tolerance_the_nearest_partner_is_taken() -> None:
+    joiner = StampJoiner(('left', 'right'), tolerance_ns=10)
+    joiner.add('left', 100, 'l100')
+    joiner.add('left', 115, 'l115')
+    assert joiner.add('right', 109, 'r109') == {'left': 'l115', 'right': 'r109'}
+    assert joiner.take_dropped() == [Dropped(100, ('right',))]
+    joiner.add('left', 200, 'l200')
+    assert joiner.add('right', 211, 'r211') is None
+
+
+def test_waiting_for_names_what_every_set_lacks() -> None:
+    joiner = StampJoiner(('a', 'b', 'c'))
+    assert joiner.waiting_for() == ()
+    joiner.add('a', 1, None)
+    joiner.add('a', 2, None)
+    joiner.add('b', 2, None)
+    assert joiner.waiting_for() == ('c',)

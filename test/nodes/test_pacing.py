@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from segfloor_ros.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.pacing import (
+    MAX_FRAMES_UNDER_WAY,
+    MAX_KEYFRAMES_UNDER_WAY,
+    ChainPace,
+    ClockPace,
+)
+from segfloor_ros.nodes.stereo_camera import note_status
+
+S = 1_000_000_000
+
+
+def test_the_clock_starts_with_the_first_frame_and_runs_at_the_rate() -> None:
+    now = [100.0]
+    pace = ClockPace(2.0, clock_s=lambda: now[0])
+    assert pace.ready(7 * S)
+    pace.sent(7 * S)
+    assert not pace.ready(8 * S)
+    now[0] = 100.49
+    assert not pace.ready(8 * S)
+    now[0] = 100.51
+    assert pace.ready(8 * S)
+    pace.restart()
+    assert pace.ready(1000 * S)
+
+
+def test_few_frames_are_under_way_at_a_time() -> None:
+    pace = ChainPace()
+    for stamp in range(MAX_FRAMES_UNDER_WAY):
+        assert pace.ready()
+        pace.sent(stamp)
+    assert not pace.ready()
+    assert 'stamp 0' in pace.waits_for()
+    pace.answered(12345)
+    assert not pace.ready()
+    pace.answered(0)
+    assert pace.ready()
+
+
+def test_keyframes_count_until_they_reach_the_map_or_fail() -> None:
+    pace = ChainPace()
+    for stamp in range(MAX_KEYFRAMES_UNDER_WAY):
+        pace.sent(stamp)
+        note_status(pace, _status('stereo_slam', stamp, keyframe='1'))
+    assert not pace.ready()
+    assert 'the keyframe with stamp 0' in pace.waits_for()
+    note_status(pace, _status('floor_segmentation', 0))
+    assert not pace.ready()
+    note_status(pace, _status('occupancy_grid', 0))
+    assert pace.ready()
+    note_status(pace, _status('stereo_slam', 9, keyframe='1'))
+    assert not pace.ready()
+    note_status(pace, _status('cloud_labelling', 1, Level.ERROR))
+    assert pace.ready()
+
+
+def test_the_end_of_a_keyframe_may_be_heard_of_before_its_beginning() -> None:
+    pace = ChainPace()
+    for stamp in range(10):
+        note_status(pace, _status('occupancy_grid', stamp))
+        note_status(pace, _status('stereo_slam', stamp, keyframe='1'))
+        assert pace.ready()
+
+
+def _status(node: str, stamp: int, level: Level = Level.OK, **values: str) -> Status:
+    return Status(stamp, f'/{node}', level, '', values)

@@ -1,0 +1,350 @@
+"""Each node over DDS, against its stage called directly."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from std_srvs.srv import SetBool, Trigger
+from stereo_drive import room_drive, write_kitti
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.cloud.labelled_cloud import CloudLabelling
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.geometry import invert
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.mapper import OccupancyGridMapper
+from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.messages.camera_info import (
+    camera_info_message,
+    eye_calibration,
+    rectified_calibration,
+)
+from segfloor_ros.messages.clouds import (
+    features_message,
+    labelled_arrays,
+    labelled_message,
+    sparse_cloud_arrays,
+    sparse_cloud_message,
+)
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.floor import scan_arrays, scan_message
+from segfloor_ros.messages.grids import grid_arrays
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey8_image, image_message
+from segfloor_ros.messages.poses import (
+    odometry_message,
+    path_arrays,
+    path_message,
+    pose_array,
+    transform_array,
+    transform_message,
+)
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+
+STAMP_NS = 12_345_678_901
+CALIBRATION = rectified_calibration(CAMERA)
+
+
+def test_the_camera_sends_every_pair_as_recorded(make_graph, tmp_path) -> None:
+    frames, _ = room_drive(4)
+    folder = write_kitti(tmp_path / 'drive', frames)
+    graph = make_graph('-p', f'input:={folder}', '-p', 'rate:=50.0', '-p', 'start_paused:=true')
+    names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
+    received = {name: graph.collect(name) for name in names}
+    graph.add(StereoCameraNode())
+    resumed = graph.call(SetBool, 'stereo_camera/pause', SetBool.Request(data=False))
+    assert resumed.success
+    graph.until(lambda: any(s.kind == 'recording' for s in graph.statuses), 'the end')
+    graph.until(lambda: all(len(m) == 4 for m in received.values()), 'all messages')
+    stamps = [frame.stamp_ns for frame in frames]
+    for name, messages in received.items():
+        assert [to_ns(message.header.stamp) for message in messages] == stamps, name
+    for frame, left, right in zip(
+        frames, received['left/image_raw'], received['right/image_raw'], strict=True
+    ):
+        np.testing.assert_array_equal(grey8_image(left, 'left'), frame.left)
+        np.testing.assert_array_equal(grey8_image(right, 'right'), frame.right)
+    info = eye_calibration(received['right/camera_info'][0], 'right/camera_info')
+    assert info.P[0, 3] == pytest.approx(-CAMERA.disparity_times_depth)
+    assert received['left/camera_info'][0].header.frame_id == 'left_camera_optical_frame'
+    (end,) = (s for s in graph.statuses if s.kind == 'recording')
+    assert (end.values['frames'], end.values['skipped']) == ('4', '0')
+
+
+def test_the_camera_waits_for_somebody_who_listens(make_graph, tmp_path) -> None:
+    frames, _ = room_drive(2)
+    folder = write_kitti(tmp_path / 'drive', frames)
+    graph = make_graph('-p', f'input:={folder}', '-p', 'rate:=50.0')
+    graph.add(StereoCameraNode())
+    graph.until(lambda: any(s.kind == 'connections' for s in graph.statuses), 'a sign of life')
+    received = graph.collect('left/image_raw')
+    for name in ('right/image_raw', 'left/camera_info', 'right/camera_info'):
+        graph.collect(name)
+    graph.until(lambda: len(received) == 2, 'both images')
+
+
+class TestStereoSlam:
+    """The node `stereo_slam` fed by hand."""
+
+    ARGUMENTS = (
+        '-p', f'camera_height_m:={MOUNT.height_m}',
+        '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+        '-p', 'camera_roll_rad:=0.0',
+    )  # fmt: skip
+
+    def _inputs(self, graph):
+        names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
+        publishers = {name: graph.publisher(name) for name in names}
+        graph.connected(list(publishers.values()))
+        return publishers
+
+    def _send(self, inputs, frame, sides=('left', 'right')) -> None:
+        for side in sides:
+            eye, image = getattr(CALIBRATION, side), getattr(frame, side)
+            info = camera_info_message(frame.stamp_ns, side, eye)
+            inputs[f'{side}/camera_info'].publish(info)
+            inputs[f'{side}/image_raw'].publish(image_message(frame.stamp_ns, side, image))
+
+    def test_it_tracks_and_everything_of_a_keyframe_has_its_stamp(self, make_graph) -> None:
+        frames, truth = room_drive(8)
+        graph = make_graph(*self.ARGUMENTS)
+        names = (
+            'odometry', 'keyframe/odometry', 'keyframe/left/image_rect', 'map_points',
+            'keyframe/right/image_rect', 'keyframe/left/camera_info', 'keyframe/features',
+            'keyframe/right/camera_info', 'keyframe/path',
+        )  # fmt: skip
+        received = {name: graph.collect(name) for name in names}
+        graph.add(StereoSlamNode())
+        inputs = self._inputs(graph)
+        self._wait_for_outputs(graph)
+        for frame in frames:
+            self._send(inputs, frame)
+            graph.until(
+                lambda frame=frame: frame.stamp_ns in _stamps(graph.reports('stereo_slam')),
+                f'frame {frame.index}',
+            )
+        answers = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
+        assert all(s.level is Level.OK for s in answers.values())
+        keyframes = [t for t, s in answers.items() if s.values['keyframe'] == '1']
+        assert keyframes[0] == frames[0].stamp_ns
+        graph.until(lambda: len(received['odometry']) == 8, 'odometry')
+        for name in names[1:]:
+            graph.until(lambda name=name: len(received[name]) >= len(keyframes), name)
+            assert [to_ns(m.header.stamp) for m in received[name]] == keyframes, name
+        for message, frame in zip(received['odometry'], frames, strict=True):
+            pose = pose_array(message.pose.pose)
+            error = pose[:3, 3] - (invert(truth[0]) @ truth[frame.index])[:3, 3]
+            assert np.linalg.norm(error) < 0.02, frame.index
+            assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
+        assert received['odometry'][-1].twist.twist.linear.x == pytest.approx(0.6, abs=0.05)
+        path = path_arrays(received['keyframe/path'][-1])
+        assert path.stamp_ns.tolist() == keyframes
+        np.testing.assert_array_equal(
+            grey8_image(received['keyframe/left/image_rect'][0], ''), frames[0].left
+        )
+        cloud = sparse_cloud_arrays(received['map_points'][-1], 'map_points')
+        assert len(cloud.point_id) > 100
+        assert (np.diff(cloud.point_id) > 0).all()
+        assert cloud.xyz_map[:, 2].min() > -0.2
+
+    def test_the_mount_reaches_those_who_come_late(self, make_graph) -> None:
+        frames, _ = room_drive(1)
+        graph = make_graph(*self.ARGUMENTS)
+        graph.add(StereoSlamNode())
+        self._send(self._inputs(graph), frames[0])
+        graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
+        late = graph.collect('camera_mount')
+        graph.until(lambda: late, 'the mount')
+        assert (late[0].header.frame_id, late[0].child_frame_id) == ('base_link', 'left')
+        found = Mount.from_transform(transform_array(late[0]))
+        assert (found.height_m, found.pitch_rad) == pytest.approx((0.4, 0.15))
+
+    def test_when_lost_it_says_so_and_publishes_no_pose(self, make_graph) -> None:
+        frames, _ = room_drive(2)
+        dark = np.zeros_like(frames[0].left)
+        graph = make_graph(*self.ARGUMENTS)
+        poses = graph.collect('odometry')
+        graph.add(StereoSlamNode())
+        inputs = self._inputs(graph)
+        self._wait_for_outputs(graph)
+        self._send(inputs, frames[0])
+        blind = type(frames[1])(1, frames[1].stamp_ns, dark, dark)
+        self._send(inputs, blind)
+        graph.until(lambda: len(graph.reports('stereo_slam')) == 2, 'both answers')
+        tracked, lost = graph.reports('stereo_slam')
+        assert (tracked.level, lost.level) == (Level.OK, Level.ERROR)
+        assert lost.message.startswith('lost')
+        graph.until(lambda: poses, 'the first pose')
+        assert [to_ns(message.header.stamp) for message in poses] == [frames[0].stamp_ns]
+
+    def test_broken_and_lonely_images_are_named_and_the_node_lives(self, make_graph) -> None:
+        frames, _ = room_drive(4)
+        graph = make_graph(*self.ARGUMENTS)
+        graph.add(StereoSlamNode())
+        inputs = self._inputs(graph)
+        self._send(inputs, frames[0])
+        broken = image_message(frames[1].stamp_ns, 'left', frames[1].left)
+        broken.encoding = '64FC7'
+        inputs['left/image_raw'].publish(broken)
+        inputs['right/image_raw'].publish(
+            image_message(frames[1].stamp_ns, 'right', frames[1].right)
+        )
+        self._send(inputs, frames[2], sides=('left',))
+        self._send(inputs, frames[3])
+        graph.until(lambda: len(graph.reports('stereo_slam')) == 4, 'four statuses')
+        by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
+        assert 'left/image_raw' in by_stamp[frames[1].stamp_ns].message
+        assert '64FC7' in by_stamp[frames[1].stamp_ns].message
+        assert 'no message on right/image_raw' in by_stamp[frames[2].stamp_ns].message
+        assert by_stamp[frames[3].stamp_ns].level is Level.OK
+
+    def _wait_for_outputs(self, graph) -> None:
+        def connected() -> bool:
+            seen = [s for s in graph.statuses if s.kind == 'connections']
+            return bool(seen) and seen[-1].values['odometry'] == '1'
+
+        graph.until(connected, 'the connection of odometry')
+
+
+def test_floor_segmentation_is_the_stage(make_graph) -> None:
+    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
+    expected = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(
+        frame.left, frame.right, MOUNT, np.eye(4)
+    )
+    graph = make_graph()
+    masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_scan')
+    graph.add(FloorSegmentationNode())
+    messages = {'keyframe/odometry': _pose(np.eye(4))}
+    for side in ('left', 'right'):
+        image = image_message(STAMP_NS, side, getattr(frame, side))
+        messages[f'keyframe/{side}/image_rect'] = image
+        info = camera_info_message(STAMP_NS, side, getattr(CALIBRATION, side))
+        messages[f'keyframe/{side}/camera_info'] = info
+    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
+    _publish(graph, {**messages, 'camera_mount': mount})
+    graph.until(lambda: masks and scans, 'mask and scan')
+    assert to_ns(masks[0].header.stamp) == to_ns(scans[0].header.stamp) == STAMP_NS
+    assert (masks[0].encoding, masks[0].header.frame_id) == ('mono8', 'left')
+    np.testing.assert_array_equal(grey8_image(masks[0], ''), expected.mask)
+    assert scans[0].header.frame_id == 'base_link'
+    np.testing.assert_array_equal(scan_arrays(scans[0], '').ranges_m, expected.scan.ranges_m)
+    assert (expected.mask == 255).mean() > 0.1
+
+
+POINTS = SparseCloud(
+    np.array([2, 5, 8], np.int32), np.array([[1, 0, 0], [2, 0, 1], [3, 1, 0]], np.float32)
+)
+FEATURES = KeyframeFeatures(
+    np.array([[2.0, 9.0], [2.0, 1.0], [5.0, 5.0]], np.float32),
+    np.array([2, 5, -1], np.int32),
+    np.array([[1, 0, 0], [2, 0, 1], [np.nan] * 3], np.float32),
+)
+MASK = np.repeat(np.array([0] * 5 + [255] * 5, np.uint8)[:, None], 10, axis=1)
+
+
+def test_cloud_labelling_is_the_stage(make_graph) -> None:
+    expected = CloudLabelling(CloudLabellingSettings()).update(POINTS, FEATURES, MASK)
+    graph = make_graph()
+    labelled, floor = graph.collect('labelled_points'), graph.collect('floor_points')
+    graph.add(CloudLabellingNode())
+    _publish(graph, _cloud_messages(STAMP_NS))
+    graph.until(lambda: labelled and floor, 'labelled points')
+    assert to_ns(labelled[0].header.stamp) == STAMP_NS
+    assert labelled[0].header.frame_id == 'map'
+    found = labelled_arrays(labelled[0], '')
+    for name in ('point_id', 'xyz_map', 'label', 'confidence'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    ids = sparse_cloud_arrays(floor[0], '').point_id
+    np.testing.assert_array_equal(ids, expected.point_id[expected.label == FLOOR])
+
+
+def test_a_missing_partner_is_named_and_the_next_keyframe_goes_through(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    alone = _cloud_messages(STAMP_NS)
+    del alone['keyframe/floor_mask']
+    publishers = _publish(graph, alone)
+    _publish(graph, _cloud_messages(STAMP_NS + 1), publishers)
+    graph.until(lambda: labelled, 'the second keyframe')
+    assert to_ns(labelled[0].header.stamp) == STAMP_NS + 1
+    (error,) = (s for s in graph.reports('cloud_labelling') if s.level is Level.ERROR)
+    assert error.stamp_ns == STAMP_NS
+    assert 'keyframe/floor_mask' in error.message
+
+
+def test_the_grid_is_the_stage_and_is_saved_on_request(make_graph, tmp_path) -> None:
+    labelled = LabelledPoints(
+        np.array([2, 5], np.int32),
+        np.array([[1.0, 0, 0], [2, 0.3, 0.5]], np.float32),
+        np.array([FLOOR, OBSTACLE], np.uint8),
+        np.ones(2, np.float32),
+    )
+    path = KeyframePath(np.array([STAMP_NS]), np.eye(4)[None])
+    scan = FloorScan(-0.5, 0.25, np.array([1.5, 1.5, 1.5, 1.5, 1.5], np.float32))
+    stage = OccupancyGridMapper(OccupancyGridSettings())
+    stage.update(STAMP_NS, labelled, FEATURES, path, scan)
+    expected = stage.grid()
+    file = tmp_path / 'saved.yaml'
+    graph = make_graph('-p', f'map_file:={file}')
+    graph.add(OccupancyGridNode())
+    early = graph.call(Trigger, 'save_map', Trigger.Request())
+    assert not early.success
+    assert not file.exists()
+    messages = {
+        'labelled_points': labelled_message(STAMP_NS, 'map', labelled),
+        'keyframe/features': features_message(STAMP_NS, 'map', FEATURES),
+        'keyframe/path': path_message(STAMP_NS, 'map', path),
+        'keyframe/odometry': _pose(np.eye(4)),
+        'keyframe/floor_scan': scan_message(STAMP_NS, 'base_link', scan),
+    }
+    _publish(graph, messages)
+    graph.until(lambda: graph.reports('occupancy_grid'), 'the update')
+    late = graph.collect('map')
+    graph.until(lambda: late, 'the map, latched')
+    found = grid_arrays(late[0], 'map')
+    assert (late[0].header.frame_id, to_ns(late[0].header.stamp)) == ('map', STAMP_NS)
+    np.testing.assert_array_equal(found.cells, expected.cells)
+    assert found.origin_xy_m == pytest.approx(expected.origin_xy_m)
+    assert set(Counter(expected.cells.ravel().tolist())) >= {0, -1}
+    saved = graph.call(Trigger, 'save_map', Trigger.Request())
+    assert (saved.success, saved.message) == (True, str(file))
+    np.testing.assert_array_equal(load_map(file).cells, expected.cells)
+
+
+def _cloud_messages(stamp_ns: int):
+    return {
+        'map_points': sparse_cloud_message(stamp_ns, 'map', POINTS),
+        'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
+        'keyframe/floor_mask': image_message(stamp_ns, 'left', MASK),
+    }
+
+
+def _pose(T_map_base):
+    return odometry_message(STAMP_NS, 'map', 'base_link', T_map_base, np.zeros((6, 6)))
+
+
+def _publish(graph, messages, publishers=None):
+    publishers = {} if publishers is None else publishers
+    for name in messages.keys() - publishers.keys():
+        publishers[name] = graph.publisher(name)
+    graph.connected(list(publishers.values()))
+    for name, message in messages.items():
+        publishers[name].publish(message)
+    return publishers
+
+
+def _stamps(statuses) -> set[int]:
+    return {status.stamp_ns for status in statuses}

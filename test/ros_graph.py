@@ -1,0 +1,79 @@
+"""A ROS graph inside the test process: nodes under test and a tester that talks to them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from segfloor_ros.messages.diagnostics import Status, statuses
+from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+
+PATIENCE_S = 20.0
+
+
+class Graph:
+    """Nodes in one executor. Messages between them go through DDS like between processes."""
+
+    def __init__(self) -> None:
+        self.tester = Node('tester')
+        self.statuses: list[Status] = []
+        self._nodes: list[Node] = [self.tester]
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.tester)
+        self.tester.create_subscription(
+            DIAGNOSTICS.type,
+            DIAGNOSTICS.name,
+            lambda message: self.statuses.extend(statuses(message)),
+            DIAGNOSTICS.profile,
+        )
+
+    def add(self, node: Node) -> Any:
+        """Run a node in this graph."""
+        self._nodes.append(node)
+        self._executor.add_node(node)
+        return node
+
+    def collect(self, name: str) -> list[Any]:
+        """Subscribe to a topic; the list grows with its messages."""
+        topic, received = TOPICS[name], []
+        self.tester.create_subscription(topic.type, name, received.append, topic.profile)
+        return received
+
+    def publisher(self, name: str) -> Any:
+        """Return a publisher of a topic."""
+        return self.tester.create_publisher(TOPICS[name].type, name, TOPICS[name].profile)
+
+    def connected(self, publishers: list[Any]) -> None:
+        """Wait until every publisher has a subscriber."""
+        self.until(lambda: all(p.get_subscription_count() for p in publishers), 'subscribers')
+
+    def until(self, condition: Callable[[], Any], what: str) -> None:
+        """Handle messages until the condition holds; fails naming what did not come."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end_s, f'waited in vain for {what}'
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def reports(self, node: str) -> list[Status]:
+        """Return the statuses of a node about frames and keyframes."""
+        return [s for s in self.statuses if s.node == node and not s.kind]
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """Call a service and return its response."""
+        client = self.tester.create_client(kind, name)
+        self.until(client.service_is_ready, f'service {name}')
+        future = client.call_async(request)
+        self.until(future.done, f'the answer of {name}')
+        return future.result()
+
+    def close(self) -> None:
+        """Take the graph down."""
+        self._executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()

@@ -1,0 +1,38 @@
+"""A short drive through the textured room, written as a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from stereo_room import CAMERA, StereoRoom, planar_pose
+
+from segfloor_ros.camera.model import StereoFrame
+
+RATE_HZ = 10.0
+
+
+def room_drive(frames: int, step_m: float = 0.06) -> tuple[list[StereoFrame], list[np.ndarray]]:
+    """Return stereo frames of a straight drive with a slight turn, and T_world_base of each."""
+    room = StereoRoom(seed=3)
+    poses = [planar_pose(step_m * i, 0.0, 0.01 * i) for i in range(frames)]
+    return [room.frame(i, pose, RATE_HZ) for i, pose in enumerate(poses)], poses
+
+
+def write_kitti(folder: Path, frames: list[StereoFrame]) -> Path:
+    """Write frames as a KITTI odometry folder and return it."""
+    for camera in (0, 1):
+        (folder / f'image_{camera}').mkdir(parents=True)
+    for frame in frames:
+        cv2.imwrite(str(folder / 'image_0' / f'{frame.index:06d}.png'), frame.left)
+        cv2.imwrite(str(folder / 'image_1' / f'{frame.index:06d}.png'), frame.right)
+    P = np.hstack([CAMERA.K, np.zeros((3, 1))])
+    rows = []
+    for name, shift in (('P0', 0.0), ('P1', -CAMERA.disparity_times_depth)):
+        P[0, 3] = shift
+        rows.append(f'{name}: ' + ' '.join(f'{value:.12e}' for value in P.ravel()))
+    (folder / 'calib.txt').write_text('\n'.join(rows) + '\n')
+    times = ''.join(f'{frame.stamp_ns * 1e-9:.6f}\n' for frame in frames)
+    (folder / 'times.txt').write_text(times)
+    return folder
