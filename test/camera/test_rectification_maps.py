@@ -26,6 +26,13 @@ def pixel_grid(width: int, height: int) -> NDArray[np.float64]:
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
 
 
+def small_eye(model: str, cx: float) -> EyeCalibration:
+    """A quarter of the size, for speed."""
+    eye = raw_eye(model, cx)
+    K = np.diag([0.25, 0.25, 1.0]) @ eye.K
+    return dataclasses.replace(eye, width=160, height=120, K=K, P=np.hstack([K, np.zeros((3, 1))]))
+
+
 def raw_image(eye: EyeCalibration) -> NDArray[np.uint8]:
     """What the raw camera sees of the scene: the distortion is inverted pixel by pixel, by
     fixed-point iteration of OpenCV's forward projection.
@@ -48,11 +55,12 @@ def ideal_image(eye: EyeCalibration) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize('model', COEFFICIENTS)
 def test_rectified_images_are_those_of_the_ideal_camera(model: str) -> None:
-    pair = StereoCalibration.from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
+    eyes = small_eye(model, 320.0), small_eye(model, 330.0)
+    pair = StereoCalibration.from_extrinsics(*eyes, T_RIGHT_LEFT)
     images = StereoRectifier(pair).rectify(raw_image(pair.left), raw_image(pair.right))
     for image, eye in zip(images, (pair.left, pair.right), strict=True):
         assert image.dtype == np.uint8
-        inner = np.s_[40:-40, 40:-40]
+        inner = np.s_[10:-10, 10:-10]
         error = np.abs(image[inner].astype(int) - ideal_image(eye)[inner])
         assert np.percentile(error, 99) <= 2
 

@@ -66,9 +66,15 @@ def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
         images = _nested_images(folders[left]), _nested_images(folders[right])
         if any(images):
             return images
-    candidates = [*images_in(folder), *(i for f in folders.values() for i in _nested_images(f))]
+    # Both sides in one folder, or a lonely side, whose partner is missed in the next check.
     left_images, right_images = (
-        [path for path in candidates if is_side(str(path.relative_to(folder)), side)]
+        [path for path in images_in(folder) if is_side(path.stem, side)]
+        or [
+            path
+            for name in folders
+            if is_side(name, side)
+            for path in _nested_images(folders[name])
+        ]
         for side in (0, 1)
     )
     return (left_images, right_images) if left_images or right_images else None

@@ -1,0 +1,106 @@
+"""Round trips through the bags that we write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_recordings import grey_pairs, opened, write_folders, write_kitti
+from rosbags.highlevel import AnyReader
+
+from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, convert
+from segfloor_ros.camera.sources import StereoSource
+from segfloor_ros.errors import InputError
+
+
+def assert_same_recording(one: StereoSource, other: StereoSource) -> None:
+    """Stamps, numbers, rectified pixels and calibration are equal to the last bit."""
+    assert one.camera == other.camera
+    for eye, copy in (
+        (one.calibration.left, other.calibration.left),
+        (one.calibration.right, other.calibration.right),
+    ):
+        assert eye.distortion_model == copy.distortion_model
+        for name in 'KDRP':
+            np.testing.assert_array_equal(getattr(eye, name), getattr(copy, name))
+    for frame, again in zip(one.frames(), other.frames(), strict=True):
+        assert (frame.index, frame.stamp_ns) == (again.index, again.stamp_ns)
+        np.testing.assert_array_equal(frame.left, again.left)
+        np.testing.assert_array_equal(frame.right, again.right)
+
+
+@pytest.mark.parametrize('coding', [ImageCoding.raw, ImageCoding.png])
+@pytest.mark.parametrize('name', ['drive.mcap', 'drive'])
+@pytest.mark.parametrize('distorted', [False, True])
+def test_round_trips_are_exact(
+    tmp_path: Path, coding: ImageCoding, name: str, distorted: bool
+) -> None:
+    source = opened(write_folders(tmp_path / 'images', grey_pairs(5), distorted=distorted))
+    out = tmp_path / 'new' / name
+    progress: list[int] = []
+    assert convert(source, out, coding, progress.append) == 5
+    assert progress == [1, 2, 3, 4, 5]
+    assert out.is_file() == (name == 'drive.mcap')
+    assert_same_recording(source, opened(out))
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_jpeg_is_close(tmp_path: Path) -> None:
+    source = opened(write_kitti(tmp_path / 'drive', grey_pairs(2)))
+    convert(source, tmp_path / 'small.mcap', ImageCoding.jpeg)
+    again = opened(tmp_path / 'small.mcap')
+    for frame, copy in zip(source.frames(), again.frames(), strict=True):
+        assert np.abs(frame.left.astype(int) - copy.left).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ('distorted', 'coding', 'image', 'kind'),
+    [
+        (True, ImageCoding.raw, 'image_raw', 'Image'),
+        (False, ImageCoding.raw, 'image_rect', 'Image'),
+        (True, ImageCoding.png, 'image_raw/compressed', 'CompressedImage'),
+    ],
+)
+def test_topics_types_and_headers_are_the_usual_ones(
+    tmp_path: Path, distorted: bool, coding: ImageCoding, image: str, kind: str
+) -> None:
+    source = opened(write_folders(tmp_path / 'images', grey_pairs(2), distorted=distorted))
+    convert(source, tmp_path / 'drive', coding)
+    with AnyReader([tmp_path / 'drive']) as reader:
+        types = {name: topic.msgtype for name, topic in reader.topics.items()}
+        assert types == {
+            f'/left/{image}': f'sensor_msgs/msg/{kind}',
+            f'/right/{image}': f'sensor_msgs/msg/{kind}',
+            '/left/camera_info': 'sensor_msgs/msg/CameraInfo',
+            '/right/camera_info': 'sensor_msgs/msg/CameraInfo',
+        }
+        for connection, time_ns, data in reader.messages():
+            header = reader.deserialize(data, connection.msgtype).header
+            assert header.stamp.sec * 10**9 + header.stamp.nanosec == time_ns
+            assert header.frame_id.startswith(connection.topic.split('/')[1])
+            assert header.frame_id.endswith('_optical_frame')
+
+
+def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
+    folder = write_kitti(tmp_path / 'drive', grey_pairs(3))
+    source = opened(folder)
+    (folder / 'image_0' / '000002.png').unlink()
+    out = tmp_path / 'out' / 'drive.mcap'
+    with pytest.raises(InputError, match=r'000002.png: cannot read the image'):
+        convert(source, out)
+    assert list(out.parent.iterdir()) == []
+
+
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
+    source = opened(write_kitti(tmp_path / 'drive', grey_pairs(1)))
+    out = tmp_path / 'drive.mcap'
+    out.write_text('precious')
+    with (
+        pytest.raises(InputError, match=r'drive.mcap: exists already; remove it or choose'),
+        BagWriter(out, source.calibration),
+    ):
+        pass
+    assert out.read_text() == 'precious'
+    with pytest.raises(InputError, match=r'cannot be written'):
+        convert(source, out / 'below' / 'drive.mcap')
