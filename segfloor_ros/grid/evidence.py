@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.grid.fan import unit_vectors
+from segfloor_ros.grid.fan import SAME_SURFACE_SHARE, unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
@@ -24,8 +24,8 @@ class KeyframeEvidence:
 
     fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad.
     positions_m: (2, M) float32; the first num_rays are the ends of single rays to floor points
-    that reach farther than the fan, then num_contacts where the floor ends at something upright,
-    the others obstacle points at any height that concerns the robot.
+    that reach farther than the fan, then num_contacts ends of lines along what the floor ends at,
+    two for each; the others are obstacle points at any height that concerns the robot.
     """
 
     first_rad: float
@@ -49,11 +49,10 @@ def gather_evidence(
     floor, obstacles = _seen_points(points, features, T_map_base)
     if not settings.use_points:
         floor, obstacles = floor[:0], obstacles[:0]
-    seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
-    free_m = np.minimum(_certain(seen_m, settings), settings.max_range_m)
+    free_m = np.minimum(_certain(_floor_end(scan, settings), settings), settings.max_range_m)
     rays = _rays(floor, scan, settings)
-    contacts = _well_placed(_contacts(scan), settings)
-    obstacles = _well_placed(obstacles, settings)
+    contacts = _contacts(scan, settings)
+    obstacles = obstacles[np.hypot(obstacles[:, 0], obstacles[:, 1]) <= hit_range_m(settings)]
     return KeyframeEvidence(
         first_rad=scan.angle_min_rad,
         step_rad=scan.angle_increment_rad,
@@ -94,18 +93,38 @@ def _seen_points(
     return in_base[label == FLOOR, :2], in_base[label == OBSTACLE, :2]
 
 
-def _contacts(scan: FloorScan) -> Array:
-    """Return the positions (C, 2) of what the scan's bearings end at, in the base frame."""
+def _floor_end(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
+    """Return how far the floor reaches, (S,), 0 where unknown.
+
+    Matching blurs the seam between floor and wall: a gap there, no wider than the error, is floor
+    up to the foot of what stands behind it.
+    """
+    seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
+    if scan.obstacle_m is None:
+        return seen_m
+    standing_m = scan.obstacle_m.astype(np.float64)
+    seam_m = settings.seam_m + 3 * settings.range_error_per_m * standing_m**2
+    with np.errstate(invalid='ignore'):
+        joined = (seen_m > 0) & (standing_m > seen_m) & (standing_m - seen_m <= seam_m)
+    return np.where(joined, standing_m, seen_m)
+
+
+def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
+    """Return the faces that the scan's bearings end at, as lines: their starts and ends (2 C, 2)
+    in turn, in the base frame.
+
+    A line joins neighbouring bearings where they see the same surface, and is a point elsewhere.
+    """
     if scan.obstacle_m is None:
         return np.zeros((0, 2))
-    standing = np.isfinite(scan.obstacle_m)
-    directions = unit_vectors(scan.bearings_rad[standing])
-    return (directions * scan.obstacle_m[standing]).T
-
-
-def _well_placed(hits: Array, settings: OccupancyGridSettings) -> Array:
-    """Return those of the positions (N, 2) that are near enough to mark a cell."""
-    return hits[np.hypot(hits[:, 0], hits[:, 1]) <= hit_range_m(settings)]
+    near = np.flatnonzero(scan.obstacle_m <= hit_range_m(settings))
+    distance_m = scan.obstacle_m[near].astype(np.float64)
+    start = (unit_vectors(scan.bearings_rad[near]) * distance_m).T
+    joined = np.zeros(len(near), np.bool_)
+    step_m = np.abs(np.diff(distance_m))
+    joined[:-1] = (np.diff(near) == 1) & (step_m <= SAME_SURFACE_SHARE * distance_m[:-1])
+    end = np.where(joined[:, None], np.roll(start, -1, axis=0), start)
+    return np.stack([start, end], axis=1).reshape(-1, 2)
 
 
 def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from segfloor_ros.geometry import Array
 
 SUBPIXEL_BITS = 4
-_JUMP_SHARE = 0.15
+SAME_SURFACE_SHARE = 0.06
 """Neighbouring bearings whose ranges differ by more than this share end at different things."""
 
 
@@ -54,7 +54,7 @@ class Fan:
         """Return where the S - 1 wedges end at their first and second bearing, (2, S - 1) each."""
         first, second = self.lengths[:-1], self.lengths[1:]
         nearer = np.minimum(first, second)
-        jump = np.abs(first - second) > _JUMP_SHARE * nearer
+        jump = np.abs(first - second) > SAME_SURFACE_SHARE * nearer
         left = np.where(jump, nearer, first) * self.directions[:, :-1]
         right = np.where(jump, nearer, second) * self.directions[:, 1:]
         return left, right

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.grid.blocking import Horizon
-from segfloor_ros.grid.evidence import KeyframeEvidence
+from segfloor_ros.grid.evidence import KeyframeEvidence, hit_range_m
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
+from segfloor_ros.grid.hits import draw_hits, draw_lines
 from segfloor_ros.grid.log_odds import ZERO, LogOddsRaster, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
@@ -28,11 +29,17 @@ class EvidenceFolder:
     def __init__(self, settings: OccupancyGridSettings) -> None:
         self._resolution_m = settings.resolution_m
         self._radius_m = settings.footprint_radius_m
-        self._hit = steps(settings.hit_log_odds)
-        self._free = steps(settings.free_log_odds)
-        self._most = ZERO + steps(settings.max_log_odds)
+        self._hit_range = hit_range_m(settings) / settings.resolution_m
         self._least = ZERO - steps(-settings.min_log_odds)
         self._occupied = ZERO + steps(settings.occupied_log_odds)
+        value = np.arange(256)
+        hit, free = steps(settings.hit_log_odds), steps(settings.free_log_odds)
+        self._raised = np.minimum(value + hit, ZERO + steps(settings.max_log_odds))
+        self._lowered = np.maximum(value - free, self._least)
+        # Floor seen from farther than an obstacle could have been placed from is free as long as
+        # nothing says otherwise: it clears no obstacle, and counts no more than one look.
+        tentative = np.minimum(value, np.maximum(value - free, ZERO - free))
+        self._lowered_far = np.where(value >= self._occupied, value, tentative)
 
     def fold(
         self,
@@ -47,9 +54,12 @@ class EvidenceFolder:
         placed = place(evidence, pose, previous, self._resolution_m, self._radius_m)
         cells = raster.patch(placed.low, placed.high)
         free = self._draw_free(cells, placed)
-        hits = _hit_cells(free, placed)
-        self._lower(cells, free, hits)
-        self._raise(cells, hits)
+        hits = draw_hits(free, placed)
+        free[hits > 0] = 0
+        near = self._draw_near(free, placed)
+        _replace(cells, near, self._lowered)
+        _replace(cells, free - near, self._lowered_far)
+        _replace(cells, hits, self._raised)
         self._drive(cells, placed)
 
     def _draw_free(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
@@ -68,22 +78,17 @@ class EvidenceFolder:
             distance = np.sqrt((offset**2).sum(axis=0))
             reached = np.minimum(distance, horizon.towards(offset) + 1) - 0.5
             ends = placed.base[:, None] + offset * (np.maximum(reached, 0) / distance)
-            line = np.stack([np.broadcast_to(placed.base[:, None], ends.shape), ends], axis=2)
-            pixels = fixed_point(line.reshape(2, -1)).reshape(-1, 2, 2)
-            cv2.polylines(free, list(pixels), False, 1, shift=SUBPIXEL_BITS)
+            draw_lines(free, np.broadcast_to(placed.base[:, None], ends.shape), ends)
         return free
 
-    def _lower(
-        self, cells: NDArray[np.uint8], free: NDArray[np.uint8], hits: NDArray[np.intp]
-    ) -> None:
-        free.ravel()[hits] = 0
-        lowered = cv2.subtract(cells, free * np.uint8(self._free))
-        np.maximum(lowered, np.uint8(self._least), out=cells)
-
-    def _raise(self, cells: NDArray[np.uint8], hits: NDArray[np.intp]) -> None:
-        row, column = np.divmod(hits, cells.shape[1])
-        raised = cells[row, column].astype(np.int16) + self._hit
-        cells[row, column] = np.minimum(raised, self._most).astype(np.uint8)
+    def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
+        """Return the free cells that are near enough for an obstacle there to be placed, 1."""
+        near = np.zeros_like(free)
+        centre = fixed_point(placed.base[:, None])[0].tolist()
+        radius = round(self._hit_range * (1 << SUBPIXEL_BITS))
+        cv2.circle(near, centre, radius, 1, cv2.FILLED, shift=SUBPIXEL_BITS)
+        near &= free
+        return near
 
     def _drive(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
         """Free the cells below the base on its way here."""
@@ -94,22 +99,6 @@ class EvidenceFolder:
         cv2.line(cells, way[0], way[1], self._least, width, shift=SUBPIXEL_BITS)
 
 
-def _hit_cells(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.intp]:
-    """Return the cells, as ascending indices without repetition, that hold an obstacle.
-
-    What is seen is an obstacle's near face. A cell that the face leaves mostly free stays free,
-    and the cell behind it is the occupied one. Contacts without such a cell mark none; points
-    hang above free floor then, and mark the cell below them.
-    """
-    hits = np.concatenate([placed.contacts, placed.points], axis=1)
-    offset = hits - placed.base[:, None]
-    distance = np.sqrt((offset**2).sum(axis=0))
-    step = offset * (0.5 / np.maximum(distance, 1.0))
-    candidates = np.stack([hits, hits + step, hits + 2 * step], axis=1).astype(np.intp)
-    cell = candidates[1] * free.shape[1] + candidates[0]
-    solid = free.ravel()[cell] == 0
-    choice = solid.argmax(axis=0)
-    chosen = cell[choice, np.arange(hits.shape[1])]
-    marks = solid.any(axis=0)
-    marks[placed.contacts.shape[1] :] = True
-    return np.unique(chosen[marks])
+def _replace(cells: NDArray[np.uint8], where: NDArray[np.uint8], table: NDArray[np.intp]) -> None:
+    """Replace the values of some cells by those of a table (256,)."""
+    np.copyto(cells, cv2.LUT(cells, table.astype(np.uint8)), where=where.view(np.bool_))

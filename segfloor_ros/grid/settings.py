@@ -42,6 +42,14 @@ class OccupancyGridSettings(StageSettings):
         maximum=1.0,
         live=True,
     )
+    seam_m: float = setting(
+        0.06,
+        'A gap of this width between floor and what stands behind it counts as floor.',
+        unit='m',
+        minimum=0.0,
+        maximum=0.5,
+        live=True,
+    )
     use_points: bool = setting(
         True, 'Obstacle points mark cells, and rays to floor points mark free cells.'
     )

@@ -1,0 +1,45 @@
+"""The cells in which a keyframe sees something standing."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
+from segfloor_ros.grid.placing import PlacedEvidence
+
+
+def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
+    """Return a raster like `free` that is 1 in the cells that hold an obstacle.
+
+    What is seen is an obstacle's near face. A cell that the face leaves mostly free stays free,
+    and the cell behind it is the occupied one. Contacts without such a cell mark none; points
+    hang above free floor then, and mark the cell below them.
+    """
+    hits = np.zeros_like(free)
+    behind = placed.contacts + 0.5 * _outward(placed.contacts, placed.base)
+    draw_lines(hits, behind[:, ::2], behind[:, 1::2])
+    hits[free > 0] = 0
+    step = 0.5 * _outward(placed.points, placed.base)
+    candidates = np.stack([placed.points, placed.points + step, placed.points + 2 * step], axis=1)
+    column, row = candidates.astype(np.intp)
+    choice = (free[row, column] == 0).argmax(axis=0)
+    point = np.arange(len(choice))
+    hits[row[choice, point], column[choice, point]] = 1
+    return hits
+
+
+def draw_lines(raster: NDArray[np.uint8], start: Array, end: Array) -> None:
+    """Set the cells on straight lines between positions (2, N) and (2, N), in cells, to 1."""
+    lines = np.stack([start, end], axis=2)
+    pixels = fixed_point(lines.reshape(2, -1)).reshape(-1, 2, 2)
+    if len(pixels):
+        cv2.polylines(raster, list(pixels), False, 1, shift=SUBPIXEL_BITS)
+
+
+def _outward(positions: Array, base: Array) -> Array:
+    """Return unit vectors (2, N) from the base to positions (2, N)."""
+    offset = positions - base[:, None]
+    return offset / np.maximum(np.sqrt((offset**2).sum(axis=0)), 1.0)
