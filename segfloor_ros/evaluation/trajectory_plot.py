@@ -14,17 +14,20 @@ from segfloor_ros.evaluation.trajectory import MatchedTrajectories
 def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
     """Write a plot of both paths from above and of the error over time.
 
-    Paths are drawn on the two axes in which the true path extends most.
+    Paths are drawn on the plane in which the true path extends most.
     """
     truth, aligned = matched.truth[:, :3, 3], matched.aligned[:, :3, 3]
-    first, second = sorted(np.argsort(np.ptp(truth, axis=0))[-2:])
+    axes = np.linalg.svd(truth - truth[0], full_matrices=False)[2][:2]
+    axes *= np.sign((truth[-1] - truth[0]) @ axes[0] or 1.0)
+    true_xy, xy = (truth - truth[0]) @ axes.T, (aligned - truth[0]) @ axes.T
     figure = Figure(figsize=(11, 5), layout='constrained')
     FigureCanvasAgg(figure)
     above, error = figure.subplots(1, 2)
-    above.plot(truth[:, first], truth[:, second], 'k--', label='truth')
-    above.plot(aligned[:, first], aligned[:, second], color='tab:blue', label='estimate, aligned')
-    above.plot(truth[0, first], truth[0, second], 'ko', label='start')
-    above.set(xlabel=f'{"xyz"[first]} [m]', ylabel=f'{"xyz"[second]} [m]', aspect='equal')
+    above.plot(*true_xy.T, 'k--', label='truth')
+    above.plot(*xy.T, color='tab:blue', label='estimate, aligned')
+    above.plot(0, 0, 'ko', label='start')
+    above.set(xlabel="along the path's longest extent [m]", ylabel='across [m]')
+    above.set_aspect('equal', adjustable='datalim')
     above.legend()
     above.grid(alpha=0.3)
     distances_cm = 100 * np.linalg.norm(aligned - truth, axis=1)

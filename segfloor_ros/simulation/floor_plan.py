@@ -50,6 +50,7 @@ def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
         'floor': {'texture': 'tiles'},
         'boxes': _boxes(grid, occupied, seed),
         'resolution_m': grid.resolution_m,
+        'raster_phase': 0.0,
         'path': {'waypoints': waypoints},
     }
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -40,13 +42,13 @@ def record(
     out: Path,
     options: RecordingOptions,
     on_frame: Callable[[int], None] = lambda done: None,
-    sink: Callable[[Path], FrameSink] | None = None,
+    open_sink: Callable[[Path], FrameSink] | None = None,
 ) -> None:
     """Write a drive to a new folder, complete or not at all.
 
     Rectified images go to image_0/ and image_1/ with calib.txt (KITTI odometry layout), others to
-    left/ and right/ with ROS calibrations left.yaml and right.yaml. sink: makes a further
-    receiver of the frames from the folder, e.g. a bag. Raises InputError when `out` holds
+    left/ and right/ with ROS calibrations left.yaml and right.yaml. open_sink: makes a
+    further receiver of the frames in the folder, e.g. a bag. Raises InputError when `out` holds
     something already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -54,7 +56,7 @@ def record(
     out.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
     try:
-        _record_into(staging, simulation, options, on_frame, sink)
+        _record_into(staging, simulation, options, on_frame, open_sink)
         staging.chmod(0o755)
         if out.exists():
             out.rmdir()
@@ -63,14 +65,15 @@ def record(
         shutil.rmtree(staging, ignore_errors=True)
 
 
-class FrameSink:
-    """Receives the frames of a drive besides the folder."""
+class FrameSink(Protocol):
+    """Receives the frames of a drive besides the folder; entered before the first one."""
 
-    def write(self, frame: SimulatedFrame) -> None:
+    def add(self, frame: SimulatedFrame) -> None:
         """Take one frame."""
 
-    def close(self) -> None:
-        """Finish."""
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *error: Any) -> None: ...
 
 
 def _record_into(
@@ -78,27 +81,28 @@ def _record_into(
     simulation: Simulation,
     options: RecordingOptions,
     on_frame: Callable[[int], None],
-    make_sink: Callable[[Path], FrameSink] | None,
+    open_sink: Callable[[Path], FrameSink] | None,
 ) -> None:
     write_truth(folder, simulation)
-    sink = make_sink(folder) if make_sink is not None else None
+    if options.images:
+        _write_calibration(folder, simulation)
     poses = []
-    for frame in simulation.frames():
-        if options.images:
-            _write_images(folder, frame, simulation.scene.camera.rectified)
-        if sink is not None:
-            sink.write(frame)
-        if options.floor_every and frame.index % options.floor_every == 0:
-            _write_frame_truth(folder, simulation, frame.index, options)
-        poses.append(frame.T_world_left)
-        on_frame(frame.index + 1)
-    if sink is not None:
-        sink.close()
+    with ExitStack() as stack:
+        sink = stack.enter_context(open_sink(folder)) if open_sink is not None else None
+        for frame in simulation.frames():
+            if options.images:
+                _write_images(folder, frame, simulation.scene.camera.rectified)
+            if sink is not None:
+                sink.add(frame)
+            if options.floor_every and frame.index % options.floor_every == 0:
+                _write_frame_truth(folder, simulation, frame.index, options)
+            poses.append(frame.T_world_left)
+            on_frame(frame.index + 1)
     _write_poses(folder / 'poses.txt', np.array(poses))
 
 
 def write_truth(folder: Path, simulation: Simulation) -> None:
-    """Write map, scene.yaml, base_poses.txt, times.txt and the calibration."""
+    """Write map, scene.yaml, base_poses.txt and times.txt."""
     scene, rig, drive = simulation.scene, simulation.scene.camera, simulation.drive
     save_map(simulation.true_map, folder / 'map.yaml')
     times = drive.times_s
@@ -120,7 +124,6 @@ def write_truth(folder: Path, simulation: Simulation) -> None:
         'start_pose_world': [float(value) for value in drive.xy_yaw[0]],
     }
     (folder / 'scene.yaml').write_text(yaml.safe_dump(facts, sort_keys=False))
-    _write_calibration(folder, simulation)
 
 
 def _write_calibration(folder: Path, simulation: Simulation) -> None:

@@ -173,7 +173,10 @@ class Route:
 @dataclass(frozen=True)
 class Scene:
     """A world, the camera and the drive through it. robot_height_m: what hangs higher is no
-    obstacle in the true map; step_height_m: what is lower is not one either.
+    obstacle in the true map; step_height_m: what is lower is not one either. resolution_m and
+    raster_phase: cells of the true map, and where in a cell the outermost corner of the solids
+    lies; in the middle (0.5) a wall's face is not a cell's border, which an estimate may round
+    to either side.
     """
 
     description: str
@@ -191,5 +194,6 @@ class Scene:
     lighting: Lighting = field(default_factory=Lighting)
     camera: CameraRig = field(default_factory=CameraRig)
     resolution_m: float = 0.05
+    raster_phase: float = 0.5
     robot_height_m: float = 1.0
     step_height_m: float = 0.03

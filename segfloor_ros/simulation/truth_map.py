@@ -58,11 +58,11 @@ def true_map(
 
 
 def _empty_grid(scene: Scene, obstacles: list[Prism], start: Array) -> OccupancyGrid:
-    """Return a grid around everything whose cell borders go through the outermost corners."""
+    """Return a grid around everything, in phase with the outermost corner of the solids."""
     size = scene.resolution_m
     drive = np.vstack([start[None], np.array(scene.path.waypoints)])
     corners = np.vstack([p.footprint for p in obstacles]) if obstacles else drive
-    anchor = corners.min(axis=0)
+    anchor = corners.min(axis=0) - scene.raster_phase * size
     everything = np.vstack([corners, drive])
     low = anchor - np.ceil((anchor - everything.min(axis=0) + MARGIN_M) / size) * size
     columns, rows = np.ceil((everything.max(axis=0) + MARGIN_M - low) / size).astype(int)

@@ -161,11 +161,11 @@ def _document(builder: WorldBuilder, width: int, height: int) -> str:
     {''.join(builder.assets)}
   </asset>
   <worldbody>
-    <light type="directional" castshadow="false" pos="0 0 2" dir="0.45 0.6 -0.75"
+    <light directional="true" castshadow="false" pos="0 0 2" dir="0.45 0.6 -0.75"
            ambient="{_grey(scene.lighting.ambient)}" diffuse="{_grey(diffuse)}" specular="0 0 0"/>
-    <light type="directional" castshadow="false" pos="0 0 2" dir="-0.7 -0.35 -0.5"
+    <light directional="true" castshadow="false" pos="0 0 2" dir="-0.7 -0.35 -0.5"
            ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
-    <light type="directional" castshadow="false" pos="0 0 1" dir="0 0 1"
+    <light directional="true" castshadow="false" pos="0 0 1" dir="0 0 1"
            ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
     {''.join(builder.bodies)}
     <body name="{RIG}" mocap="true">{cameras}</body>

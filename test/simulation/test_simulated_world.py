@@ -147,7 +147,7 @@ def test_texture_coordinates_are_in_metres():
 def test_true_map_of_a_box_on_the_raster():
     walls = [{'points': ROOM, 'closed': True, 'thickness_m': 0.1}]
     boxes = [{'at': [2.0, 2.0], 'size': [0.5, 0.2, 0.3]}]
-    grid = map_of(scene_with(walls=walls, boxes=boxes))
+    grid = map_of(scene_with(walls=walls, boxes=boxes, raster_phase=0.0))
     # The room is 3.9 x 2.9 m inside its walls; the box takes 10 x 4 cells of it.
     assert (grid.cells == FREE).sum() == 78 * 58 - 10 * 4
     assert (grid.cells == OCCUPIED).sum() == 82 * 62 - 78 * 58 + 10 * 4
@@ -155,6 +155,17 @@ def test_true_map_of_a_box_on_the_raster():
     assert cell(grid, 2.26, 2.09) == FREE
     assert cell(grid, 2.24, 2.11) == FREE
     assert cell(grid, -0.3, 1.0) == UNKNOWN
+
+
+def test_faces_lie_in_the_middle_of_cells_unless_asked_otherwise():
+    grid = map_of(scene_with(walls=[{'points': ROOM, 'closed': True}]))
+    # The outer face at -0.05 is in the middle of a cell of 0.05: its border is at -0.075.
+    offset = (-0.075 - np.array(grid.origin_xy_m)) / 0.05
+    np.testing.assert_allclose(offset, np.round(offset), atol=1e-6)
+    # Inner faces at 0.05 and 3.95 leave the cells with their middles from 0.1 to 3.9 free.
+    row = grid.cells[int((1.5 - grid.origin_xy_m[1]) / 0.05)]
+    free = grid.origin_xy_m[0] + (np.flatnonzero(row == FREE) + 0.5) * 0.05
+    np.testing.assert_allclose([free[0], free[-1], len(free)], [0.1, 3.9, 77])
 
 
 def test_true_map_knows_heights():

@@ -1,0 +1,90 @@
+"""`segfloor demo` and `segfloor simulate` as a user runs them."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.demo import DRIVE, demo
+from segfloor_ros.cli.simulate import simulate as simulate_command
+from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.simulation.bag import ODOMETRY, ODOMETRY_TOPIC
+from segfloor_ros.simulation.renderer import RenderingError
+
+app = typer.Typer()
+app.command('demo')(demo)
+app.command('simulate')(simulate_command)
+
+SMALL = ('camera.width=160', 'camera.height=120', 'path.waypoints=[[-0.3, 0], [0.3, 0]]')
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if isinstance(result.exception, RenderingError):
+        pytest.skip(str(result.exception))
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result.output
+
+
+def simulate(out, *options):
+    settings = [word for value in SMALL for word in ('--set', value)]
+    return run('simulate', 'corridor2', '--out', out, *settings, *options)
+
+
+def test_the_demo_drive_is_small_and_complete():
+    assert sum(file.stat().st_size for file in DRIVE.iterdir()) < 15e6
+    truth = load_truth(DRIVE)
+    source = open_source(StereoCameraSettings(input=str(DRIVE / 'drive.mcap')))
+    assert len(truth.base_poses) == source.frame_count == 273
+
+
+def test_demo_maps_and_scores(tmp_path):
+    output = run('demo', '--lockstep', '--out', tmp_path / 'demo').split('\n')
+    picture = Path(output[-2])
+    assert picture == tmp_path / 'demo' / 'overlay.png'
+    assert cv2.imread(str(picture)).shape[2] == 3
+    path = next(line for line in output if line.startswith('path: '))
+    assert '7.8 m, 100.0 % of the frames tracked' in path
+    free = next(line for line in output if 'free cells' in line).split('│')
+    assert float(free[2]) > 98.0
+    assert float(free[3]) > 75.0
+
+
+def test_simulate_writes_a_folder_that_can_be_read(tmp_path):
+    assert 'pairs, 0.6 m' in simulate(tmp_path / 'drive')
+    source = open_source(StereoCameraSettings(input=str(tmp_path / 'drive')))
+    assert source.calibration.camera.fx == pytest.approx(80.0)
+    frames = list(source.frames())
+    assert len(frames) == len(load_truth(tmp_path / 'drive').base_poses)
+
+
+@pytest.mark.parametrize('coding', ['bag-png', 'bag-jpeg'])
+def test_simulate_writes_a_bag_with_the_true_odometry(tmp_path, coding):
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    simulate(tmp_path / 'bag', '--images', coding)
+    simulate(tmp_path / 'files')
+    pairs = [
+        list(open_source(StereoCameraSettings(input=str(path))).raw_pairs())
+        for path in (tmp_path / 'bag' / 'drive.mcap', tmp_path / 'files')
+    ]
+    assert len(pairs[0]) == len(pairs[1])
+    largest = 0 if coding == 'bag-png' else 30
+    for from_bag, from_files in zip(*pairs, strict=True):
+        assert from_bag.stamp_ns == from_files.stamp_ns
+        assert cv2.absdiff(from_bag.right, from_files.right).max() <= largest
+    base = np.loadtxt(tmp_path / 'files' / 'base_poses.txt')
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with AnyReader([tmp_path / 'bag' / 'drive.mcap'], default_typestore=store) as reader:
+        wanted = [c for c in reader.connections if c.topic == ODOMETRY_TOPIC]
+        assert [c.msgtype for c in wanted] == [ODOMETRY]
+        poses = [reader.deserialize(raw, ODOMETRY) for _, _, raw in reader.messages(wanted)]
+    driven = [message.pose.pose.position.x for message in poses]
+    np.testing.assert_allclose(driven, base[:, 1] - base[0, 1], atol=1e-5)
+    assert (poses[0].header.frame_id, poses[0].child_frame_id) == ('map', 'base_link')
