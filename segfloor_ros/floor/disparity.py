@@ -25,10 +25,10 @@ def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.
     """Return how many disparities must be searched, a multiple of 16.
 
     The nearest floor is in the image's lower corners; `share` leaves room for what stands in
-    front of it. Without a mount a fifth of the image width is searched.
+    front of it. Without a mount a quarter of the image width is searched.
     """
     if mount is None:
-        wanted = camera.width / 5
+        wanted = camera.width / 4
     else:
         up = mount.up_in_camera
         v = (camera.height - 1 - camera.cy) / camera.fy

@@ -23,7 +23,7 @@ def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:
 
 
 def obstacle_rows(
-    disparity_px: NDArray[np.floating],
+    disparity_px: NDArray[np.floating] | NDArray[np.integer],
     height_m: float,
     rows_per_m_px: float,
     floor_rows_per_px: float,

@@ -61,14 +61,15 @@ class FloorProfile:
     disparity_px: Array
     support: float
 
-    def at_rows(self, rows: NDArray[np.floating]) -> Array:
+    def at_rows(self, rows: NDArray[np.floating] | NDArray[np.integer]) -> Array:
         """Return the floor's disparity at de-rolled rows, NaN above the first row."""
-        rows = np.asarray(rows, np.float64)
+        row = np.asarray(rows, np.float64)
         end = self.first_row + len(self.disparity_px) - 1
         grid = self.first_row + np.arange(len(self.disparity_px))
-        values = np.interp(rows, grid, self.disparity_px)
-        values += np.maximum(rows - end, 0) * self.line.slope
-        return np.where(rows < self.first_row, np.nan, values)
+        values = np.interp(row, grid, self.disparity_px)
+        values += np.maximum(row - end, 0) * self.line.slope
+        values[row < self.first_row] = np.nan
+        return values
 
     def row_of_disparity(self, disparity_px: NDArray[np.floating]) -> Array:
         """Return the de-rolled row at which the floor has a disparity."""

@@ -155,7 +155,7 @@ class FloorSegmentation:
         noise_m = np.float32(noise) / np.maximum(disparity, np.float32(0.25))
         up = np.sqrt(np.float32(settings.step_height_m**2) + noise_m**2)
         down = np.float32(settings.drop_height_m) + 2 * noise_m
-        return up, down
+        return up.astype(np.float32), down.astype(np.float32)
 
     def _evidence(
         self,

@@ -1,0 +1,138 @@
+"""The camera's height, pitch and roll, measured from the floor it sees."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
+from segfloor_ros.floor.plane import (
+    PlaneFit,
+    Samples,
+    preference,
+    propose,
+    refine,
+    scores,
+    with_known,
+)
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.geometry import Array
+
+_MAX_FRAMES = 12
+_SAMPLES_PER_FRAME = 4000
+_PROPOSALS = 600
+_KEPT = 60
+_PLAIN_SUPPORT = 0.3
+_WEAK_SUPPORT = 0.08
+_MAX_VIOLATIONS = 0.05
+_REST = 5
+"""So many keyframes in a row must agree where the floor is not plain to see."""
+_TEXTURE_GREY = 1.2
+"""Horizontal grey gradient per pixel below which a disparity is mostly invented."""
+
+
+class MountEstimator:
+    """Measures the mount over the first keyframes, in SLAM's own frame.
+
+    known values are kept and only the others measured; NaN where not known. Deterministic: the
+    same frames give the same mount.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        height_m: float = math.nan,
+        pitch_rad: float = math.nan,
+        roll_rad: float = math.nan,
+        forward_m: float = 0.0,
+        left_m: float = 0.0,
+    ) -> None:
+        self._camera = camera
+        self._known = np.array([pitch_rad, roll_rad, height_m])
+        self._offset = (forward_m, left_m)
+        self._frames: list[Samples] = []
+        self._guesses = np.zeros((0, 3))
+        self._matcher = DisparityMatcher(disparity_range(camera, None), FloorSegmentationSettings())
+        self._rng = np.random.default_rng(0)
+        self._fits: list[PlaneFit] = []
+        self._settled = False
+
+    @property
+    def mount(self) -> Mount | None:
+        """The mount of the first camera pose, None until the evidence suffices."""
+        if not self._settled:
+            return None
+        pitch, roll, height = (float(value) for value in self._fits[-1].angles_height)
+        return Mount(height, pitch, roll, *self._offset)
+
+    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
+        """Use one more rectified grey pair (H, W) uint8.
+
+        T_world_left: pose (4, 4) of the camera in a frame whose origin is the first camera's.
+        """
+        if self._settled:
+            return
+        samples = self._sample(left, right, T_world_left)
+        if len(samples.weight) < 50 or samples.weight.sum() < 1:
+            return
+        self._frames = [*self._frames, samples][-_MAX_FRAMES:]
+        fresh = propose(samples, _PROPOSALS, self._rng, self._known)
+        guesses = np.concatenate([with_known(self._guesses, self._known), fresh])
+        if len(guesses) == 0:
+            return
+        total = np.sum([scores(frame, guesses) for frame in self._frames], axis=0)
+        total = np.maximum(total, 0) * preference(guesses, self._travel())
+        order = np.argsort(-total, kind='stable')[:_KEPT]
+        self._guesses = guesses[order]
+        fit = refine(self._frames, self._guesses[0], self._known, self._travel())
+        self._guesses = np.concatenate([fit.angles_height[None], self._guesses])
+        self._fits.append(fit)
+        self._settled = self._suffices(fit)
+
+    def _travel(self) -> Array:
+        positions = np.array([frame.position_m for frame in self._frames])
+        steps = positions[1:] - positions[:1]
+        return steps[np.linalg.norm(steps, axis=1) > 0.05]
+
+    def _suffices(self, fit: PlaneFit) -> bool:
+        """Tell whether the floor is plain to see, or weaker evidence has come to rest."""
+        if fit.violations > _MAX_VIOLATIONS:
+            return False
+        certain = fit.sigma[2] < 0.015 * fit.angles_height[2]
+        if fit.support > _PLAIN_SUPPORT and certain and fit.sigma[:2].max() < math.radians(0.2):
+            return True
+        if len(self._fits) < _REST or fit.support < _WEAK_SUPPORT:
+            return False
+        recent = np.array([past.angles_height for past in self._fits[-_REST:]])
+        spread = np.ptp(recent, axis=0)
+        return bool(
+            certain
+            and spread[2] < 0.03 * fit.angles_height[2]
+            and spread[0] < math.radians(1.0)
+            and spread[1] < math.radians(4.0)
+        )
+
+    def _sample(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
+    ) -> Samples:
+        camera = self._camera
+        disparity = self._matcher.compute(left, right)
+        smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
+        gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
+        texture = cv2.blur(gradient, (9, 9))
+        step = max(2, round(math.sqrt(left.size / 2 / _SAMPLES_PER_FRAME)))
+        grid = disparity[step // 2 :: step, step // 2 :: step]
+        rows, columns = (step // 2 + step * index for index in np.nonzero(grid >= 1))
+        rays = camera.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
+        grey = texture[rows, columns].astype(np.float64)
+        return Samples(
+            rays=rays @ T_world_left[:3, :3].T,
+            position_m=T_world_left[:3, 3].astype(np.float64),
+            disparity_px=disparity[rows, columns].astype(np.float64),
+            weight=grey**4 / (grey**4 + _TEXTURE_GREY**4),
+            disparity_m=camera.disparity_times_depth,
+        )
