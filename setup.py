@@ -41,8 +41,8 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     data_files=data_files,
     python_requires='>=3.10',
-    # colcon does not install these: on a ROS install rosdep brings the distribution's OpenCV, NumPy,
-    # SciPy and PyYAML, which pip packages must not shadow.
+    # colcon does not install these: on a ROS install rosdep brings the distribution's own packages,
+    # which those of pip must not shadow.
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',

@@ -14,6 +14,7 @@ from segfloor_ros.cli.output import console, print_error, print_summary, progres
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import SaveMasks
+from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.recording import OutputFolder
 
 
@@ -44,6 +45,7 @@ def replay(
         raise SettingsError(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
         )
+    StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})
     # The camera node reads the recording; here it is opened so that bad input ends at once.
     frame_count = open_source(configuration.stereo_camera).frame_count

@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import pytest
-
-pytest.importorskip('rclpy')
-
 from segfloor_ros.messages.join import Dropped, StampJoiner
 
 

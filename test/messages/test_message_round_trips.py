@@ -2,9 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip('rclpy')
-
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation

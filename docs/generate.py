@@ -1,0 +1,145 @@
+"""Writes the pages of the nodes from the declared topics and settings: python docs/generate.py."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from segfloor_ros.configuration import STAGE_SETTINGS
+from segfloor_ros.messages.qos import describe
+from segfloor_ros.messages.topics import (
+    CAMERA,
+    CLOUD,
+    DIAGNOSTICS,
+    FLOOR,
+    GRID,
+    NODES,
+    SLAM,
+    Topic,
+    published_by,
+    subscribed_by,
+)
+from segfloor_ros.node_settings import NODE_SETTINGS
+from segfloor_ros.settings import SettingSpec
+
+PAGES = Path(__file__).parent / 'nodes'
+
+PURPOSE = {
+    CAMERA: """\
+Plays a recording or reads a device and publishes every stereo pair as recorded, with its own stamp
+and calibration. It begins once all four topics have a subscriber. On a robot with a camera driver
+it is not needed: remap the driver's topics to those that `stereo_slam` subscribes to.""",
+    SLAM: """\
+Tracks every stereo pair, adds keyframes, and keeps a sparse map of points with stable ids. While
+tracking is lost it publishes no pose, and `/diagnostics` says why. Where the camera sits on the
+robot comes from the parameters, else from `/tf_static` (`base_link` to the frame of the left
+image), else it is measured from the floor the camera sees; until then results are held back, and
+all of them follow. With tf2_ros installed it broadcasts `map` → `odom` → `base_link`, and the mount
+where tf did not have it.""",
+    FLOOR: """\
+Computes the disparity of every keyframe and marks the pixels that show floor.""",
+    CLOUD: """\
+Labels every point of the sparse map as floor or obstacle, by the masks of the keyframes that see it
+and by its height.""",
+    GRID: """\
+Builds the occupancy grid from the labelled points, the rays to floor points and the floor scans. It
+follows every later correction of the keyframes.""",
+}
+
+SERVICES = {
+    CAMERA: [
+        (
+            '`~/pause`',
+            '`std_srvs/srv/SetBool`',
+            'Pause (true) or go on (false) with the recording.',
+        )
+    ],
+    GRID: [
+        (
+            '`save_map`',
+            '`std_srvs/srv/Trigger`',
+            'Write the map to `map_file` in the format of Nav2’s map_server.',
+        )
+    ],
+}
+
+STATUS = {
+    CAMERA: 'One status per pair sent (`frame_index`), and `stereo_camera: recording` at its end '
+    '(`frames`, `skipped`).',
+    SLAM: 'One status per frame: OK while tracking, WARN while the mount is measured, ERROR while '
+    'lost, with the reason. Values: `tracked`, `keyframe`, `matches`, `reference_keyframe_ns` (the '
+    'keyframe a pose is relative to), `processing_ms`, `rss_mb`.',
+    FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
+    'delivered. Values: `processing_ms`, `rss_mb`.',
+    CLOUD: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
+    'delivered. Values: `points`, `processing_ms`, `rss_mb`.',
+    GRID: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
+    'delivered. Values: `processing_ms`, `rss_mb`.',
+}
+
+
+def page(node: str) -> str:
+    """Return the page of a node in Markdown."""
+    stage, own = STAGE_SETTINGS[node].specs(), NODE_SETTINGS[node].specs()
+    sections = [
+        f'# {node}',
+        PURPOSE[node],
+        '## Subscribes to',
+        _topics(subscribed_by(node)) or 'Nothing (at rate 0 or lossless: `/diagnostics`).',
+        '## Publishes',
+        _topics([*published_by(node), DIAGNOSTICS]),
+        STATUS[node] + ' Once a second `connections` tells the subscribers of each topic.',
+    ]
+    if node in SERVICES:
+        sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
+    sections += ['## Parameters', _parameters(stage)]
+    if own:
+        sections += ['Only the node has these; `segfloor run` passes over them:', _parameters(own)]
+    sections.append(
+        'Live parameters can be set while the node runs; the others are read at its start.'
+    )
+    return '\n\n'.join(sections) + '\n'
+
+
+def _topics(topics: list[Topic]) -> str:
+    rows = [(f'`{t.name}`', f'`{t.type_name}`', describe(t.profile), t.about) for t in topics]
+    return _table(('topic', 'type', 'QoS', 'what it holds'), rows) if rows else ''
+
+
+def _parameters(specs: list[SettingSpec]) -> str:
+    rows = [
+        (
+            f'`{spec.name}`',
+            _value(spec),
+            spec.unit or '–',
+            spec.range_text().removesuffix(f' {spec.unit}') or '–',
+            'yes' if spec.live else 'no',
+            spec.description,
+        )
+        for spec in specs
+    ]
+    return _table(('parameter', 'default', 'unit', 'range', 'live', 'meaning'), rows)
+
+
+def _value(spec: SettingSpec) -> str:
+    if isinstance(spec.default, float) and math.isnan(spec.default):
+        return '`.nan`'
+    if isinstance(spec.default, bool):
+        return f'`{str(spec.default).lower()}`'
+    return f'`{spec.default}`' if spec.default != '' else "`''`"
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, tuple('---' for _ in head), *rows]
+    return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
+
+
+def main() -> None:
+    """Write all pages."""
+    PAGES.mkdir(exist_ok=True)
+    for node in NODES:
+        (PAGES / f'{node}.md').write_text(page(node))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,49 @@
+"""A rosbag2 recording, played by `ros2 bag play` in its own time, through the nodes."""
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    IncludeLaunchDescription,
+)
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
+
+PACKAGE = 'segfloor_ros'
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the player, the nodes and the arguments."""
+    share = FindPackageShare(PACKAGE)
+    nodes = PathJoinSubstitution([share, 'launch_configs', 'segfloor.launch.py'])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('bag', description='Folder of the rosbag2 recording.'),
+            DeclareLaunchArgument(
+                'rate', default_value='1.0', description='Speed against real time.'
+            ),
+            DeclareLaunchArgument(
+                'namespace', default_value='', description='Namespace of all nodes and topics.'
+            ),
+            DeclareLaunchArgument(
+                'params_file',
+                default_value=PathJoinSubstitution([share, 'params', 'default.yaml']),
+                description='Parameter file for all nodes.',
+            ),
+            IncludeLaunchDescription(
+                nodes,
+                launch_arguments={
+                    'namespace': LaunchConfiguration('namespace'),
+                    'params_file': LaunchConfiguration('params_file'),
+                    'use_sim_time': 'true',
+                }.items(),
+            ),
+            ExecuteProcess(
+                cmd=[
+                    *('ros2', 'bag', 'play', LaunchConfiguration('bag')),
+                    *('--clock', '--rate', LaunchConfiguration('rate')),
+                ],
+                output='screen',
+            ),
+        ]
+    )

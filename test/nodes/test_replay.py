@@ -1,0 +1,141 @@
+"""`segfloor replay` for real: five processes, a small drive, and what may go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from stereo_drive import room_drive, write_kitti
+
+from segfloor_ros.cli.replay_graph import unconnected
+from segfloor_ros.messages.topics import NODES, TOPICS, published_by
+
+FRAMES = 20
+SAME_FILES = ('map.pgm', 'map.yaml', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply')
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory) -> Path:
+    frames, _ = room_drive(FRAMES)
+    return write_kitti(tmp_path_factory.mktemp('recording') / 'drive', frames)
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    environment = {k: v for k, v in os.environ.items() if k != 'ROS_DOMAIN_ID'}
+    return subprocess.Popen(
+        [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def segfloor(*arguments: object) -> tuple[int, str, str]:
+    process = start(*arguments)
+    out, err = process.communicate(timeout=150)
+    return process.returncode, out, err
+
+
+def node_processes(replay: subprocess.Popen[str]) -> dict[str, int]:
+    """Return the process ids of a running replay's nodes."""
+    children = Path(f'/proc/{replay.pid}/task/{replay.pid}/children')
+    found = {}
+    for pid in children.read_text().split():
+        try:
+            words = Path(f'/proc/{pid}/cmdline').read_text().split('\0')
+        except OSError:
+            continue
+        names = [w.rsplit('.', 1)[-1] for w in words if w.startswith('segfloor_ros.nodes.')]
+        found.update({name: int(pid) for name in names})
+    return found
+
+
+def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
+    status, _, errors = segfloor('run', drive, '--out', tmp_path / 'run')
+    assert status == 0, errors
+    status, out, errors = segfloor('replay', drive, '--out', tmp_path / 'replay', '--rate', 0)
+    assert status == 0, errors
+    for name in SAME_FILES:
+        run, replay = ((tmp_path / kind / name).read_bytes() for kind in ('run', 'replay'))
+        assert run == replay, name
+    summaries = [
+        json.loads((tmp_path / kind / 'summary.json').read_text()) for kind in ('run', 'replay')
+    ]
+    for key in ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'map_updates'):
+        assert summaries[0][key] == summaries[1][key], key
+    assert summaries[1]['frames'] == FRAMES
+    masks = [
+        sorted(p.name for p in (tmp_path / k / 'floor_masks').iterdir()) for k in ('run', 'replay')
+    ]
+    assert masks[0] == masks[1]
+    assert len(masks[0]) == summaries[0]['keyframes']
+    assert 'keyframes that failed: 0' in out
+
+
+def test_a_node_that_dies_ends_the_replay_by_its_name(drive, tmp_path) -> None:
+    out = tmp_path / 'out'
+    replay = start('replay', drive, '--out', out, '--rate', 0.2)
+    nodes = {}
+    deadline_s = time.monotonic() + 60
+    while len(nodes) < 5 and time.monotonic() < deadline_s:
+        nodes = node_processes(replay)
+    os.kill(nodes['cloud_labelling'], signal.SIGKILL)
+    _, errors = replay.communicate(timeout=60)
+    assert replay.returncode == 1
+    assert 'node cloud_labelling died (signal SIGKILL)' in errors
+    assert not out.exists()
+    assert list(tmp_path.iterdir()) == []
+    assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
+
+
+@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
+    replay = start('replay', drive, '--out', tmp_path / 'out', '--rate', 0.2)
+    nodes = {}
+    while len(nodes) < 5 and replay.poll() is None:
+        nodes = node_processes(replay)
+    stop_s = time.monotonic()
+    replay.send_signal(stop)
+    replay.communicate(timeout=30)
+    assert replay.returncode == 130
+    assert time.monotonic() - stop_s < 5
+    assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['missing'], 'missing'),
+        (['drive', '--set', 'occupancy_grid.resolution_m=7'], 'occupancy_grid.resolution_m = 7'),
+        (['drive', '--set', 'occupancy_grid.resolution=1'], 'did you mean resolution_m'),
+        (['drive', '--save-masks', 'all'], '--save-masks all'),
+        (['drive', '--rate', '-1'], 'rate = -1'),
+    ],
+)
+def test_bad_input_ends_with_one_line_before_anything_is_written(
+    drive, tmp_path, arguments, words
+) -> None:
+    given = [str(drive) if word == 'drive' else word for word in arguments]
+    status, _, errors = segfloor('replay', *given, '--out', tmp_path / 'out')
+    assert status == 2
+    assert words in errors
+    assert len(errors.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_frame_is_sent_before_every_topic_is_connected() -> None:
+    assert unconnected({}) == [f'{node} (no sign of life)' for node in NODES]
+    enough = {node: {t.name: 9 for t in published_by(node)} for node in NODES}
+    for counts in enough.values():
+        counts['/diagnostics'] = 2
+    assert unconnected(enough) == []
+    enough['stereo_slam']['keyframe/features'] = len(TOPICS['keyframe/features'].subscribers) - 1
+    assert unconnected(enough) == ['keyframe/features (1 of 2 subscribers)']
