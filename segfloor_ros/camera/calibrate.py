@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.calibration_files import write_ros_calibration
-from segfloor_ros.camera.images import CorruptImageError
-from segfloor_ros.camera.sources.files import read_grey
+from segfloor_ros.camera.chessboard import find_corners
 from segfloor_ros.camera.sources.image_folders import find_image_pairs
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.geometry import Array, make_transform
@@ -23,7 +22,6 @@ from segfloor_ros.geometry import Array, make_transform
 MIN_PAIRS = 5
 """Fewer views do not hold the intrinsics (Zhang needs 3; distortion needs more)."""
 
-SUBPIX_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 
 logger = logging.getLogger(__name__)
@@ -112,7 +110,7 @@ def _find_boards(
 ) -> _Views:
     views = _Views([], [], (0, 0))
     for done, (left_path, right_path) in enumerate(zip(left, right, strict=True), 1):
-        left_view, right_view = (_find_corners(path, board) for path in (left_path, right_path))
+        left_view, right_view = (find_corners(path, board) for path in (left_path, right_path))
         on_progress(done)
         if left_view is None or right_view is None:
             logger.warning('%s, %s: the board is not seen whole', left_path, right_path.name)
@@ -133,28 +131,6 @@ def _find_boards(
             'corners, or take more images'
         )
     return views
-
-
-def _find_corners(
-    path: Path, board: tuple[int, int]
-) -> tuple[NDArray[np.float32], tuple[int, int]] | None:
-    try:
-        image = read_grey(path)
-    except CorruptImageError as error:
-        logger.warning('%s', error)
-        return None
-    if image.dtype != np.uint8:
-        image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
-    found, corners = cv2.findChessboardCorners(image, board)
-    if not found:
-        return None
-    corners = corners.reshape(-1, 1, 2).astype(np.float32)
-    # The window stays within the squares, or it would catch the next corner.
-    grid = corners.reshape(board[1], board[0], 2)
-    spacing_px = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min())
-    half = int(np.clip(spacing_px / 3, 2, 11))
-    cv2.cornerSubPix(image, corners, (half, half), (-1, -1), SUBPIX_END)
-    return corners, (image.shape[1], image.shape[0])
 
 
 def _solve(

@@ -45,7 +45,10 @@ def decode_compressed(data: bytes) -> Grey:
     """
     _check_complete(data)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise CorruptImageError('the image cannot be decoded')
     if image.dtype not in (np.uint8, np.uint16):
@@ -135,7 +138,8 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
 def _check_complete(data: bytes) -> None:
     if not data:
         raise CorruptImageError('the image is empty')
-    if data.startswith(JPEG_START) and JPEG_END not in data[-64:]:
+    # Cameras pad their JPEGs with zeros.
+    if data.startswith(JPEG_START) and JPEG_END not in data.rstrip(b'\0')[-64:]:
         raise CorruptImageError('the JPEG is truncated')
     if data.startswith(PNG_SIGNATURE):
         _check_png(data)

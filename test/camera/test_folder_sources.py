@@ -201,7 +201,7 @@ def test_truncated_images_are_skipped_with_a_warning_and_counted(
     assert indices == [i for i in range(4) if i != broken]
     assert source.skipped_frames == 1
     assert f'frame {broken} is skipped: ' in caplog.text
-    assert f'{broken:06d}.png: the PNG is truncated' in caplog.text
+    assert caplog.text.count(f'{broken:06d}.png: the PNG is truncated') == 1
 
 
 def test_a_stamp_that_comes_twice_is_skipped(tmp_path: Path) -> None:

@@ -122,6 +122,11 @@ def test_truncated_images_are_refused(suffix: str) -> None:
             decode_compressed(data[: int(part * len(data))])
 
 
+def test_zeros_after_a_jpeg_are_padding() -> None:
+    data = encoded('.jpg', picture())
+    np.testing.assert_array_equal(decode_compressed(data + bytes(5000)), decode_compressed(data))
+
+
 def test_damaged_png_is_refused() -> None:
     data = bytearray(encoded('.png', picture()))
     data[len(data) // 2] ^= 0xFF

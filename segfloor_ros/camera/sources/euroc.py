@@ -65,7 +65,7 @@ def _read_index(camera: Path) -> list[Stamped[Path]]:
         return [Stamped(int(path.stem), path) for path in images]
     present = {path.name for path in images_in(camera / 'data')}
     entries: list[Stamped[Path]] = []
-    for number, line in enumerate(index.read_text().splitlines(), 1):
+    for number, line in enumerate(index.read_text(errors='replace').splitlines(), 1):
         if not line.strip() or line.startswith('#'):
             continue
         entry = _entry(camera, line, f'{index}, line {number}')

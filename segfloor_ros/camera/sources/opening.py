@@ -28,6 +28,15 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
     """
     if not settings.input:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
+    try:
+        return _open(settings)
+    except OSError as error:
+        raise InputError(
+            f'{error.filename or settings.input}: cannot be read ({error.strerror})'
+        ) from None
+
+
+def _open(settings: StereoCameraSettings) -> StereoSource:
     path = Path(settings.input).expanduser()
     if is_device(settings.input) and not path.is_dir():
         return open_device(settings.input, settings)

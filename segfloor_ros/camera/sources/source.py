@@ -69,6 +69,7 @@ class StereoSource(ABC):
         self.frame_count = frame_count
         self.rate_hz = rate_hz
         self.skipped_frames = 0
+        self._warned_of: set[int] = set()
         self._eight_bit = EightBitScale(bit_depth)
         self._check_first_pair()
 
@@ -121,4 +122,6 @@ class StereoSource(ABC):
 
     def _skip(self, index: int, reason: str) -> None:
         self.skipped_frames += 1
-        logger.warning('%s: frame %d is skipped: %s', self.name, index, reason)
+        if index not in self._warned_of:  # recordings are read more than once
+            self._warned_of.add(index)
+            logger.warning('%s: frame %d is skipped: %s', self.name, index, reason)

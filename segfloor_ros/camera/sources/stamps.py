@@ -18,7 +18,7 @@ def read_times(path: Path) -> list[int]:
     Raises InputError naming the line where one is no number or earlier than the one before.
     """
     stamps: list[int] = []
-    for number, line in enumerate(path.read_text().split('\n'), 1):
+    for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
         if not line.strip():
             continue
         try:
