@@ -59,6 +59,7 @@ setup(
             'pytest',
             'pytest-timeout',
             'ruff',
+            "scipy-stubs; python_version >= '3.11'",
             'setuptools<80',
             'types-PyYAML',
         ],

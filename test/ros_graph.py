@@ -63,6 +63,10 @@ class Graph:
         """Return the statuses of a node about frames and keyframes."""
         return [s for s in self.statuses if s.node == node and not s.kind]
 
+    def reports_any(self, node: str) -> bool:
+        """Whether a node has given any sign of life."""
+        return any(status.node == node for status in self.statuses)
+
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service and return its response."""
         client = self.tester.create_client(kind, name)

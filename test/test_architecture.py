@@ -1,0 +1,101 @@
+"""The import rules of the package, read from the source."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / 'segfloor_ros'
+MODULES = sorted(PACKAGE.rglob('*.py'))
+ROS_FREE_ROOMS = ('camera', 'slam', 'floor', 'cloud', 'grid', 'evaluation', 'simulation')
+ROS = {
+    'rclpy', 'rcl_interfaces', 'tf2_ros', 'launch', 'launch_ros', 'ament_index_python', 'cv_bridge',
+    'rosbag2_py', 'message_filters', 'builtin_interfaces',
+}  # fmt: skip
+# What belongs to one room or to a command only; the others must do without it.
+ONLY_IN = {
+    'typer': ('cli',),
+    'rich': ('cli',),
+    'mujoco': ('simulation',),
+    'rosbags': ('camera', 'cli'),
+    'evo': ('evaluation',),
+    'matplotlib': ('evaluation', 'cli'),
+}
+FLOW = ('camera', 'slam', 'floor', 'cloud', 'grid')
+"""Data flows one way: a stage may know the data of the stages before it, not of those behind it."""
+
+
+def is_ros(name: str) -> bool:
+    top = name.split('.')[0]
+    return top in ROS or top.endswith(('_msgs', '_srvs'))
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: relative import'
+            assert node.module is not None
+            yield node.module
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 else ''
+
+
+def rooms_imported(path: Path) -> set[str]:
+    names = (name.split('.') for name in imports_of(path))
+    return {name[1] for name in names if name[0] == 'segfloor_ros' and len(name) > 1}
+
+
+@pytest.mark.parametrize('path', MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_a_module_keeps_to_the_rules(path) -> None:
+    room, names = room_of(path), set(imports_of(path))
+    if room not in ('messages', 'nodes', 'cli'):
+        assert not {name for name in names if is_ros(name)}, 'ROS outside of messages, nodes, cli'
+    if room != 'nodes':
+        assert 'nodes' not in rooms_imported(path)
+    if room != 'cli':
+        assert 'cli' not in rooms_imported(path)
+    if room in ROS_FREE_ROOMS:
+        assert 'messages' not in rooms_imported(path)
+        assert 'pipeline' not in rooms_imported(path)
+    for package, rooms in ONLY_IN.items():
+        if any(name.split('.')[0] == package for name in names):
+            assert room in rooms, f'{package} is for {rooms}'
+
+
+@pytest.mark.parametrize('room', FLOW)
+def test_a_stage_knows_nothing_of_the_stages_behind_it(room) -> None:
+    behind = set(FLOW[FLOW.index(room) + 1 :])
+    for path in MODULES:
+        if room_of(path) == room:
+            assert not rooms_imported(path) & behind, path.relative_to(PACKAGE)
+
+
+def test_ros_in_the_commands_is_for_the_replay_alone() -> None:
+    for path in MODULES:
+        if room_of(path) == 'cli' and not path.stem.startswith('replay_'):
+            ros = {name for name in imports_of(path) if is_ros(name)}
+            assert not ros, path.relative_to(PACKAGE)
+
+
+def test_every_room_is_a_package_with_a_purpose() -> None:
+    for path in PACKAGE.rglob('__init__.py'):
+        assert ast.get_docstring(ast.parse(path.read_text())), path
+
+
+def test_the_rules_catch_what_they_are_for(tmp_path) -> None:
+    module = tmp_path / 'module.py'
+    module.write_text('import sensor_msgs.msg\nfrom rclpy.node import Node\nimport numpy\n')
+    assert {name for name in imports_of(module) if is_ros(name)} == {
+        'sensor_msgs.msg',
+        'rclpy.node',
+        'rclpy.node.Node',
+    }

@@ -1,0 +1,169 @@
+"""The package as colcon and pip see it: description, and a real build in a scratch workspace."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import importlib.util
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
+                 'python3-yaml': 'yaml'}  # fmt: skip
+OF_EXTRAS = {'typer', 'rich', 'rosbags', 'evo', 'matplotlib', 'mujoco'}
+START_S = 60.0
+
+
+def manifest() -> ET.Element:
+    return ET.parse(REPOSITORY / 'package.xml').getroot()
+
+
+def test_the_manifest_is_of_format_3_and_says_ament_python() -> None:
+    root = manifest()
+    assert root.attrib['format'] == '3'
+    assert root.findtext('name') == 'segfloor_ros'
+    assert root.findtext('license') == 'Apache-2.0'
+    assert root.findtext('export/build_type') == 'ament_python'
+    order = [child.tag for child in root]
+    schema = ['name', 'version', 'description', 'maintainer', 'license', 'exec_depend',
+              'test_depend', 'export']  # fmt: skip
+    assert list(dict.fromkeys(order)) == schema
+    assert (REPOSITORY / 'resource' / 'segfloor_ros').exists()
+
+
+def test_one_version_everywhere() -> None:
+    from segfloor_ros import __version__
+
+    assert manifest().findtext('version') == __version__
+
+
+def test_everything_imported_is_declared() -> None:
+    keys = {element.text for element in manifest() if element.tag.endswith('depend')}
+    declared = {IMPORT_OF_KEY.get(key or '', key) for key in keys}
+    used = set()
+    for path in (REPOSITORY / 'segfloor_ros').rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                used |= {alias.name.split('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                used.add(node.module.split('.')[0])
+    foreign = used - set(sys.stdlib_module_names) - {'segfloor_ros'}
+    assert foreign - declared - OF_EXTRAS == set()
+
+
+def test_constraints_pin_every_requirement_exactly() -> None:
+    lines = (REPOSITORY / 'constraints.txt').read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith('#')]
+    assert all(re.fullmatch(r'[a-z0-9.-]+==[\w.]+(; python_version .+)?', pin) for pin in pins)
+    pinned = {pin.partition('==')[0] for pin in pins}
+    setup = ast.parse((REPOSITORY / 'setup.py').read_text())
+    given = {
+        keyword.arg: ast.literal_eval(keyword.value)
+        for node in ast.walk(setup)
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg in ('install_requires', 'extras_require')
+    }
+    requirements = [*given['install_requires'], *sum(given['extras_require'].values(), [])]
+    wanted = {re.split(r'[\[<>=;]', requirement)[0].lower() for requirement in requirements}
+    assert {'numpy', 'ros-jazzy-rclpy', 'typer', 'mujoco', 'ruff'} <= wanted
+    assert wanted <= pinned
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory) -> Path:
+    """A colcon workspace with a copy of the package, built and installed."""
+    if shutil.which('colcon', path=os.pathsep.join([_scripts(), os.environ['PATH']])) is None:
+        pytest.skip('colcon is not installed')
+    setuptools = int(importlib.metadata.version('setuptools').split('.')[0])
+    if setuptools >= 80:
+        pytest.skip('colcon needs setuptools < 80')
+    workspace = tmp_path_factory.mktemp('workspace')
+    ignored = shutil.ignore_patterns('.*', '__pycache__', 'build', 'install', 'log', '*.egg-info')
+    shutil.copytree(REPOSITORY, workspace / 'src' / 'segfloor_ros', ignore=ignored)
+    colcon = ['colcon', '--log-base', 'log', 'build', '--event-handlers', 'console_direct+']
+    built = subprocess.run(
+        colcon, cwd=workspace, env=_environment(), capture_output=True, text=True, timeout=240
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return workspace
+
+
+def installed(workspace: Path, command: str, **environment: str) -> subprocess.Popen[str]:
+    """Start a command in a shell that has sourced the workspace, away from the sources."""
+    script = f'. {workspace}/install/setup.sh && exec {command}'
+    return subprocess.Popen(
+        ['sh', '-c', script],
+        cwd=workspace / 'install',
+        env={**_environment(), **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_the_install_has_what_ros_looks_for(workspace) -> None:
+    prefix = workspace / 'install' / 'segfloor_ros'
+    for node in (*NODES, 'segfloor'):
+        assert os.access(prefix / 'lib' / 'segfloor_ros' / node, os.X_OK), node
+    share = prefix / 'share'
+    assert (share / 'ament_index' / 'resource_index' / 'packages' / 'segfloor_ros').exists()
+    assert (share / 'segfloor_ros' / 'package.xml').exists()
+    for folder, pattern in (('launch_configs', '*.launch.py'), ('params', '*.yaml')):
+        names = {path.name for path in (REPOSITORY / folder).glob(pattern)}
+        assert {path.name for path in (share / 'segfloor_ros' / folder).iterdir()} == names
+    assert os.access(prefix / 'bin' / 'segfloor', os.X_OK)
+
+
+def test_the_installed_command_runs_from_the_install(workspace) -> None:
+    out, errors = installed(workspace, 'segfloor --help').communicate(timeout=START_S)
+    assert 'replay' in out, errors
+    where = 'python -c "import segfloor_ros; print(segfloor_ros.__file__)"'
+    out, errors = installed(workspace, where).communicate(timeout=START_S)
+    assert str(workspace / 'install') in out, errors
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
+@pytest.mark.parametrize('node', NODES[1:])
+def test_an_installed_node_starts_and_stops_on_interrupt(workspace, make_graph, node) -> None:
+    graph = make_graph()
+    path = workspace / 'install' / 'segfloor_ros' / 'lib' / 'segfloor_ros' / node
+    process = installed(workspace, str(path), ROS_DOMAIN_ID=os.environ['ROS_DOMAIN_ID'])
+    try:
+        graph.until(lambda: graph.reports_any(node) or process.poll() is not None, node)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=START_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+
+
+@pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
+def test_an_installed_camera_without_input_says_so(workspace) -> None:
+    path = workspace / 'install' / 'segfloor_ros' / 'lib' / 'segfloor_ros' / 'stereo_camera'
+    process = installed(workspace, str(path))
+    _, errors = process.communicate(timeout=START_S)
+    assert process.returncode == 2
+    assert 'stereo_camera.input is empty' in errors
+
+
+def _scripts() -> str:
+    return str(Path(sys.executable).parent)
+
+
+def _environment() -> dict[str, str]:
+    """The environment with this interpreter's scripts first, and without the sources."""
+    environment = dict(os.environ)
+    environment['PATH'] = os.pathsep.join([_scripts(), environment['PATH']])
+    environment.pop('PYTHONPATH', None)
+    return environment
