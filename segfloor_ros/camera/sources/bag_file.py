@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from segfloor_ros.errors import InputError
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
+REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
 MISSING_LIBRARY = (
     'bags are read and written by the package rosbags; install it with pip install '
     "'segfloor_ros[cli]'"
@@ -81,9 +82,10 @@ def _read_errors(path: Path) -> Iterator[None]:
         yield
     except Exception as error:  # damaged bytes make the library fail in any way, anywhere
         reason = ' '.join(str(error).split()) or type(error).__name__
+        repair = REPAIRS.get(path.suffix, 'ros2 bag reindex')
         raise InputError(
             f'{path}: cannot read the bag ({reason}); if its recording was interrupted, repair it '
-            'with ros2 bag reindex'
+            f'with {repair}'
         ) from error
 
 
