@@ -1,0 +1,171 @@
+"""The map of small worlds that change, leak and hold thin things."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from conftest import Drive, World, cells_at, centres, no_points
+
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.grid.settings import OccupancyGridSettings
+
+MakeDrive = Callable[..., Drive]
+ROOM = World(walls=((4, -3, 4, 3), (-1, 2, 4, 2), (-1, -2, 4, -2)))
+AHEAD = [(0.02 * i, 0.0, 0.0) for i in range(100)]
+
+
+def with_disc(world: World, *disc: float) -> World:
+    return World((*world.discs, disc), world.walls)  # type: ignore[arg-type]
+
+
+def test_a_room_is_free_inside_and_its_wall_occupied(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    for pose in AHEAD[:60:4]:
+        drive.look(ROOM, pose)
+    grid = drive.grid()
+    assert (cells_at(grid, centres((1.4, 3.8), (-0.6, 0.6))) == 0).all()
+    assert (cells_at(grid, centres((4.1, 6.0), (-2.0, 2.0))) == -1).all()
+    wall = cells_at(grid, centres((4.0, 4.05), (-1.0, 1.0)))
+    assert len(wall) == 40
+    assert (wall == 100).all()
+
+
+def test_a_person_walking_through_leaves_no_ghost(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    here = (0.0, 0.0, 0.0)
+    for _ in range(5):
+        drive.look(ROOM, here)
+    for k in range(14):  # from right to left at 0.5 m a keyframe and less
+        drive.look(with_disc(ROOM, 2.0, -1.6 + 0.25 * k, 0.2), here)
+    for _ in range(10):
+        drive.look(ROOM, here)
+    area = centres((1.5, 3.3), (-1.2, 1.2))
+    assert (cells_at(drive.grid(), area) == 0).all()
+
+
+def test_a_person_who_stands_is_in_the_map_until_gone(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    person = with_disc(ROOM, 2.0, 0.0, 0.2)
+    for _ in range(100):
+        drive.look(person, (0.0, 0.0, 0.0))
+    face = np.array([[1.825, 0.0], [1.825, 0.04]])
+    assert (cells_at(drive.grid(), face) == 100).all()
+    assert (cells_at(drive.grid(), centres((2.3, 3.5), (-0.1, 0.1))) == -1).all()
+    # However long they stood there, ten or so looks at the floor behind clear it.
+    for _ in range(12):
+        drive.look(ROOM, (0.0, 0.0, 0.0))
+    assert (cells_at(drive.grid(), centres((1.5, 3.5), (-0.3, 0.3))) == 0).all()
+
+
+def test_what_has_come_is_marked_after_a_few_looks(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    for _ in range(100):
+        drive.look(ROOM, (0.0, 0.0, 0.0))
+    for _ in range(5):
+        drive.look(with_disc(ROOM, 2.0, 0.0, 0.2), (0.0, 0.0, 0.0))
+    assert cells_at(drive.grid(), np.array([[1.825, 0.0]])) == 100
+
+
+@pytest.mark.parametrize('miss_share', [0.0, 0.3])
+def test_a_chair_leg_stays(make_drive: MakeDrive, miss_share: float) -> None:
+    leg = with_disc(ROOM, 3.02, 0.41, 0.015)
+    drive = make_drive(OccupancyGridSettings(), miss_share=miss_share)
+    for pose in AHEAD:
+        drive.look(leg, pose)
+    near = cells_at(drive.grid(), centres((2.95, 3.10), (0.35, 0.50)))
+    assert (near == 100).any()
+    assert (near == 100).sum() <= 4
+
+
+def test_a_leg_is_not_cleared_from_where_it_cannot_be_seen(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    leg = with_disc(World(walls=((7, -3, 7, 3),)), 3.02, 0.01, 0.015)
+    for _ in range(10):
+        drive.look(leg, (1.0, 0.0, 0.0))
+    drive.miss_share = 0.0
+    without = World(walls=leg.walls)
+    for k in range(40):  # 4.5 m away: too far to place a thing of 3 cm
+        drive.look(without, (-1.5, 0.0, 0.001 * k))
+    assert (cells_at(drive.grid(), centres((2.95, 3.15), (-0.1, 0.1))) == 100).any()
+
+
+@pytest.mark.parametrize('thickness_m', [0.04, 0.001])
+def test_a_door_leaf_stays_whole(make_drive: MakeDrive, thickness_m: float) -> None:
+    along = np.array([0.7, 0.6])
+    across = thickness_m * np.array([-0.6, 0.7]) / math.hypot(0.6, 0.7)
+    corners = [np.array([2.5, 0.3]), np.array([2.5, 0.3]) + along]
+    corners += [corners[1] - across, corners[0] - across]
+    leaf = [(*a, *b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+    drive = make_drive(OccupancyGridSettings())
+    for pose in AHEAD:
+        drive.look(World(walls=(*ROOM.walls, *leaf)), pose)
+    middle = np.linspace(0.05, 0.95, 20)[:, None] * along + corners[0] - across / 2
+    normal = np.array([-0.6, 0.7]) / math.hypot(0.6, 0.7)
+    grid = drive.grid()
+    crossing = [cells_at(grid, middle + s * normal) for s in np.arange(-0.1, 0.1, 0.01)]
+    # Between two cells that touch at a corner a line may slip through.
+    assert (np.max(crossing, axis=0) == 100).mean() >= 0.85
+
+
+def test_a_thin_leg_stays_while_the_base_circles_around_it(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    leg = with_disc(World(), 0.012, 0.021, 0.012)
+    for angle in np.linspace(0, 6 * math.pi, 150):
+        x, y = 1.5 * math.cos(angle), 1.5 * math.sin(angle)
+        drive.look(leg, (x, y, angle + math.pi + 0.1 * math.sin(7 * angle)))
+    near = cells_at(drive.grid(), centres((-0.1, 0.1), (-0.1, 0.1)))
+    assert (near == 100).any()
+
+
+def test_leaks_open_no_way_through_a_wall(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings(), leak_share=0.1)
+    for pose in AHEAD:
+        drive.look(ROOM, pose)
+    behind = cells_at(drive.grid(), centres((4.15, 6.0), (-2.0, 2.0)))
+    assert (behind == 0).mean() < 0.002
+    assert (cells_at(drive.grid(), centres((2.5, 3.8), (-0.6, 0.6))) == 0).mean() > 0.99
+
+
+def point_cloud(xyz: list[tuple[float, float, float]], label: int) -> LabelledPoints:
+    count = len(xyz)
+    return LabelledPoints(
+        np.arange(count, dtype=np.int32),
+        np.array(xyz, np.float32).reshape(-1, 3),
+        np.full(count, label, np.uint8),
+        np.ones(count, np.float32),
+    )
+
+
+def test_a_table_top_over_free_floor_is_occupied(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    edge = point_cloud([(2.02, 0.02, 0.7)], OBSTACLE)
+    for k in range(20):
+        drive.look(ROOM, (0.0, 0.0, 0.0), edge if k % 2 else no_points())
+    assert (cells_at(drive.grid(), centres((2.0, 2.1), (0.0, 0.05))) == 100).any()
+
+
+def test_one_outlier_marks_nothing(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.02, 0.02, 0.5)], OBSTACLE))
+    assert (drive.grid().cells != 100).all()
+
+
+def test_rays_to_floor_points_free_their_cells(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings(use_scan=False, footprint_radius_m=0.0))
+    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.0, 0.0), (0.0, 1.0, 0.0)], FLOOR))
+    grid = drive.grid()
+    assert (cells_at(grid, np.array([[0.5, 0.0], [1.5, 0.0], [0.0, 0.5]])) == 0).all()
+    assert (cells_at(grid, np.array([[2.2, 0.0], [1.0, 1.0], [0.0, 1.2], [0.0, -0.5]])) == -1).all()
+
+
+def test_the_base_has_driven_over_free_floor(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings(footprint_radius_m=0.2, use_scan=False))
+    drive.look(World(), (0.0, 0.0, 0.0))
+    drive.look(World(), (1.0, 0.0, 0.0))
+    grid = drive.grid()
+    assert (cells_at(grid, centres((0.0, 1.0), (-0.1, 0.1))) == 0).all()
+    beyond = np.concatenate([centres((0.0, 1.0), (0.25, 0.4)), centres((1.3, 1.5), (-0.1, 0.1))])
+    assert (cells_at(grid, beyond) == -1).all()
