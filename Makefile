@@ -23,8 +23,7 @@ $(VENV)/bin/python:
 	exit 1
 
 $(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt \
-	  pip setuptools wheel
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip setuptools
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt \
 	  --no-build-isolation -e '.[ros,cli,sim,dev]'
 	@touch $@

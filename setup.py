@@ -53,6 +53,8 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'cli': ['typer>=0.12', 'rich>=13', 'rosbags>=0.10', 'evo>=1.28', 'matplotlib>=3.6'],
         'sim': ['mujoco>=3.1'],
+        # colcon takes the tests to be pytest's by this name.
+        'test': ['pytest', 'pytest-timeout'],
         'dev': [
             'colcon-common-extensions',
             'mypy',
@@ -64,7 +66,6 @@ setup(
             'types-PyYAML',
         ],
     },
-    tests_require=['pytest'],
     entry_points={
         'console_scripts': [
             'segfloor = segfloor_ros.cli.main:main',

@@ -115,7 +115,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         assert self._chain_pace is not None
         namespace = self.get_namespace().rstrip('/')
         for status in statuses(message):
-            if status.name.startswith(f'{namespace}/') and not status.kind:
+            if status.name == f'{namespace}/{status.node}':
                 note_status(self._chain_pace, status)
         self._advance()
 
