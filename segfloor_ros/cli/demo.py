@@ -14,6 +14,7 @@ from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.evaluation.map_score import compare, score_map
 from segfloor_ros.evaluation.overlay import save_overlay
+from segfloor_ros.evaluation.report import write_report
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.grid.map_file import load_map
@@ -48,7 +49,7 @@ def demo(
 
 
 def _print_scores(out: Path) -> None:
-    """Print how good map and path are; the last line is the path of the picture."""
+    """Print how good map and path are; the last line is the path of the report."""
     truth = load_truth(DRIVE)
     pose = truth.start_pose or (0.0, 0.0, 0.0)
     grid = load_map(out / 'map.yaml')
@@ -59,6 +60,6 @@ def _print_scores(out: Path) -> None:
         f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)',
         highlight=False,
     )
-    overlay = out / 'overlay.png'
-    save_overlay(compare(grid, truth, pose), overlay)
-    console.print(str(overlay), highlight=False, soft_wrap=True)
+    save_overlay(compare(grid, truth, pose), out / 'overlay.png')
+    console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
+    console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)

@@ -19,6 +19,7 @@ from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, MapScore, compare
 from segfloor_ros.evaluation.overlay import save_overlay
 from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
 from segfloor_ros.evaluation.raster import from_frame
+from segfloor_ros.evaluation.report import write_report
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
 from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
@@ -143,6 +144,17 @@ def evaluate_floor(
     table.add_row('masks scored', str(score.masks), '')
     table.add_row('true masks without an estimate', str(score.missing), '')
     Console().print(table)
+
+
+@app.command('report')
+def evaluate_report(
+    run: Annotated[Path, typer.Argument(metavar='RUN', help='Results folder of a run.')],
+    truth: Annotated[
+        Path | None, typer.Option(help='Scene folder or map.yaml to score against.')
+    ] = None,
+) -> None:
+    """Write report.html, one page with all pictures of a run, into its folder."""
+    typer.echo(f'report: {write_report(run, truth)}')
 
 
 def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> Pose2d:

@@ -1,5 +1,7 @@
 """`segfloor demo` and `segfloor simulate` as a user runs them."""
 
+import base64
+import re
 from pathlib import Path
 
 import cv2
@@ -45,9 +47,17 @@ def test_the_demo_drive_is_small_and_complete():
 
 def test_demo_maps_and_scores(tmp_path):
     output = run('demo', '--lockstep', '--out', tmp_path / 'demo').split('\n')
-    picture = Path(output[-2])
-    assert picture == tmp_path / 'demo' / 'overlay.png'
-    assert cv2.imread(str(picture)).shape[2] == 3
+    assert Path(output[-2]) == tmp_path / 'demo' / 'report.html'
+    assert cv2.imread(str(tmp_path / 'demo' / 'overlay.png')).shape[2] == 3
+    page = (tmp_path / 'demo' / 'report.html').read_text()
+    assert set(re.findall(r'(?:src|href)="([a-z]+:)', page)) == {'data:'}
+    for heading in ('Against the truth', 'Map', 'Keyframes', 'Floor profile', 'Time per stage'):
+        assert f'<h2>{heading}</h2>' in page
+    # Map, overlay, cloud, v-disparity and six keyframes, each a whole picture.
+    pictures = re.findall(r'src="data:image/\w+;base64,([^"]+)"', page)
+    sizes = [cv2.imdecode(np.frombuffer(base64.b64decode(p), np.uint8), 1).shape for p in pictures]
+    assert len(sizes) == 10
+    assert min(min(height, width) for height, width, _ in sizes) > 200
     path = next(line for line in output if line.startswith('path: '))
     assert '7.8 m, 100.0 % of the frames tracked' in path
     free = next(line for line in output if 'free cells' in line).split('│')

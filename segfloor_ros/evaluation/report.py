@@ -1,0 +1,193 @@
+"""The report of a run: one HTML page with everything in it, readable without a network."""
+
+from __future__ import annotations
+
+import base64
+import html
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.map_score import MapScore, compare, score_map
+from segfloor_ros.evaluation.overlay import draw_overlay
+from segfloor_ros.evaluation.report_data import ReportData, read_run
+from segfloor_ros.evaluation.report_pictures import (
+    cloud_picture,
+    map_picture,
+    strip_pictures,
+    v_disparity_picture,
+)
+from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+
+REPORT_NAME = 'report.html'
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 1180px; padding: 24px;
+       color: #1d2430; background: #fafbfc; }
+h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 34px 0 10px; }
+p.sub { color: #5a6675; margin: 0 0 18px; }
+.facts { display: flex; flex-wrap: wrap; gap: 12px; }
+.fact { background: #fff; border: 1px solid #e1e6ec; border-radius: 8px; padding: 10px 16px; }
+.fact b { display: block; font-size: 21px; } .fact span { color: #5a6675; font-size: 13px; }
+.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 16px; }
+.strip { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 10px; }
+figure { margin: 0; background: #fff; border: 1px solid #e1e6ec; border-radius: 8px;
+         padding: 10px; }
+figure img { width: 100%; display: block; } figcaption { color: #5a6675; font-size: 13px;
+         padding-top: 6px; }
+table { border-collapse: collapse; background: #fff; width: 100%; }
+td, th { border-bottom: 1px solid #e1e6ec; padding: 5px 10px; text-align: right; }
+td:first-child, th:first-child { text-align: left; }
+td.bar { width: 42%; text-align: left; } td.bar div { background: #4a84d4; height: 12px;
+         border-radius: 3px; min-width: 1px; }
+pre { background: #fff; border: 1px solid #e1e6ec; border-radius: 8px; padding: 12px;
+      overflow-x: auto; font-size: 12.5px; }
+"""
+
+
+def write_report(run: Path, truth: Path | None = None) -> Path:
+    """Write report.html into the results folder of a run and return its path.
+
+    truth: a scene folder or a true map to score against. The recording is opened again for the
+    keyframes' images. Raises InputError or MapError naming what is missing.
+    """
+    data = read_run(run, truth)
+    page = _page(data)
+    path = run / REPORT_NAME
+    try:
+        path.write_text(page, encoding='utf-8')
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
+    return path
+
+
+def _page(data: ReportData) -> str:
+    sections = [
+        _facts(data),
+        _maps(data),
+        _keyframes(data),
+        _section('Floor profile', _v_disparity(data)),
+        _section('Time per stage', _stages(data.summary)),
+        _section('Memory', _memory(data.summary)),
+        '<h2>Settings</h2><details><summary>as resolved</summary>'
+        f'<pre>{html.escape(data.settings_text)}</pre></details>',
+    ]
+    title = html.escape(f'Segfloor: {data.name}')
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<title>{title}</title><style>{STYLE}</style></head><body>'
+        f'<h1>{title}</h1><p class="sub">An occupancy map from a stereo camera</p>'
+        f'{"".join(sections)}</body></html>\n'
+    )
+
+
+def _facts(data: ReportData) -> str:
+    summary = data.summary
+    tracked = 100 * summary['tracked_frames'] / max(1, summary['frames'])
+    facts = [
+        (f'{summary["frames"]}', 'frames'),
+        (f'{tracked:.1f} %', 'of them tracked'),
+        (f'{summary["keyframes"]}', 'keyframes'),
+        (f'{summary["map_updates"]}', 'map updates'),
+        (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
+        (f'{100 * summary["camera_height_m"]:.1f} cm', 'camera above the floor'),
+    ]
+    return f'<div class="facts">{"".join(_fact(*fact) for fact in facts)}</div>' + _scores(data)
+
+
+def _scores(data: ReportData) -> str:
+    """Return the scores against the truth, where there is one."""
+    if data.truth is None:
+        return ''
+    pose = data.truth.start_pose or (0.0, 0.0, 0.0)
+    facts = _map_facts(score_map(data.grid, data.truth, pose))
+    if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
+        path = score_trajectory(match_files(data.folder, data.truth_folder))
+        facts.append(
+            (f'{100 * path.ate_rmse_m:.1f} cm', f'path error over {path.path_length_m:.1f} m')
+        )
+    return (
+        '<h2>Against the truth</h2>'
+        f'<div class="facts">{"".join(_fact(*fact) for fact in facts)}</div>'
+    )
+
+
+def _map_facts(score: MapScore) -> list[tuple[str, str]]:
+    return [
+        (f'{100 * score.opened.precision.mean:.1f} %', 'road-map precision'),
+        (f'{100 * score.opened.recall.mean:.1f} %', 'road-map recall'),
+        (f'{100 * score.cells.free_precision:.1f} %', 'free cells right'),
+        (f'{100 * score.cells.free_recall:.1f} %', 'floor found'),
+    ]
+
+
+def _maps(data: ReportData) -> str:
+    figures = [_figure(map_picture(data), 'Map with the path of the robot')]
+    if data.truth is not None:
+        pose = data.truth.start_pose or (0.0, 0.0, 0.0)
+        overlay = draw_overlay(compare(data.grid, data.truth, pose))
+        png = bytes(cv2.imencode('.png', overlay)[1])
+        figures.append(_figure(png, 'Map laid on the true one'))
+    figures.append(_figure(cloud_picture(data), 'Labelled cloud from above: floor in green'))
+    return f'<h2>Map</h2><div class="row">{"".join(figures)}</div>'
+
+
+def _keyframes(data: ReportData) -> str:
+    figures = [_figure(picture, name, 'jpeg') for name, picture in strip_pictures(data)]
+    if not figures:
+        return ''
+    return (
+        '<h2>Keyframes</h2><p class="sub">green: floor; yellow: no evidence</p>'
+        f'<div class="strip">{"".join(figures)}</div>'
+    )
+
+
+def _v_disparity(data: ReportData) -> str:
+    picture = v_disparity_picture(data)
+    caption = 'Pixels per image row and disparity; the line is the fitted floor'
+    return _figure(picture, caption) if picture is not None else ''
+
+
+def _stages(summary: dict[str, Any]) -> str:
+    longest = max([stage['p95_ms'] for stage in summary['stages'].values()] or [1.0])
+    rows = ''.join(
+        f'<tr><td>{html.escape(name)}</td><td>{stage["count"]}</td><td>{stage["p50_ms"]:.1f}</td>'
+        f'<td>{stage["p95_ms"]:.1f}</td><td>{stage["max_ms"]:.1f}</td><td class="bar">'
+        f'<div style="width:{100 * stage["p50_ms"] / longest:.1f}%"></div></td></tr>'
+        for name, stage in summary['stages'].items()
+    )
+    names = ('stage', 'calls', 'median ms', 'p95 ms', 'max ms', '')
+    head = '<tr>' + ''.join(f'<th>{name}</th>' for name in names) + '</tr>'
+    return f'<table>{head}{rows}</table>' if rows else ''
+
+
+def _memory(summary: dict[str, Any]) -> str:
+    memory = summary.get('rss_mb', {})
+    words = (
+        ('start', 'MB at the start'),
+        ('peak', 'MB at most'),
+        ('slope_per_update', 'MB more per map update'),
+    )
+    facts = [_fact(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
+    return f'<div class="facts">{"".join(facts)}</div>' if facts else ''
+
+
+def _section(title: str, content: str) -> str:
+    return f'<h2>{title}</h2>{content}' if content else ''
+
+
+def _fact(value: str, what: str) -> str:
+    return f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
+
+
+def _figure(picture: bytes, caption: str, kind: str = 'png') -> str:
+    data = base64.b64encode(picture).decode()
+    text = html.escape(caption)
+    return (
+        f'<figure><img alt="{text}" src="data:image/{kind};base64,{data}">'
+        f'<figcaption>{text}</figcaption></figure>'
+    )

@@ -1,0 +1,125 @@
+"""What a report shows, read back from the results folder of a run and its recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.ply import read_ply
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.evaluation.truth import MapTruth, load_truth
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.occupancy import OccupancyGrid
+
+STRIP_LENGTH = 6
+
+
+@dataclass(frozen=True)
+class MaskedFrame:
+    """A keyframe's rectified pair with the floor mask (H, W) uint8 that was found in it."""
+
+    frame: StereoFrame
+    mask: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """A run as its files tell it. trajectory, keyframes: base poses (N, 4, 4) in `map`. strip:
+    keyframes evenly over the drive. settings_text: settings.yaml as it is. truth: None where
+    nobody knows it.
+    """
+
+    folder: Path
+    name: str
+    summary: dict[str, Any]
+    settings_text: str
+    floor_settings: FloorSegmentationSettings
+    camera: StereoCamera
+    mount: Mount
+    grid: OccupancyGrid
+    trajectory: Array
+    keyframes: Array
+    cloud: LabelledPoints
+    strip: list[MaskedFrame]
+    truth: MapTruth | None
+    truth_folder: Path | None
+
+
+def read_run(folder: Path, truth: Path | None = None) -> ReportData:
+    """Read a results folder, its recording and, where given, the truth.
+
+    Raises InputError or MapError naming the file that is missing or malformed.
+    """
+    summary = _read_summary(folder / 'summary.json')
+    settings_text = _read_text(folder / 'settings.yaml')
+    parameters = {
+        name: node['ros__parameters'] for name, node in yaml.safe_load(settings_text).items()
+    }
+    source = open_source(StereoCameraSettings.from_mapping(parameters['stereo_camera']))
+    return ReportData(
+        folder=folder,
+        name=Path(source.name).name,
+        summary=summary,
+        settings_text=settings_text,
+        floor_settings=FloorSegmentationSettings.from_mapping(parameters['floor_segmentation']),
+        camera=source.camera,
+        mount=Mount(
+            summary['camera_height_m'],
+            summary['camera_pitch_rad'],
+            summary.get('camera_roll_rad', 0.0),
+        ),
+        grid=load_map(folder / 'map.yaml'),
+        trajectory=read_trajectory(folder / 'trajectory.txt')[1],
+        keyframes=read_trajectory(folder / 'keyframes.txt')[1],
+        cloud=read_ply(folder / 'labelled_cloud.ply'),
+        strip=_masked_frames(folder / 'floor_masks', source.frames()),
+        truth=load_truth(truth) if truth is not None else None,
+        truth_folder=truth if truth is not None and truth.is_dir() else None,
+    )
+
+
+def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFrame]:
+    """Return some frames that have a mask, evenly over the drive."""
+    files = sorted(folder.glob('*.png')) if folder.is_dir() else []
+    chosen = np.unique(np.linspace(0, len(files) - 1, STRIP_LENGTH).round().astype(int))
+    wanted = {int(files[i].stem): files[i] for i in chosen} if files else {}
+    strip: list[MaskedFrame] = []
+    for frame in frames:
+        if len(strip) == len(wanted):
+            break
+        if frame.index in wanted:
+            mask = cv2.imread(str(wanted[frame.index]), cv2.IMREAD_GRAYSCALE)
+            strip.append(MaskedFrame(frame, mask.astype(np.uint8)))
+    return strip
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(_read_text(path))
+    except ValueError:
+        raise InputError(f'{path}: not valid JSON') from None
+    if 'stages' not in summary or 'camera_height_m' not in summary:
+        raise InputError(f'{path}: not the summary of a run')
+    return summary
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read ({error.strerror}); is this a run?') from None

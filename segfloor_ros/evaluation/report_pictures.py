@@ -1,0 +1,172 @@
+"""The pictures of a report, as PNG or JPEG bytes."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from segfloor_ros.cloud.labels import FLOOR as FLOOR_POINT
+from segfloor_ros.cloud.labels import OBSTACLE, LabelledPoints
+from segfloor_ros.evaluation.raster import FREE, OCCUPIED, states
+from segfloor_ros.evaluation.report_data import MaskedFrame, ReportData
+from segfloor_ros.floor.histograms import obstacle_rows, u_disparity
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.profile import FloorLine
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.grid.occupancy import OccupancyGrid
+
+FLOOR_TINT, NO_EVIDENCE_TINT = (80, 190, 60), (60, 200, 240)
+STRIP_WIDTH_PX = 480
+FREE_GREY, OCCUPIED_GREY, UNKNOWN_GREY = 1.0, 0.1, 0.8
+MAX_DRAWN_POINTS = 60000
+MARGIN_CELLS = 5
+
+
+def map_picture(data: ReportData) -> bytes:
+    """Draw the map with the path of the base and its keyframes."""
+    figure, axes = _figure(data.grid)
+    _show_grid(axes, data.grid)
+    axes.plot(*data.trajectory[:, :2, 3].T, color='tab:blue', linewidth=1.6, label='path')
+    axes.plot(*data.keyframes[:, :2, 3].T, '.', color='tab:orange', markersize=4, label='keyframes')
+    axes.plot(*data.trajectory[0, :2, 3], 'o', color='tab:green', label='start')
+    axes.legend(loc='upper right', fontsize=8, framealpha=0.9)
+    return _png(figure)
+
+
+def cloud_picture(data: ReportData) -> bytes:
+    """Draw the labelled cloud from above: floor green, obstacles by height."""
+    figure, axes = _figure(data.grid)
+    floor, obstacles = (_some(data.cloud, label) for label in (FLOOR_POINT, OBSTACLE))
+    axes.scatter(floor[:, 0], floor[:, 1], s=1.0, color='#3aa655', label='floor', linewidths=0)
+    drawn = axes.scatter(
+        obstacles[:, 0], obstacles[:, 1], s=1.6, c=obstacles[:, 2], cmap='plasma',
+        vmin=0, vmax=2, linewidths=0, label='obstacle',
+    )  # fmt: skip
+    axes.plot(*data.trajectory[:, :2, 3].T, color='black', linewidth=0.8)
+    figure.colorbar(drawn, ax=axes, label='height [m]', shrink=0.7, pad=0.02)
+    axes.set_facecolor('#f4f4f4')
+    return _png(figure)
+
+
+def strip_pictures(data: ReportData) -> list[tuple[str, bytes]]:
+    """Return keyframes with their floor tinted, each with a caption."""
+    return [(f'frame {item.frame.index}', _tinted(item)) for item in data.strip]
+
+
+def v_disparity_picture(data: ReportData) -> bytes | None:
+    """Draw the v-disparity of a keyframe, all of it and without obstacles, with the floor's spline
+    through it; None where no keyframe was kept.
+    """
+    if not data.strip:
+        return None
+    frame = data.strip[len(data.strip) // 2].frame
+    stage = FloorSegmentation(data.camera, data.floor_settings)
+    floor = stage.process(frame.left, frame.right, data.mount)
+    matched = floor.disparity_px > 0
+    figure = Figure(figsize=(10, 4.4), layout='constrained')
+    FigureCanvasAgg(figure)
+    kept = matched & ~_upright(data, floor.disparity_px)
+    for axes, pixels, title in zip(
+        figure.subplots(1, 2, sharex=True, sharey=True),
+        (matched, kept),
+        ('all disparities', 'obstacles removed, with the floor spline'),
+        strict=True,
+    ):
+        _show_v_disparity(axes, data, floor.disparity_px, pixels)
+        axes.set_title(f'{title} (frame {frame.index})', fontsize=10)
+    axes.plot(floor.profile_px, np.arange(data.camera.height), color='#00e5ff', linewidth=0.7)
+    return _png(figure)
+
+
+def _upright(data: ReportData, disparity_px: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the pixels of columns with many pixels at one disparity: something upright."""
+    camera = data.camera
+    bins = (disparity_px + 0.5).astype(np.intp)
+    number = int(bins.max()) + 1
+    rows_per_m = camera.fy / camera.disparity_times_depth
+    slope = FloorLine.of(camera, data.mount).slope
+    limit = obstacle_rows(
+        np.arange(number), data.floor_settings.obstacle_height_m, rows_per_m, 1 / slope
+    )
+    upright = u_disparity(bins, number) > limit[:, None]
+    return np.asarray(upright[bins, np.arange(camera.width)])
+
+
+def _show_v_disparity(
+    axes: Axes, data: ReportData, disparity_px: NDArray[np.float32], pixels: NDArray[np.bool_]
+) -> None:
+    height, width = disparity_px.shape
+    shear = FloorLine.of(data.camera, data.mount).shear * (np.arange(width) - data.camera.cx)
+    row = (np.arange(height)[:, None] + shear)[pixels]
+    top = float(np.ceil(disparity_px.max())) + 1
+    counts, _, _ = np.histogram2d(
+        row, disparity_px[pixels], bins=(height, int(4 * top)), range=((0, height), (0, top))
+    )
+    axes.imshow(
+        np.where(counts > 0, counts, np.nan), extent=(0, top, height, 0), aspect='auto',
+        norm=LogNorm(1, max(2.0, counts.max())), cmap='inferno', interpolation='nearest',
+    )  # fmt: skip
+    axes.set(xlabel='disparity [px]', ylabel='image row')
+    axes.set_facecolor('black')
+
+
+def _tinted(item: MaskedFrame) -> bytes:
+    picture = cv2.cvtColor(item.frame.left, cv2.COLOR_GRAY2BGR).astype(np.float32)
+    for value, tint in ((FLOOR, FLOOR_TINT), (NO_EVIDENCE, NO_EVIDENCE_TINT)):
+        pixels = item.mask == value
+        picture[pixels] = 0.62 * picture[pixels] + 0.38 * np.array(tint, np.float32)
+    scale = STRIP_WIDTH_PX / picture.shape[1]
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, encoded = cv2.imencode('.jpg', small.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return bytes(encoded)
+
+
+def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
+    """Return a figure whose axes show the known part of a grid with equal scales."""
+    known = np.argwhere(grid.cells >= 0)
+    low, high = np.zeros(2), np.array(grid.cells.shape)
+    if len(known):
+        low, high = known.min(axis=0) - MARGIN_CELLS, known.max(axis=0) + 1 + MARGIN_CELLS
+    rows, columns = high - low
+    figure = Figure(figsize=(8, float(np.clip(8 * rows / columns, 2.5, 10)) + 0.8))
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    x, y = grid.origin_xy_m
+    axes.set(
+        xlabel='x [m]',
+        ylabel='y [m]',
+        xlim=(x + low[1] * grid.resolution_m, x + high[1] * grid.resolution_m),
+        ylim=(y + low[0] * grid.resolution_m, y + high[0] * grid.resolution_m),
+    )
+    axes.set_aspect('equal')
+    return figure, axes
+
+
+def _show_grid(axes: Axes, grid: OccupancyGrid) -> None:
+    state = states(grid)
+    grey = np.select([state == FREE, state == OCCUPIED], [FREE_GREY, OCCUPIED_GREY], UNKNOWN_GREY)
+    rows, columns = state.shape
+    x, y = grid.origin_xy_m
+    extent = (x, x + columns * grid.resolution_m, y, y + rows * grid.resolution_m)
+    axes.imshow(
+        grey, extent=extent, origin='lower', cmap='gray', vmin=0, vmax=1, interpolation='nearest'
+    )
+
+
+def _some(cloud: LabelledPoints, label: int) -> NDArray[np.float32]:
+    """Return the points (N, 3) of a label, thinned evenly where there are many."""
+    points = cloud.xyz_map[cloud.label == label]
+    return points[:: max(1, len(points) // MAX_DRAWN_POINTS)]
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png', dpi=120, bbox_inches='tight', metadata={'Software': None})
+    return buffer.getvalue()
