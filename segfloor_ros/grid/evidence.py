@@ -26,6 +26,8 @@ class KeyframeEvidence:
     positions_m: (2, M) float32; the first num_rays are the ends of single rays to floor points
     that reach farther than the fan, then num_contacts ends of lines along what the floor ends at,
     two for each; the others are obstacle points at any height that concerns the robot.
+    thickness_m: (num_contacts / 2,) float32, how deep the things behind these lines are taken to
+    be.
     """
 
     first_rad: float
@@ -34,6 +36,7 @@ class KeyframeEvidence:
     positions_m: NDArray[np.float32]
     num_rays: int
     num_contacts: int
+    thickness_m: NDArray[np.float32]
 
 
 def gather_evidence(
@@ -60,6 +63,7 @@ def gather_evidence(
         positions_m=np.concatenate([rays, contacts, obstacles]).T.astype(np.float32),
         num_rays=len(rays),
         num_contacts=len(contacts),
+        thickness_m=_thickness_m(contacts[::2], settings),
     )
 
 
@@ -125,6 +129,14 @@ def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
     joined[:-1] = (np.diff(near) == 1) & (step_m <= SAME_SURFACE_SHARE * distance_m[:-1])
     end = np.where(joined[:, None], np.roll(start, -1, axis=0), start)
     return np.stack([start, end], axis=1).reshape(-1, 2)
+
+
+def _thickness_m(faces: Array, settings: OccupancyGridSettings) -> NDArray[np.float32]:
+    """Return how deep (C,) to mark behind faces (C, 2): two sigma of their distance, and no less
+    than things that stand have.
+    """
+    error_m = settings.range_error_per_m * (faces**2).sum(axis=1)
+    return np.maximum(2 * error_m, settings.min_thickness_m).astype(np.float32)
 
 
 def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:

@@ -19,8 +19,7 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
     hang above free floor then, and mark the cell below them.
     """
     hits = np.zeros_like(free)
-    behind = placed.contacts + 0.5 * _outward(placed.contacts, placed.base)
-    draw_lines(hits, behind[:, ::2], behind[:, 1::2])
+    _draw_bands(hits, placed)
     hits[free > 0] = 0
     step = 0.5 * _outward(placed.points, placed.base)
     candidates = np.stack([placed.points, placed.points + step, placed.points + 2 * step], axis=1)
@@ -29,6 +28,17 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
     point = np.arange(len(choice))
     hits[row[choice, point], column[choice, point]] = 1
     return hits
+
+
+def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
+    """Draw what stands behind the faces: a cell, and what the error of the distance may add."""
+    start, end = placed.contacts[:, ::2], placed.contacts[:, 1::2]
+    outward, outward_end = _outward(start, placed.base), _outward(end, placed.base)
+    num_layers = np.ceil(placed.thickness).astype(np.intp)
+    for layer in range(num_layers.max(initial=0)):
+        deep = num_layers > layer
+        depth = layer + 0.5
+        draw_lines(hits, (start + depth * outward)[:, deep], (end + depth * outward_end)[:, deep])
 
 
 def draw_lines(raster: NDArray[np.uint8], start: Array, end: Array) -> None:

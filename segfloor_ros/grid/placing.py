@@ -19,7 +19,7 @@ class PlacedEvidence:
     """Evidence in cells, x along columns and y along rows, seen from the corner of cell `low`.
 
     low, high: (row, column) of the first cell and of one beyond the last that the evidence
-    touches. previous: (2,), where the base came from. rays, contacts, points: (2, N) each,
+    touches. previous: (2,), where the base came from. rays, contacts, thickness and points:
     as in `KeyframeEvidence`.
     """
 
@@ -29,6 +29,7 @@ class PlacedEvidence:
     previous: Array
     rays: Array
     contacts: Array
+    thickness: Array
     points: Array
 
     @property
@@ -52,11 +53,13 @@ def place(
     directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
     cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
     positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m + way[:, :1]
+    thickness = np.maximum(evidence.thickness_m * scale, 1.0)
     margin = margin_m * scale + 2
+    body = int(np.ceil(thickness.max(initial=1.0))) + 1
     ends = directions * lengths + way[:, :1]
     touched = np.concatenate([ends, positions, way - margin, way + margin], axis=1)
-    low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - 2
-    high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + 3
+    low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - body
+    high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + body + 1
     positions -= low
     way -= low
     rays, contacts = evidence.num_rays, evidence.num_rays + evidence.num_contacts
@@ -67,5 +70,6 @@ def place(
         previous=way[:, 1],
         rays=positions[:, :rays],
         contacts=positions[:, rays:contacts],
+        thickness=thickness,
         points=positions[:, contacts:],
     )

@@ -50,6 +50,14 @@ class OccupancyGridSettings(StageSettings):
         maximum=0.5,
         live=True,
     )
+    min_thickness_m: float = setting(
+        0.03,
+        'What stands on the floor is at least this deep behind the face that is seen.',
+        unit='m',
+        minimum=0.0,
+        maximum=0.5,
+        live=True,
+    )
     use_points: bool = setting(
         True, 'Obstacle points mark cells, and rays to floor points mark free cells.'
     )

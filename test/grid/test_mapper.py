@@ -162,18 +162,6 @@ def test_probabilities() -> None:
     assert graded[plain == 0].max() < 50 < graded[plain == 100].min()
 
 
-def test_opening_removes_single_rays() -> None:
-    scan = FloorScan(-0.006, 0.012, np.full(4, 3.0, np.float32))
-    grids = []
-    for opening in (0, 3):
-        mapper = OccupancyGridMapper(OccupancyGridSettings(opening_cells=opening))
-        mapper.update(0, no_points(), NO_FEATURES, path_of([(0.0, 0.0, 0.0)]), scan)
-        grids.append(mapper.grid())
-    assert cells_at(grids[0], np.array([[2.5, 0.02]])) == 0
-    assert cells_at(grids[1], np.array([[2.5, 0.02]])) == -1
-    assert cells_at(grids[1], np.array([[0.0, 0.0]])) == 0
-
-
 def test_a_keyframe_must_be_in_its_path() -> None:
     mapper = OccupancyGridMapper(OccupancyGridSettings())
     scan = FloorScan(0.0, 0.01, np.zeros(3, np.float32))

@@ -27,7 +27,7 @@ def test_a_room_is_free_inside_and_its_wall_occupied(make_drive: MakeDrive) -> N
         drive.look(ROOM, pose)
     grid = drive.grid()
     assert (cells_at(grid, centres((1.4, 3.8), (-0.6, 0.6))) == 0).all()
-    assert (cells_at(grid, centres((4.1, 6.0), (-2.0, 2.0))) == -1).all()
+    assert (cells_at(grid, centres((4.05, 6.0), (-2.0, 2.0))) != 0).all()
     wall = cells_at(grid, centres((4.0, 4.05), (-1.0, 1.0)))
     assert len(wall) == 40
     assert (wall == 100).all()
@@ -169,3 +169,14 @@ def test_the_base_has_driven_over_free_floor(make_drive: MakeDrive) -> None:
     assert (cells_at(grid, centres((0.0, 1.0), (-0.1, 0.1))) == 0).all()
     beyond = np.concatenate([centres((0.0, 1.0), (0.25, 0.4)), centres((1.3, 1.5), (-0.1, 0.1))])
     assert (cells_at(grid, beyond) == -1).all()
+
+
+@pytest.mark.parametrize(('opening_cells', 'expected'), [(0, 0), (3, -1)])
+def test_opening_removes_single_rays(
+    make_drive: MakeDrive, opening_cells: int, expected: int
+) -> None:
+    settings = OccupancyGridSettings(use_scan=False, opening_cells=opening_cells)
+    drive = make_drive(settings)
+    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.02, 0.0)], FLOOR))
+    assert cells_at(drive.grid(), np.array([[1.5, 0.02]])) == expected
+    assert cells_at(drive.grid(), np.array([[0.0, 0.0]])) == 0
