@@ -6,8 +6,13 @@ Through V-disparity Representation (2002); Hu, Uchimura, U-V-Disparity (2005).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from segfloor_ros.floor.evidence import FloorView
+from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 
 def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:
@@ -50,3 +55,31 @@ def v_disparity(
     """
     index = rows[keep] * shape[1] + bins[keep]
     return np.bincount(index, minlength=shape[0] * shape[1])[: shape[0] * shape[1]].reshape(shape)
+
+
+def filtered_v_disparity(
+    view: FloorView,
+    disparity: NDArray[np.float32],
+    textured: NDArray[np.bool_],
+    num_disparities: int,
+    bins_per_px: int,
+    settings: FloorSegmentationSettings,
+) -> tuple[NDArray[np.intp], int]:
+    """Return the v-disparity (rows, bins) of what is textured and not upright, and its first
+    de-rolled row.
+    """
+    camera = view.camera
+    bins = (disparity + 0.5).astype(np.intp)
+    num = num_disparities + 1
+    limit = obstacle_rows(
+        np.arange(num),
+        settings.obstacle_height_m,
+        camera.fy / (camera.fx * camera.baseline_m),
+        1 / view.line.slope,
+    )
+    upright = u_disparity(bins, num) > limit[:, None]
+    keep = (disparity > 0) & textured & ~upright[bins, np.arange(camera.width)]
+    first = math.floor(float(view.derolled.min()))
+    rows = (view.derolled - np.float32(first - 0.5)).astype(np.intp)
+    fine = (disparity * bins_per_px + 0.5).astype(np.intp)
+    return v_disparity(rows, fine, keep, (int(rows.max()) + 1, num * bins_per_px)), first

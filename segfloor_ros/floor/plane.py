@@ -27,6 +27,7 @@ _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SIGMA_PX = 0.5
+_SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
 _PITCH_SIGMA_RAD = np.radians(20.0)
 _ROLL_SIGMA_RAD = np.radians(6.0)
 _CLIMB = 0.03
@@ -160,17 +161,29 @@ def _climb_sigma_m(travel: Array) -> Array:
     return _CLIMB * np.linalg.norm(travel, axis=1) + _SWAY_M
 
 
-def refine(frames: list[Samples], start: Array, known: Array, travel: Array) -> PlaneFit:
+def refine(
+    frames: list[Samples],
+    start: Array,
+    known: Array,
+    travel: Array,
+    prior_sigma: Array | None = None,
+    scales_px: tuple[float, ...] = _SCALES_PX,
+) -> PlaneFit:
     """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
 
     travel: (T, 3) displacements of the camera in metres, along which the floor runs.
+    prior_sigma: (3,) how far from `start` the values may be, where it is more than a guess.
+    scales_px: scale of the biweight, one per iteration.
     """
     state = start.copy()
     free = np.isnan(known)
     information: Array = np.eye(3)
-    for scale in (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5):
-        information, gradient = _normal_equations(frames, state, scale * INLIER_PX)
+    prior = np.zeros((3, 3)) if prior_sigma is None else np.diag(prior_sigma**-2.0)
+    for scale in scales_px:
+        information, gradient = _normal_equations(frames, state, scale)
         _add_travel(information, gradient, state, travel)
+        information += prior
+        gradient += prior @ (start - state)
         step = np.zeros(3)
         step[free] = np.linalg.solve(
             information[np.ix_(free, free)] + 1e-9 * np.eye(int(free.sum())), gradient[free]

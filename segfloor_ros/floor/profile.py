@@ -17,6 +17,7 @@ from segfloor_ros.geometry import Array
 
 SEGMENTS = 5
 _CONTROLS = SEGMENTS + 3
+BINS_PER_PX = 4
 _CORRELATED_PIXELS = 200.0
 """Neighbouring disparities err together: so many of them count as one measurement."""
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import SUBPIXEL, DisparityMatcher, disparity_range
-from segfloor_ros.floor.histograms import obstacle_rows, u_disparity, v_disparity
+from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
+from segfloor_ros.floor.evidence import Evidence, FloorView, judge
+from segfloor_ros.floor.filling import fill_gaps, floor_pixels, floor_positions, trim_to_edges
+from segfloor_ros.floor.histograms import filtered_v_disparity
+from segfloor_ros.floor.memory import REACH_M, FloorMemory, cells_around, floor_at
 from segfloor_ros.floor.observation import (
     FLOOR,
     NO_EVIDENCE,
@@ -18,26 +21,19 @@ from segfloor_ros.floor.observation import (
     FloorObservation,
     FloorScan,
 )
-from segfloor_ros.floor.profile import FloorLine, FloorProfile, fit_profile
+from segfloor_ros.floor.plane import PlaneFit, Samples, refine
+from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
 from segfloor_ros.floor.scan import ScanGeometry, make_scan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.texture import enough_texture_grey, texture_grey
+from segfloor_ros.floor.tracking import FloorTracker
 from segfloor_ros.geometry import Array
 
-_BINS_PER_PX = 4
-_CONTACT_HEIGHT_M = 0.12
-"""Up to this height an upright surface is taken to stand on the floor below it."""
-
-
-@dataclass(frozen=True)
-class _View:
-    """What depends on camera and mount alone, for the rows that can show floor."""
-
-    matcher: DisparityMatcher
-    line: FloorLine
-    scan: ScanGeometry
-    first_row: int
-    derolled: NDArray[np.float32]
-    column: NDArray[np.intp]
+_ROWS_ABOVE_HORIZON = 16
+"""The matcher's paths get a run-up, and the horizon some play."""
+_TEXTURE_WINDOW_PX = 11
+_PLANE_SAMPLES = 4000
+_PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 
 
 class FloorSegmentation:
@@ -46,7 +42,12 @@ class FloorSegmentation:
     def __init__(self, camera: StereoCamera, settings: FloorSegmentationSettings) -> None:
         self._camera = camera
         self._settings = settings
-        self._views: dict[Mount, _View] = {}
+        self._tracker = FloorTracker(settings)
+        self._memory = FloorMemory()
+        self._cells = cells_around()
+        self._mount: Mount | None = None
+        self._matcher: DisparityMatcher
+        self._scan_geometry: ScanGeometry
 
     def process(
         self,
@@ -58,178 +59,149 @@ class FloorSegmentation:
         """Return the floor of a rectified grey pair (H, W) uint8.
 
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
-        the map, where known.
+        the map, where known; with it the floor found by earlier keyframes helps.
         """
-        view = self._view(mount)
-        disparity = self._disparity(view, left, right)
-        below = disparity[view.first_row :]
-        profile = self._profile(view, below)
-        height = self._heights(view, profile, below)
-        mask = self._evidence(view, profile, below, height)
-        mask = self._fill(view, profile, mask)
-        scan = self._scan(view, mount, profile, below, height, mask)
+        self._prepare(mount)
+        expected, sigma = self._tracker.predict(mount, T_map_base)
+        first_row = self._first_row(_with_angles(mount, expected))
+        disparity = self._disparity(first_row, left, right)
+        below = disparity[first_row:]
+        texture = texture_grey(left[first_row:], _TEXTURE_WINDOW_PX)
+        enough = enough_texture_grey(left[first_row:], self._settings.min_texture_grey)
+        fit = self._plane(first_row, below, texture, enough, expected, sigma)
+        self._tracker.update(mount, T_map_base, fit)
+        view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
+        textured = texture > enough
+        profile = self._profile(view, below, textured)
+        evidence = judge(
+            view, profile, below, textured, self._matcher.num_disparities, self._settings
+        )
+        mask = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
+        evidence = Evidence(mask, evidence.height_m)
+        mask = self._recall(view, mask, T_map_base)
+        mask = fill_gaps(view, profile, mask, self._settings.fill_gap_m)
+        scan = self._scan(view, below, evidence, mask, T_map_base)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
-        whole[view.first_row :] = mask
+        whole[first_row:] = mask
         return FloorObservation(
             disparity_px=disparity,
             mask=whole,
             profile_px=profile.at_rows(np.arange(self._camera.height)),
             scan=scan,
             min_disparity_px=0.0,
-            max_disparity_px=float(view.matcher.num_disparities),
+            max_disparity_px=float(self._matcher.num_disparities),
         )
 
-    def _view(self, mount: Mount) -> _View:
-        if mount not in self._views:
-            self._views = {mount: self._make_view(mount)}
-        return self._views[mount]
+    def _prepare(self, mount: Mount) -> None:
+        if mount == self._mount:
+            return
+        searched = self._settings.num_disparities or disparity_range(self._camera, mount)
+        self._matcher = DisparityMatcher(-(-searched // 16) * 16, self._settings)
+        self._scan_geometry = ScanGeometry(self._camera, mount, self._settings)
+        self._tracker = FloorTracker(self._settings)
+        self._memory = FloorMemory()
+        self._mount = mount
 
-    def _make_view(self, mount: Mount) -> _View:
-        camera, settings = self._camera, self._settings
-        line = FloorLine.of(camera, mount)
-        columns = np.arange(camera.width)
-        shear = line.shear * (columns - camera.cx)
-        first = int(np.clip(np.floor(line.horizon - shear.max()), 0, camera.height - 16))
-        rows = np.arange(first, camera.height)
-        derolled = (rows[:, None] + shear[None, :]).astype(np.float32)
-        searched = settings.num_disparities or disparity_range(camera, mount)
-        return _View(
-            matcher=DisparityMatcher(-(-searched // 16) * 16, settings),
-            line=line,
-            scan=ScanGeometry(camera, mount, settings),
-            first_row=first,
-            derolled=derolled,
-            column=columns,
-        )
+    def _first_row(self, expected: Mount) -> int:
+        camera = self._camera
+        line = FloorLine.of(camera, expected)
+        shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
+        top = math.floor(line.horizon - shear) - _ROWS_ABOVE_HORIZON
+        return int(np.clip(top, 0, camera.height - 32))
 
     def _disparity(
-        self, view: _View, left: NDArray[np.uint8], right: NDArray[np.uint8]
+        self, first_row: int, left: NDArray[np.uint8], right: NDArray[np.uint8]
     ) -> NDArray[np.float32]:
-        # A few rows above the horizon give the matcher's paths a run-up.
-        top = 0 if self._settings.disparity_above_horizon else max(0, view.first_row - 16)
+        top = 0 if self._settings.disparity_above_horizon else first_row
         disparity = np.zeros(left.shape, np.float32)
-        disparity[top:] = view.matcher.compute(left[top:], right[top:])
+        disparity[top:] = self._matcher.compute(left[top:], right[top:])
         return disparity
 
-    def _profile(self, view: _View, disparity: NDArray[np.float32]) -> FloorProfile:
-        settings, camera = self._settings, self._camera
-        bins = (disparity + 0.5).astype(np.intp)
-        num = view.matcher.num_disparities + 1
-        upright = (
-            u_disparity(bins, num)
-            > obstacle_rows(
-                np.arange(num),
-                settings.obstacle_height_m,
-                camera.fy / (camera.fx * camera.baseline_m),
-                1 / view.line.slope,
-            )[:, None]
+    def _plane(
+        self,
+        first_row: int,
+        disparity: NDArray[np.float32],
+        texture: NDArray[np.float32],
+        enough: float,
+        expected: Array,
+        sigma: Array,
+    ) -> PlaneFit:
+        """Return the plane of the floor in this frame, in its own camera's axes."""
+        camera = self._camera
+        step = max(2, round(math.sqrt(disparity.size / _PLANE_SAMPLES)))
+        rows, columns = np.nonzero(disparity[::step, ::step] > 0)
+        grey = texture[::step, ::step][rows, columns].astype(np.float64) / (2 * enough)
+        found = disparity[::step, ::step][rows, columns].astype(np.float64)
+        uv = np.stack([columns * step, rows * step + first_row], axis=1)
+        samples = Samples(
+            rays=camera.back_project(uv, np.ones(len(uv))),
+            position_m=np.zeros(3),
+            disparity_px=found,
+            weight=grey**4 / (grey**4 + 1),
+            disparity_m=camera.disparity_times_depth,
         )
-        keep = (disparity > 0) & ~upright[bins, view.column]
-        rows = (view.derolled + 0.5).astype(np.intp)
-        first, last = int(rows.min()), int(rows.max())
-        counts = v_disparity(
-            rows - first,
-            (disparity * _BINS_PER_PX + 0.5).astype(np.intp),
-            keep,
-            (last - first + 1, num * _BINS_PER_PX),
-        )
-        return fit_profile(counts, first, 1 / _BINS_PER_PX, view.line, camera, settings)
+        unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
+        return refine([samples], expected, unknown, no_travel, sigma, _PLANE_SCALES_PX)
 
-    def _heights(
-        self, view: _View, profile: FloorProfile, disparity: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Return metres above the floor that has the same disparity, (R, W); NaN unmatched."""
-        grid = np.arange(view.matcher.num_disparities * SUBPIXEL + 1) / SUBPIXEL
-        with np.errstate(divide='ignore'):
-            scale = view.line.metres_per_row / grid
-        scale[0] = np.nan
-        offset = np.where(grid > 0, scale * profile.row_of_disparity(grid), np.nan)
-        index = (disparity * SUBPIXEL).astype(np.intp)
-        return offset.astype(np.float32)[index] - scale.astype(np.float32)[index] * view.derolled
-
-    def _tolerances(
-        self, view: _View, disparity: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _profile(
+        self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
+    ) -> FloorProfile:
         settings = self._settings
-        noise = settings.disparity_noise_px * view.line.metres_per_row / view.line.slope
-        noise_m = np.float32(noise) / np.maximum(disparity, np.float32(0.25))
-        up = np.sqrt(np.float32(settings.step_height_m**2) + noise_m**2)
-        down = np.float32(settings.drop_height_m) + 2 * noise_m
-        return up.astype(np.float32), down.astype(np.float32)
-
-    def _evidence(
-        self,
-        view: _View,
-        profile: FloorProfile,
-        disparity: NDArray[np.float32],
-        height: NDArray[np.float32],
-    ) -> NDArray[np.uint8]:
-        up, down = self._tolerances(view, disparity)
-        mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
-        mask[(height <= up) & (height >= -down)] = FLOOR
-        mask[(height > up) | (height < -down)] = NOT_FLOOR
-        mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-        low = (height > up) & (height < up + np.float32(_CONTACT_HEIGHT_M))
-        mask[self._below_contact(view, profile, disparity, low)] = NOT_FLOOR
-        return mask
-
-    def _below_contact(
-        self,
-        view: _View,
-        profile: FloorProfile,
-        disparity: NDArray[np.float32],
-        low: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
-        """Return the pixels between the foot of an upright surface and where it meets the floor.
-
-        They are lower than a step, but belong to the same surface: its disparity says at which
-        row the floor is.
-        """
-        rows, columns = np.nonzero(low)
-        shear = view.line.shear * (columns - self._camera.cx)
-        foot = profile.row_of_disparity(disparity[rows, columns]) - shear - view.first_row
-        end = np.clip(np.floor(foot), rows, low.shape[0] - 1).astype(np.intp) + 1
-        height, width = low.shape
-        size = (height + 1) * width
-        change = np.bincount(rows * width + columns, minlength=size) - np.bincount(
-            end * width + columns, minlength=size
+        counts, first = filtered_v_disparity(
+            view, disparity, textured, self._matcher.num_disparities, BINS_PER_PX, settings
         )
-        covered = np.cumsum(change.reshape(height + 1, width), axis=0)[:height]
-        return covered >= 2
+        return fit_profile(counts, first, 1 / BINS_PER_PX, view.line, self._camera, settings)
 
-    def _fill(
-        self, view: _View, profile: FloorProfile, mask: NDArray[np.uint8]
+    def _recall(
+        self, view: FloorView, mask: NDArray[np.uint8], T_map_base: Array | None
     ) -> NDArray[np.uint8]:
-        """Fill small gaps without evidence between floor pixels."""
-        gap = max(3, round(self._settings.fill_gap_m * self._camera.fx / 2.0) | 1)
-        kernel = np.ones((3, gap), np.uint8)
-        floor = (mask == FLOOR).astype(np.uint8)
-        closed = cv2.morphologyEx(floor, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REPLICATE)
-        filled = mask.copy()
-        filled[(mask == NO_EVIDENCE) & (closed > 0)] = FLOOR
-        return filled
+        """Return the mask with floor where nothing is seen now and floor was seen before."""
+        if T_map_base is None:
+            return mask
+        rows, columns = np.nonzero(mask == NO_EVIDENCE)
+        xy_base = floor_positions(view, rows + view.first_row, columns)
+        near = np.hypot(xy_base[:, 0], xy_base[:, 1]) < REACH_M
+        rows, columns, xy_base = rows[near], columns[near], xy_base[near]
+        known = self._memory.recall(_in_map(T_map_base, xy_base))
+        recalled = mask.copy()
+        recalled[rows[known], columns[known]] = FLOOR
+        return recalled
 
     def _scan(
         self,
-        view: _View,
-        mount: Mount,
-        profile: FloorProfile,
+        view: FloorView,
         disparity: NDArray[np.float32],
-        height: NDArray[np.float32],
+        evidence: Evidence,
         mask: NDArray[np.uint8],
+        T_map_base: Array | None,
     ) -> FloorScan:
-        floor = (mask == FLOOR)[:, ::2] & (disparity > 0)[:, ::2]
-        obstacle = ((mask == NOT_FLOOR) & (height > 0))[:, ::2]
-        T = view.scan.T_base_left
         camera = self._camera
+        T_base_left = view.mount.T_base_left
 
         def in_base(where: NDArray[np.bool_]) -> Array:
-            rows, columns = np.nonzero(where)
-            d = disparity[:, ::2][where]
+            rows, columns = np.nonzero(where[:, ::2])
+            d = disparity[:, ::2][rows, columns]
             uv = np.stack([2.0 * columns, rows + view.first_row], axis=1)
             points = camera.back_project(uv, camera.disparity_times_depth / d)
-            return points @ T[:2, :3].T + T[:2, 3]
+            return points @ T_base_left[:2, :3].T + T_base_left[:2, 3]
 
-        return make_scan(
-            view.scan, in_base(floor), in_base(obstacle), self._settings, camera, mount
-        )
+        floor = in_base((evidence.mask == FLOOR) & (disparity > 0))
+        obstacle = in_base((evidence.mask == NOT_FLOOR) & (evidence.height_m > 0))
+        if T_map_base is not None:
+            pixels = floor_pixels(view, self._cells) - (0, view.first_row)
+            seen = floor_at(evidence.mask, pixels)
+            self._memory.learn(
+                _in_map(T_map_base, self._cells[seen]),
+                _in_map(T_map_base, obstacle[np.hypot(*obstacle.T) < REACH_M]),
+                T_map_base[:2, 3],
+            )
+        return make_scan(self._scan_geometry, floor, obstacle, self._settings, camera, view.mount)
+
+
+def _with_angles(mount: Mount, angles_height: Array) -> Mount:
+    pitch, roll, height = (float(value) for value in angles_height)
+    return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
+
+
+def _in_map(T_map_base: Array, xy_base: Array) -> Array:
+    return xy_base @ T_map_base[:2, :2].T + T_map_base[:2, 3]

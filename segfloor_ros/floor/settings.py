@@ -60,6 +60,14 @@ class FloorSegmentationSettings(StageSettings):
     speckle_size_px: int = setting(
         60, 'Islands of fewer pixels are dropped.', unit='px', minimum=0, maximum=2000
     )
+    min_texture_grey: float = setting(
+        0.2,
+        'Slope of the image along a row below which a disparity says nothing.',
+        unit='grey levels per px',
+        minimum=0.0,
+        maximum=20.0,
+        live=True,
+    )
     disparity_above_horizon: bool = setting(
         False, 'Match the rows above the horizon too; the floor does not need them.'
     )

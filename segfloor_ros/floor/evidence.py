@@ -1,0 +1,132 @@
+"""What each pixel says: floor, not floor, or nothing.
+
+A pixel is judged by its own disparity: its height above the floor that has the same disparity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity import SUBPIXEL
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.profile import FloorLine, FloorProfile
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+_CONTACT_HEIGHT_M = 0.12
+"""Up to this height an upright surface is taken to stand on the floor below it."""
+
+
+@dataclass(frozen=True)
+class FloorView:
+    """The image rows that can show floor, as seen with the mount of this very frame.
+
+    first_row: image row of the first one. derolled: (R, W) float32, their de-rolled rows.
+    """
+
+    camera: StereoCamera
+    mount: Mount
+    line: FloorLine
+    first_row: int
+    derolled: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, camera: StereoCamera, mount: Mount, first_row: int) -> FloorView:
+        """Return the view from `mount` of the rows from `first_row` on."""
+        line = FloorLine.of(camera, mount)
+        shear = (line.shear * (np.arange(camera.width) - camera.cx)).astype(np.float32)
+        rows = np.arange(first_row, camera.height, dtype=np.float32)
+        return cls(camera, mount, line, first_row, rows[:, None] + shear)
+
+
+@dataclass(frozen=True)
+class HeightTable:
+    """Per disparity step: height above the floor is `offset - scale * derolled row`, in metres;
+    up, down: how much of it is still floor. All (B,) float32, NaN at disparity 0.
+    """
+
+    offset: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    up: NDArray[np.float32]
+    down: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        line: FloorLine,
+        profile: FloorProfile,
+        num_disparities: int,
+        settings: FloorSegmentationSettings,
+    ) -> HeightTable:
+        """Return the table of a profile."""
+        disparity = np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
+        disparity[0] = np.nan
+        scale = line.metres_per_row / disparity
+        # One pixel of disparity is this much height: the camera's height over the disparity.
+        noise_m = settings.disparity_noise_px * line.metres_per_row / line.slope / disparity
+        tables = (
+            scale * profile.row_of_disparity(disparity),
+            scale,
+            np.hypot(settings.step_height_m, noise_m),
+            settings.drop_height_m + 2 * noise_m,
+        )
+        return cls(*(table.astype(np.float32) for table in tables))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """mask: (R, W) uint8. height_m: (R, W) float32 above the floor, NaN without a match."""
+
+    mask: NDArray[np.uint8]
+    height_m: NDArray[np.float32]
+
+
+def judge(
+    view: FloorView,
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    textured: NDArray[np.bool_],
+    num_disparities: int,
+    settings: FloorSegmentationSettings,
+) -> Evidence:
+    """Return what the pixels (R, W) of the view say by themselves.
+
+    A disparity counts where there is texture to match.
+    """
+    table = HeightTable.of(view.line, profile, num_disparities, settings)
+    index = (disparity * SUBPIXEL).astype(np.intp)
+    height = table.offset[index] - table.scale[index] * view.derolled
+    above = height > table.up[index]
+    below = height < -table.down[index]
+    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    mask[textured & (disparity > 0)] = FLOOR
+    mask[(above | below) & textured] = NOT_FLOOR
+    low = above & textured & (height < _CONTACT_HEIGHT_M + np.float32(settings.step_height_m))
+    mask[_below_contact(view, profile, disparity, low)] = NOT_FLOOR
+    mask[view.derolled <= view.line.horizon] = NOT_FLOOR
+    return Evidence(mask, height)
+
+
+def _below_contact(
+    view: FloorView,
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    low: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Return the pixels between the foot of an upright surface and where it meets the floor.
+
+    They are lower than a step but belong to the same surface: its disparity says at which row
+    the floor is.
+    """
+    rows, columns = np.nonzero(low)
+    shear = view.line.shear * (columns - view.camera.cx)
+    foot = profile.row_of_disparity(disparity[rows, columns]) - shear - view.first_row
+    height, width = low.shape
+    end = np.clip(np.floor(foot), rows, height - 1).astype(np.intp) + 1
+    size = (height + 1) * width
+    change = np.bincount(rows * width + columns, minlength=size)
+    change -= np.bincount(end * width + columns, minlength=size)
+    return np.cumsum(change.reshape(height + 1, width), axis=0)[:height] >= 2

@@ -1,0 +1,46 @@
+"""Where the image has enough texture for a disparity to mean something."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_SIGMA_PX = 2.0
+_NOISE_GAIN = 0.1
+"""What this measure gives on a surface without texture, per grey level of noise."""
+_LAPLACIAN_GAIN = 6.0
+
+
+def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32]:
+    """Return the mean absolute slope (H, W) along the row in grey levels per pixel.
+
+    Slopes are taken on a scale of two pixels, where sensor noise has averaged out; only slopes
+    along the row tell a stereo pair anything.
+    """
+    radius = int(3 * _SIGMA_PX)
+    x = np.arange(-radius, radius + 1, dtype=np.float64)
+    smooth = np.exp(-0.5 * (x / _SIGMA_PX) ** 2)
+    smooth /= smooth.sum()
+    slope = x * smooth
+    slope /= (x * slope).sum()
+    # sepFilter2D correlates: a positive slope gives a positive response.
+    response = cv2.sepFilter2D(image, cv2.CV_32F, slope, smooth)
+    return cv2.blur(cv2.absdiff(response, 0.0), (window_px, window_px))
+
+
+def noise_grey(image: NDArray[np.uint8]) -> float:
+    """Return the standard deviation of the image noise in grey levels.
+
+    Immerkaer, Fast Noise Variance Estimation (1996), with a median in place of the mean, so that
+    texture does not count.
+    """
+    part = image[::2]
+    kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+    response = cv2.filter2D(part, cv2.CV_32F, kernel)
+    return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / _LAPLACIAN_GAIN
+
+
+def enough_texture_grey(image: NDArray[np.uint8], minimum: float) -> float:
+    """Return the slope above which texture stands out from noise, at least `minimum`."""
+    return max(minimum, _NOISE_GAIN * noise_grey(image))
