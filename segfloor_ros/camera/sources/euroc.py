@@ -34,8 +34,8 @@ def open_euroc(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
     names = (str(root / CAMERAS[0]), str(root / CAMERAS[1]))
     pairing: StampPairing[Path] = StampPairing(settings.pairing_tolerance_s, names, limit=None)
     matches = [
-        *(pair for image in left for pair in pairing.add(0, *image)),
-        *(pair for image in right for pair in pairing.add(1, *image)),
+        *(pair for image in left for pair in pairing.add(0, image.stamp_ns, image.item)),
+        *(pair for image in right for pair in pairing.add(1, image.stamp_ns, image.item)),
         *pairing.finish(),
     ]
     pairing.report()

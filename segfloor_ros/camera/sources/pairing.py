@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from segfloor_ros.camera.sources.stamps import check_forward
 from segfloor_ros.errors import InputError
@@ -15,7 +16,8 @@ T = TypeVar('T')
 logger = logging.getLogger(__name__)
 
 
-class Stamped(NamedTuple, Generic[T]):
+@dataclass(frozen=True)
+class Stamped(Generic[T]):
     """Something with a stamp."""
 
     stamp_ns: int
