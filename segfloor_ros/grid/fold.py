@@ -34,12 +34,14 @@ class EvidenceFolder:
         self._occupied = ZERO + steps(settings.occupied_log_odds)
         value = np.arange(256)
         hit, free = steps(settings.hit_log_odds), steps(settings.free_log_odds)
-        self._raised = np.minimum(value + hit, ZERO + steps(settings.max_log_odds))
-        self._lowered = np.maximum(value - free, self._least)
+        most = ZERO + steps(settings.max_log_odds)
+        self._raised = np.minimum(value + hit, most).astype(np.uint8)
+        self._lowered = np.maximum(value - free, self._least).astype(np.uint8)
         # Floor seen from farther than an obstacle could have been placed from is free as long as
         # nothing says otherwise: it clears no obstacle, and counts no more than one look.
         tentative = np.minimum(value, np.maximum(value - free, ZERO - free))
-        self._lowered_far = np.where(value >= self._occupied, value, tentative)
+        far = np.where(value >= self._occupied, value, tentative)
+        self._lowered_far = far.astype(np.uint8)
 
     def fold(
         self,
@@ -58,7 +60,8 @@ class EvidenceFolder:
         free[hits > 0] = 0
         near = self._draw_near(free, placed)
         _replace(cells, near, self._lowered)
-        _replace(cells, free - near, self._lowered_far)
+        if near is not free:
+            _replace(cells, free - near, self._lowered_far)
         _replace(cells, hits, self._raised)
         self._drive(cells, placed)
 
@@ -83,6 +86,8 @@ class EvidenceFolder:
 
     def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the free cells that are near enough for an obstacle there to be placed, 1."""
+        if placed.reach <= self._hit_range:
+            return free
         near = np.zeros_like(free)
         centre = fixed_point(placed.base[:, None])[0].tolist()
         radius = round(self._hit_range * (1 << SUBPIXEL_BITS))
@@ -99,6 +104,6 @@ class EvidenceFolder:
         cv2.line(cells, way[0], way[1], self._least, width, shift=SUBPIXEL_BITS)
 
 
-def _replace(cells: NDArray[np.uint8], where: NDArray[np.uint8], table: NDArray[np.intp]) -> None:
+def _replace(cells: NDArray[np.uint8], where: NDArray[np.uint8], table: NDArray[np.uint8]) -> None:
     """Replace the values of some cells by those of a table (256,)."""
-    np.copyto(cells, cv2.LUT(cells, table.astype(np.uint8)), where=where.view(np.bool_))
+    np.copyto(cells, cv2.LUT(cells, table), where=where.view(np.bool_))

@@ -31,14 +31,18 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
 
 
 def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
-    """Draw what stands behind the faces: a cell, and what the error of the distance may add."""
+    """Mark what stands behind the faces: a cell, and what the error of the distance may add."""
     start, end = placed.contacts[:, ::2], placed.contacts[:, 1::2]
-    outward, outward_end = _outward(start, placed.base), _outward(end, placed.base)
-    num_layers = np.ceil(placed.thickness).astype(np.intp)
-    for layer in range(num_layers.max(initial=0)):
-        deep = num_layers > layer
-        depth = layer + 0.5
-        draw_lines(hits, (start + depth * outward)[:, deep], (end + depth * outward_end)[:, deep])
+    if start.size == 0:
+        return
+    along = end - start
+    num_along = int(np.abs(along).max()) + 2
+    faces = start[:, :, None] + along[:, :, None] * np.linspace(0, 1, num_along)
+    layers = np.arange(0.5, placed.thickness.max())
+    depth = np.minimum(layers, placed.thickness[:, None] - 0.5)
+    behind = _outward(start, placed.base)[:, :, None] * depth
+    column, row = (faces[:, :, :, None] + behind[:, :, None, :]).astype(np.intp)
+    hits[row, column] = 1
 
 
 def draw_lines(raster: NDArray[np.uint8], start: Array, end: Array) -> None:

@@ -33,6 +33,14 @@ class PlacedEvidence:
     points: Array
 
     @property
+    def reach(self) -> float:
+        """How far free floor was seen at most, in cells."""
+        reach = self.fan.lengths.max(initial=0.0)
+        if self.rays.size:
+            reach = max(reach, np.sqrt(((self.rays - self.base[:, None]) ** 2).sum(axis=0).max()))
+        return float(reach)
+
+    @property
     def base(self) -> Array:
         """Where the base is, (2,)."""
         return self.fan.centre

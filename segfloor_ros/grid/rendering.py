@@ -44,13 +44,13 @@ def _trinary(cells: NDArray[np.uint8], settings: OccupancyGridSettings) -> NDArr
     values = np.full(256, UNKNOWN, np.int8)
     values[: ZERO - steps(settings.free_log_odds_needed) + 1] = FREE
     values[ZERO + steps(settings.occupied_log_odds) :] = OCCUPIED
-    return values[cells]
+    return cv2.LUT(cells, values.view(np.uint8)).view(np.int8)
 
 
 def _percent(cells: NDArray[np.uint8]) -> NDArray[np.int8]:
     log_odds = (np.arange(256) - ZERO) * QUANTUM
     percent = np.rint(100 / (1 + np.exp(-log_odds))).astype(np.int8)
-    return percent[cells]
+    return cv2.LUT(cells, percent.view(np.uint8)).view(np.int8)
 
 
 def _unreached(
@@ -64,10 +64,10 @@ def _unreached(
     free = (state == FREE).astype(np.uint8)
     num, part = cv2.connectedComponents(free, connectivity=4, ltype=cv2.CV_32S)
     inside = (rows >= 0) & (rows < state.shape[0]) & (columns >= 0) & (columns < state.shape[1])
-    reached = np.zeros(num, np.bool_)
-    reached[part[rows[inside], columns[inside]]] = True
-    reached[0] = True
-    return ~reached[part]
+    unreached = np.ones(num, np.bool_)
+    unreached[part[rows[inside], columns[inside]]] = False
+    unreached[0] = False
+    return unreached.take(part)
 
 
 def _narrow(state: NDArray[np.int8], size: int) -> NDArray[np.bool_]:
