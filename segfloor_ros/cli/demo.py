@@ -14,10 +14,7 @@ from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.evaluation.map_score import compare, score_map
 from segfloor_ros.evaluation.overlay import save_overlay
-from segfloor_ros.evaluation.report import write_report
-from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.evaluation.truth import load_truth, read_map
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 """A drive through the shipped scene corridor1 with its truth, made by `segfloor simulate corridor1
@@ -50,9 +47,13 @@ def demo(
 
 def _print_scores(out: Path) -> None:
     """Print how good map and path are; the last line is the path of the report."""
+    # Imported here: evo and matplotlib take a second that no other command should wait for.
+    from segfloor_ros.evaluation.report import write_report
+    from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+
     truth = load_truth(DRIVE)
     pose = truth.start_pose or (0.0, 0.0, 0.0)
-    grid = load_map(out / 'map.yaml')
+    grid = read_map(out / 'map.yaml')
     console.print(map_table(score_map(grid, truth, pose)))
     path = score_trajectory(match_files(out, DRIVE))
     console.print(

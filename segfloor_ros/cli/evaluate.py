@@ -19,12 +19,8 @@ from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, MapScore, compare
 from segfloor_ros.evaluation.overlay import save_overlay
 from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
 from segfloor_ros.evaluation.raster import from_frame
-from segfloor_ros.evaluation.report import write_report
-from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
-from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
-from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses, read_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
@@ -68,7 +64,7 @@ def evaluate_map(
     as_json: JsonOption = False,
 ) -> None:
     """Road-map precision and recall, raw and after opening, and precision and recall per cell."""
-    grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
+    grid = read_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
     known = load_truth(truth)
     pose = resolve_alignment(align, grid, known)
     known = _with_drive(known, trajectory, fov, pose)
@@ -100,6 +96,10 @@ def evaluate_trajectory(
     as_json: JsonOption = False,
 ) -> None:
     """ATE and RPE after rigid alignment, with the share of frames that were tracked."""
+    # Imported here: evo and matplotlib take a second that no other command should wait for.
+    from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+    from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
+
     matched = match_files(estimate, truth, frames)
     score = score_trajectory(matched)
     if plot is not None:
@@ -154,6 +154,8 @@ def evaluate_report(
     ] = None,
 ) -> None:
     """Write report.html, one page with all pictures of a run, into its folder."""
+    from segfloor_ros.evaluation.report import write_report
+
     typer.echo(f'report: {write_report(run, truth)}')
 
 

@@ -11,9 +11,9 @@ from itertools import product
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.fft import irfft2, next_fast_len, rfft2
 
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.raster import (
     FREE,
     OCCUPIED,
@@ -39,12 +39,12 @@ def find_alignment(
 ) -> Pose2d:
     """Return where the estimate's frame lies in the truth's frame.
 
-    near: a pose to start from; without one the whole truth is searched. Raises MapError when the
+    near: a pose to start from; without one the whole truth is searched. Raises InputError when the
     estimate has no known cell.
     """
     free, occupied = _known_points(estimate)
     if not len(free) + len(occupied):
-        raise MapError('the estimated map has no known cell to align by; use --align none')
+        raise InputError('the estimated map has no known cell to align by; use --align none')
     gain = _gain_images(truth)
     start = near or _search_everywhere(free, occupied, truth, gain)
     return _refine(free, occupied, truth, gain, start)
@@ -130,8 +130,7 @@ def _search_everywhere(
         turned = from_frame(np.vstack([free, occupied]), (0.0, 0.0, float(yaw)))
         low = np.floor(turned.min(axis=0) / COARSE_CELL_M) * COARSE_CELL_M
         counts = [_histogram(part, low, turned) for part in np.split(turned, [len(free)])]
-        score = fftconvolve(free_gain, counts[0][::-1, ::-1])
-        score += fftconvolve(occupied_gain, counts[1][::-1, ::-1])
+        score = _correlate([free_gain, occupied_gain], counts)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         if score[row, column] > best_score:
             best_score = float(score[row, column])
@@ -139,6 +138,19 @@ def _search_everywhere(
             shift = np.array(truth.origin_xy_m) + offset * COARSE_CELL_M - low
             best = (float(shift[0]), float(shift[1]), float(yaw))
     return best
+
+
+def _correlate(gains: list[Array], counts: list[Array]) -> Array:
+    """Return, for every shift of the counts over the gains, what they earn together; shift zero
+    of the last row and column of the counts is at (0, 0) (full convolution of mirrored counts).
+    """
+    shape = [a + b - 1 for a, b in zip(gains[0].shape, counts[0].shape, strict=True)]
+    padded = [next_fast_len(side, real=True) for side in shape]
+    spectra = [
+        rfft2(gain, padded) * rfft2(count[::-1, ::-1], padded)
+        for gain, count in zip(gains, counts, strict=True)
+    ]
+    return np.asarray(irfft2(np.sum(spectra, axis=0), padded)[: shape[0], : shape[1]])
 
 
 def _histogram(points: Array, low: Array, all_points: Array) -> Array:

@@ -52,7 +52,7 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     """Write report.html into the results folder of a run and return its path.
 
     truth: a scene folder or a true map to score against. The recording is opened again for the
-    keyframes' images. Raises InputError or MapError naming what is missing.
+    keyframes' images. Raises InputError naming what is missing.
     """
     data = read_run(run, truth)
     page = _page(data)

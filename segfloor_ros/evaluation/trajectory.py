@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,8 @@ class MatchedTrajectories:
 
 def match_files(estimate: Path, truth: Path, frames: int | None = None) -> MatchedTrajectories:
     """Read two trajectories and match them by time. frames: how many the recording has; without
-    it, one per true pose, or fewer where the truth is denser than the estimate.
+    it, as summary.json of a run says, or one per true pose, or fewer where the truth is denser
+    than the estimate.
 
     A folder stands for its camera_trajectory.txt (a run) or poses.txt (a recording). Raises
     InputError when fewer than three poses match.
@@ -66,7 +68,8 @@ def match_files(estimate: Path, truth: Path, frames: int | None = None) -> Match
     estimate_file = _file_in(estimate, 'camera_trajectory.txt')
     truth_file = _file_in(truth, 'poses.txt')
     estimated, true = read_trajectory(estimate_file), read_trajectory(truth_file)
-    return match(estimated, true, frames or _expected_frames(estimated[0], true[0]))
+    frames = frames or _frames_of_run(estimate) or _expected_frames(estimated[0], true[0])
+    return match(estimated, true, frames)
 
 
 def match(
@@ -166,6 +169,17 @@ def _expected_frames(estimated_s: Array, true_s: Array) -> int:
     if float(np.median(np.diff(true_s))) > 0.75 * period_s:
         return len(true_s)
     return round(float(true_s[-1] - true_s[0]) / period_s) + 1
+
+
+def _frames_of_run(folder: Path) -> int:
+    """Return how many frames a run had by its summary.json, 0 where there is none."""
+    path = folder / 'summary.json'
+    if not path.is_file():
+        return 0
+    try:
+        return int(json.loads(path.read_text())['frames'])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f'{path}: does not say how many frames there were') from None
 
 
 def _file_in(path: Path, name: str) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.evaluation.trajectory_files import read_table, read_trajectory
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import load_map
@@ -33,13 +33,21 @@ class MapTruth:
     fov_rad: float = float(DEFAULT_FOV_RAD)
 
 
+def read_map(path: Path) -> OccupancyGrid:
+    """Read a map YAML that a user named. Raises InputError naming the file."""
+    try:
+        return load_map(path)
+    except MapError as error:
+        raise InputError(str(error)) from None
+
+
 def load_truth(path: Path) -> MapTruth:
     """Read a true map from a map YAML, or with poses from a scene folder (map.yaml, scene.yaml,
-    base_poses.txt). Raises InputError or MapError naming the file.
+    base_poses.txt). Raises InputError naming the file.
     """
     if not path.is_dir():
-        return MapTruth(load_map(path))
-    grid = load_map(path / 'map.yaml')
+        return MapTruth(read_map(path))
+    grid = read_map(path / 'map.yaml')
     scene_file = path / 'scene.yaml'
     if not scene_file.is_file():
         return MapTruth(grid)

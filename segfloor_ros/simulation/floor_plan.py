@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.evaluation.truth import read_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, OccupancyGrid
 from segfloor_ros.simulation.tour import plan_tour
 
@@ -34,9 +34,9 @@ def is_map_file(values: dict[str, Any]) -> bool:
 
 def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     """Return a scene's values: boxes for the occupied cells and, unless `overrides` has waypoints,
-    a tour through the free space. Raises MapError or InputError naming the file.
+    a tour through the free space. Raises InputError naming the file.
     """
-    grid = load_map(file)
+    grid = read_map(file)
     occupied = grid.cells == OCCUPIED
     if not occupied.any():
         raise InputError(f'{file}: the map has no occupied cell to build walls from')

@@ -94,6 +94,14 @@ def test_bad_alignment_and_bad_scene(tmp_path):
         load_truth(scene)
 
 
+def test_missing_maps_are_named(tmp_path):
+    scene = write_scene(tmp_path / 'scene')
+    with pytest.raises(InputError, match=r'none.*map\.yaml'):
+        run('map', tmp_path / 'none' / 'map.yaml', scene)
+    with pytest.raises(InputError, match=r'run.*summary\.json'):
+        run('report', tmp_path / 'run')
+
+
 def test_trajectory_and_floor_commands(tmp_path):
     poses = np.tile(np.eye(4)[:3].ravel(), (30, 1))
     poses[:, 11] = np.arange(30) * 0.1

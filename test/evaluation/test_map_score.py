@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.alignment import find_alignment
 from segfloor_ros.evaluation.map_score import compare, opened, score_cells, score_map
 from segfloor_ros.evaluation.overlay import (
@@ -219,7 +219,7 @@ def test_alignment_is_found(near):
 def test_alignment_of_an_unknown_map_is_refused():
     truth = grid_of(room(5, 5))
     unknown = OccupancyGrid(np.full((5, 5), -1, np.int8), 0.1, (0.0, 0.0))
-    with pytest.raises(MapError, match='no known cell'):
+    with pytest.raises(InputError, match='no known cell'):
         find_alignment(unknown, truth)
 
 

@@ -78,6 +78,18 @@ def test_denser_truth_does_not_count_as_lost_frames(tmp_path):
     assert score_trajectory(matched).tracked == 1.0
 
 
+def test_a_run_knows_how_many_frames_it_had(tmp_path):
+    run = tmp_path / 'run'
+    run.mkdir()
+    write_tum(run / 'camera_trajectory.txt', drive(50))
+    write_tum(tmp_path / 'truth.txt', drive(50))
+    (run / 'summary.json').write_text('{"frames": 80}')
+    assert score_trajectory(match_files(run, tmp_path / 'truth.txt')).tracked == 50 / 80
+    (run / 'summary.json').write_text('{}')
+    with pytest.raises(InputError, match=r'summary\.json'):
+        match_files(run, tmp_path / 'truth.txt')
+
+
 def test_short_path_has_no_error_over_a_metre(tmp_path):
     result = score(tmp_path, drive(6), drive(6))
     assert np.isnan(result.rpe_translation_m)
