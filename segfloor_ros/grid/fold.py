@@ -18,7 +18,7 @@ from segfloor_ros.grid.blocking import Horizon
 from segfloor_ros.grid.evidence import KeyframeEvidence, hit_range_m
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
 from segfloor_ros.grid.hits import draw_hits, draw_lines
-from segfloor_ros.grid.log_odds import ZERO, LogOddsRaster, steps
+from segfloor_ros.grid.log_odds import ZERO, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
@@ -43,18 +43,16 @@ class EvidenceFolder:
         far = np.where(value >= self._occupied, value, tentative)
         self._lowered_far = far.astype(np.uint8)
 
-    def fold(
-        self,
-        raster: LogOddsRaster,
-        evidence: KeyframeEvidence,
-        pose: Pose2d,
-        previous: Pose2d | None,
-    ) -> None:
-        """Add the evidence of a keyframe with its base at `pose`; the base came there from
-        `previous` in a straight line.
+    def place(
+        self, evidence: KeyframeEvidence, pose: Pose2d, previous: Pose2d | None
+    ) -> PlacedEvidence:
+        """Lay evidence on the raster with the base at `pose`; the base came there from `previous`
+        in a straight line.
         """
-        placed = place(evidence, pose, previous, self._resolution_m, self._radius_m)
-        cells = raster.patch(placed.low, placed.high)
+        return place(evidence, pose, previous, self._resolution_m, self._radius_m)
+
+    def fold(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
+        """Add evidence to the cells from `placed.low` up to, not including, `placed.high`."""
         free = self._draw_free(cells, placed)
         hits = draw_hits(free, placed)
         free[hits > 0] = 0

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fold import EvidenceFolder
-from segfloor_ros.grid.log_odds import LogOddsRaster, Snapshot
+from segfloor_ros.grid.log_odds import LogOddsRaster
 from segfloor_ros.grid.placing import Pose2d
 
-CHECKPOINT_EVERY = 16
-_KEEP_GROWTH = 8
+UNDO_BYTES = 6_000_000
 _MAX_STRIDE_M = 2.0
 """Between keyframes farther apart than this the base's way is not known."""
 
@@ -19,9 +20,9 @@ _MAX_STRIDE_M = 2.0
 class EvidenceHistory:
     """Folds the keyframes into the raster, and folds them anew from the first one that moved.
 
-    Copies of the raster from a while ago save most of the work: moves after local bundle
-    adjustment concern the latest keyframes. The raster depends on evidence and poses alone, not on
-    how often and when it was asked for.
+    What the latest keyframes overwrote is kept, so that they can be taken back one by one: moves
+    after local bundle adjustment concern these. The raster depends on evidence and poses alone,
+    not on how often and when it was asked for.
     """
 
     def __init__(self, folder: EvidenceFolder) -> None:
@@ -30,7 +31,8 @@ class EvidenceHistory:
         self._poses: NDArray[np.float64] = np.zeros((0, 3))
         self._raster = LogOddsRaster()
         self._done = 0
-        self._checkpoints: dict[int, Snapshot] = {}
+        self._undo: deque[tuple[tuple[int, int], NDArray[np.uint8]]] = deque()
+        self._undo_bytes = 0
 
     def __len__(self) -> int:
         return len(self._evidence)
@@ -52,25 +54,24 @@ class EvidenceHistory:
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Forget the evidence of some keyframes (K,)."""
-        first = int(np.argmax(gone))
+        self._return_to(int(np.argmax(gone)))
         self._evidence = [e for e, g in zip(self._evidence, gone, strict=True) if not g]
         self._poses = self._poses[~gone]
-        self._return_to(first)
 
     def fold_anew(self, folder: EvidenceFolder) -> None:
         """Fold all evidence again by other rules."""
         self._folder = folder
-        self._return_to(0)
+        self._start_over()
 
     def raster(self) -> LogOddsRaster:
         """Return the raster of all keyframes."""
         while self._done < len(self._evidence):
-            if self._done % CHECKPOINT_EVERY == 0 and self._done:
-                self._checkpoints[self._done] = self._raster.snapshot()
-                self._thin_checkpoints()
-            pose = self._pose(self._done)
             evidence = self._evidence[self._done]
-            self._folder.fold(self._raster, evidence, pose, self._previous(self._done))
+            pose, previous = self._pose(self._done), self._previous(self._done)
+            placed = self._folder.place(evidence, pose, previous)
+            cells = self._raster.patch(placed.low, placed.high)
+            self._remember(placed.low, cells)
+            self._folder.fold(cells, placed)
             self._done += 1
         return self._raster
 
@@ -84,21 +85,25 @@ class EvidenceHistory:
         stride = np.hypot(*(self._poses[index, :2] - self._poses[index - 1, :2]))
         return self._pose(index - 1) if stride <= _MAX_STRIDE_M else None
 
-    def _return_to(self, index: int) -> None:
-        """Make the raster one of keyframes before `index` only, or of fewer."""
-        if index >= self._done:
-            return
-        self._checkpoints = {n: s for n, s in self._checkpoints.items() if n <= index}
-        self._done = max(self._checkpoints, default=0)
-        self._raster = LogOddsRaster()
-        if self._done:
-            self._raster.restore(self._checkpoints[self._done])
+    def _remember(self, low: tuple[int, int], cells: NDArray[np.uint8]) -> None:
+        self._undo.append((low, cells.copy()))
+        self._undo_bytes += cells.size
+        while self._undo_bytes > UNDO_BYTES:
+            self._undo_bytes -= self._undo.popleft()[1].size
 
-    def _thin_checkpoints(self) -> None:
-        """Keep the two latest, and the latest that is much older."""
-        numbers = sorted(self._checkpoints, reverse=True)
-        old = [n for n in numbers[2:] if self._done - n >= _KEEP_GROWTH * CHECKPOINT_EVERY]
-        middle = numbers[2:][-1:] if not old else [old[0]]
-        waiting = [n for n in numbers[2:] if n > middle[0]][-1:] if middle else []
-        keep = {*numbers[:2], *middle, *waiting}
-        self._checkpoints = {n: s for n, s in self._checkpoints.items() if n in keep}
+    def _return_to(self, index: int) -> None:
+        """Make the raster one of the keyframes before `index`, or of none."""
+        if self._done - index > len(self._undo):
+            self._start_over()
+        while self._done > index:
+            low, cells = self._undo.pop()
+            self._undo_bytes -= cells.size
+            high = (low[0] + cells.shape[0], low[1] + cells.shape[1])
+            self._raster.patch(low, high)[:] = cells
+            self._done -= 1
+
+    def _start_over(self) -> None:
+        self._raster = LogOddsRaster()
+        self._done = 0
+        self._undo.clear()
+        self._undo_bytes = 0

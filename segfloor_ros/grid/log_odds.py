@@ -6,8 +6,6 @@ integers, so that the same observations give the same cells on every machine.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,14 +18,6 @@ CHUNK = 64
 def steps(log_odds: float) -> int:
     """Return the number of steps (at least one) of a positive amount of log-odds."""
     return max(1, round(log_odds / QUANTUM))
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """A copy of a raster at some time."""
-
-    first_cell: tuple[int, int]
-    cells: NDArray[np.uint8]
 
 
 class LogOddsRaster:
@@ -46,14 +36,6 @@ class LogOddsRaster:
         self._include(low, high)
         row, column = low[0] - self.first_cell[0], low[1] - self.first_cell[1]
         return self.cells[row : row + high[0] - low[0], column : column + high[1] - low[1]]
-
-    def snapshot(self) -> Snapshot:
-        """Return a copy of the present state."""
-        return Snapshot(self.first_cell, self.cells.copy())
-
-    def restore(self, state: Snapshot) -> None:
-        """Go back to an earlier state."""
-        self.first_cell, self.cells = state.first_cell, state.cells.copy()
 
     def _include(self, low: tuple[int, int], high: tuple[int, int]) -> None:
         first, last = self.first_cell, self._end()

@@ -20,6 +20,8 @@ from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
 
+_LEAST_MOVE_M = 0.005
+
 
 class OccupancyGridMapper:
     """Builds the map from the keyframes' evidence, and lets it follow their poses."""
@@ -72,6 +74,7 @@ class OccupancyGridMapper:
         moved_m = np.hypot(now[:, 0] - then[:, 0], now[:, 1] - then[:, 1])
         turn = np.abs(np.remainder(now[:, 2] - then[:, 2] + np.pi, 2 * np.pi) - np.pi)
         limit_m = self._settings.move_fraction * self._settings.resolution_m
+        limit_m = max(limit_m, _LEAST_MOVE_M)
         moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
         if len(moved):
             self._history.move(int(moved[0]), now[moved[0] :])

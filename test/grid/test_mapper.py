@@ -10,6 +10,7 @@ from conftest import Drive, World, cells_at, no_points, path_of
 
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.grid import history
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
@@ -59,7 +60,11 @@ def test_the_same_map_however_often_it_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize('moved', [[49], [33, 40], [17], [0], list(range(60))])
-def test_after_moves_the_map_equals_one_built_from_scratch(moved: list[int]) -> None:
+@pytest.mark.parametrize('undo_bytes', [200_000, history.UNDO_BYTES])
+def test_after_moves_the_map_equals_one_built_from_scratch(
+    monkeypatch: pytest.MonkeyPatch, moved: list[int], undo_bytes: int
+) -> None:
+    monkeypatch.setattr(history, 'UNDO_BYTES', undo_bytes)
     recording = Recording(60)
     mapper = OccupancyGridMapper(OccupancyGridSettings())
     for k in range(59):
