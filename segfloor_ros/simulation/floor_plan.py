@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.truth import read_map
+from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, OccupancyGrid
 from segfloor_ros.simulation.tour import plan_tour
 
@@ -36,7 +36,10 @@ def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     """Return a scene's values: boxes for the occupied cells and, unless `overrides` has waypoints,
     a tour through the free space. Raises InputError naming the file.
     """
-    grid = read_map(file)
+    try:
+        grid = load_map(file)
+    except MapError as error:
+        raise InputError(str(error)) from None
     occupied = grid.cells == OCCUPIED
     if not occupied.any():
         raise InputError(f'{file}: the map has no occupied cell to build walls from')
