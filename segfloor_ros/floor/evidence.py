@@ -89,22 +89,23 @@ def judge(
     profile: FloorProfile,
     disparity: NDArray[np.float32],
     textured: NDArray[np.bool_],
-    num_disparities: int,
+    against: NDArray[np.bool_],
+    table: HeightTable,
     settings: FloorSegmentationSettings,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves.
 
-    A disparity counts where there is texture to match.
+    textured: where a disparity means something; against: where the images contradict the floor.
     """
-    table = HeightTable.of(view.line, profile, num_disparities, settings)
     index = (disparity * SUBPIXEL).astype(np.intp)
     height = table.offset[index] - table.scale[index] * view.derolled
     above = height > table.up[index]
-    below = height < -table.down[index]
+    off = above | (height < -table.down[index])
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
-    mask[textured & (disparity > 0)] = FLOOR
-    mask[(above | below) & textured] = NOT_FLOOR
-    low = above & textured & (height < _CONTACT_HEIGHT_M + np.float32(settings.step_height_m))
+    mask[textured & (disparity > 0) & ~off] = FLOOR
+    sure = textured & against
+    mask[off & sure] = NOT_FLOOR
+    low = above & sure & (height < _CONTACT_HEIGHT_M + np.float32(settings.step_height_m))
     mask[_below_contact(view, profile, disparity, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     return Evidence(mask, height)

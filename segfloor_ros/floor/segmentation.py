@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
-from segfloor_ros.floor.evidence import Evidence, FloorView, judge
+from segfloor_ros.floor.evidence import Evidence, FloorView, HeightTable, judge
 from segfloor_ros.floor.filling import fill_gaps, floor_pixels, floor_positions, trim_to_edges
 from segfloor_ros.floor.histograms import filtered_v_disparity
 from segfloor_ros.floor.memory import REACH_M, FloorMemory, cells_around, floor_at
@@ -21,11 +21,12 @@ from segfloor_ros.floor.observation import (
     FloorObservation,
     FloorScan,
 )
+from segfloor_ros.floor.photometric import floor_costs
 from segfloor_ros.floor.plane import PlaneFit, Samples, refine
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
 from segfloor_ros.floor.scan import ScanGeometry, make_scan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.floor.texture import enough_texture_grey, texture_grey
+from segfloor_ros.floor.texture import enough_texture_grey, noise_grey, texture_grey
 from segfloor_ros.floor.tracking import FloorTracker
 from segfloor_ros.geometry import Array
 
@@ -72,10 +73,14 @@ class FloorSegmentation:
         self._tracker.update(mount, T_map_base, fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         textured = texture > enough
-        profile = self._profile(view, below, textured)
-        evidence = judge(
-            view, profile, below, textured, self._matcher.num_disparities, self._settings
-        )
+        profile = self._profile(view, below, texture > 2 * enough)
+        costs = floor_costs(view, profile, left[first_row:], right[first_row:], below)
+        noise = noise_grey(left[first_row:])
+        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, self._settings)
+        against = costs.floor - costs.matched > 1.0 + 0.5 * noise
+        distinct = costs.shifted - costs.floor > 0.4 + 0.1 * noise
+        self.dbg = (costs, textured, against, distinct, fit, profile)
+        evidence = judge(view, profile, below, textured, against, table, self._settings)
         mask = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
         evidence = Evidence(mask, evidence.height_m)
         mask = self._recall(view, mask, T_map_base)
@@ -130,7 +135,7 @@ class FloorSegmentation:
         camera = self._camera
         step = max(2, round(math.sqrt(disparity.size / _PLANE_SAMPLES)))
         rows, columns = np.nonzero(disparity[::step, ::step] > 0)
-        grey = texture[::step, ::step][rows, columns].astype(np.float64) / (2 * enough)
+        grey = texture[::step, ::step][rows, columns].astype(np.float64) / (4 * enough)
         found = disparity[::step, ::step][rows, columns].astype(np.float64)
         uv = np.stack([columns * step, rows * step + first_row], axis=1)
         samples = Samples(

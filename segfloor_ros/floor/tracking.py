@@ -15,7 +15,7 @@ from segfloor_ros.floor.plane import PlaneFit, angles_height_of
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
-_TILT_PER_M = math.radians(1.0)
+_TILT_PER_M = math.radians(0.4)
 """How far a floor's slope drifts from what it was a metre ago, with SLAM's drift; one sigma."""
 _CLIMB_PER_M = 0.01
 _MAX_PRIOR_TILT_RAD = math.radians(5.0)
