@@ -7,10 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.evidence import FloorView
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.geometry import Array
 
+_MIN_REGION_PX = 40
+_MIN_SLOPE = 1.5
+"""Grey levels per pixel at half resolution; weaker edges bound no region."""
 _EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
 
@@ -34,6 +37,65 @@ def fill_gaps(
     filled = mask.copy()
     filled[~known & between & (right - left <= longest[:, None])] = FLOOR
     return filled
+
+
+def fill_regions(
+    mask: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+    consistent: NDArray[np.bool_],
+    min_share: float,
+) -> NDArray[np.uint8]:
+    """Return the mask with NO_EVIDENCE turned to floor in regions that look alike, continue
+    floor, and that the images do not contradict (`consistent`).
+
+    A region is bounded by edges of the image stronger than the floor's own; `min_share` of it must
+    be floor by evidence. Within it a pixel becomes floor below floor, the next evidence up its
+    column, or between floor on its left and right. Half the resolution does.
+    """
+    step = 2
+    small = mask[::step, ::step]
+    floor = small == FLOOR
+    if np.count_nonzero(floor) < _MIN_REGION_PX:
+        return mask
+    smooth = cv2.blur(image, (5, 5))[::step, ::step]
+    slope = cv2.magnitude(
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
+    )
+    limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
+    alike = (small != NOT_FLOOR) & consistent[::step, ::step] & (slope < limit)
+    count, region = cv2.connectedComponents(
+        cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8)), connectivity=4
+    )
+    area = np.bincount(region.ravel(), minlength=count)
+    supported = np.bincount(region[floor], minlength=count)
+    good = (supported >= _MIN_REGION_PX) & (supported >= min_share * area)
+    good[0] = False
+    inside = cv2.dilate(good[region].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    fill = inside & alike & (small == NO_EVIDENCE) & (_under_floor(small) | _between_floor(small))
+    filled = mask.copy()
+    grown = cv2.resize(fill.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    filled[(grown > 0) & (mask == NO_EVIDENCE)] = FLOOR
+    return filled
+
+
+def _under_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell where the next evidence up the column is floor."""
+    return _last_known(mask) == FLOOR
+
+
+def _between_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell where the next evidence to the left and to the right is floor."""
+    left = _last_known(mask.T).T
+    right = _last_known(mask[:, ::-1].T).T[:, ::-1]
+    return (left == FLOOR) & (right == FLOOR)
+
+
+def _last_known(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return per pixel the last evidence at or before it, down its column."""
+    rows = np.arange(mask.shape[0], dtype=np.int32)[:, None]
+    last = np.maximum.accumulate(np.where(mask != NO_EVIDENCE, rows, 0), axis=0)
+    return np.take_along_axis(mask, last, axis=0)
 
 
 def trim_to_edges(

@@ -27,7 +27,7 @@ _SHIFT_PX = 2.0
 class FloorCosts:
     """Mean absolute differences of left and right in grey levels, (R, W) float32.
 
-    floor: were it floor; matched: at the matched disparity, infinite without one; shifted: at the
+    floor: were it floor, 0 where the right image does not reach; matched: at the matched disparity, infinite without one; shifted: at the
     better of two disparities a little off the floor's.
     """
 
@@ -60,11 +60,13 @@ def floor_costs(
     shifted = np.minimum(cost(floor_px - _SHIFT_PX), cost(floor_px + _SHIFT_PX))
     matched = cost(matched_px)
     matched[matched_px <= 0] = np.inf
+    floor = cost(floor_px)
+    floor[columns < floor_px] = 0
     size = (width, height)
     return FloorCosts(
         *(
             cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
-            for values in (cost(floor_px), matched, shifted)
+            for values in (floor, matched, shifted)
         )
     )
 

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
 from segfloor_ros.floor.evidence import Evidence, FloorView, HeightTable, judge
-from segfloor_ros.floor.filling import fill_gaps, floor_pixels, floor_positions, trim_to_edges
+from segfloor_ros.floor.filling import (
+    fill_gaps,
+    fill_regions,
+    floor_pixels,
+    floor_positions,
+    trim_to_edges,
+)
 from segfloor_ros.floor.histograms import filtered_v_disparity
 from segfloor_ros.floor.memory import REACH_M, FloorMemory, cells_around, floor_at
 from segfloor_ros.floor.observation import (
@@ -77,13 +83,15 @@ class FloorSegmentation:
         costs = floor_costs(view, profile, left[first_row:], right[first_row:], below)
         noise = noise_grey(left[first_row:])
         table = HeightTable.of(view.line, profile, self._matcher.num_disparities, self._settings)
-        against = costs.floor - costs.matched > 1.0 + 0.5 * noise
+        against = costs.floor > 1.3 * costs.matched + 1.0 + 0.5 * noise
         distinct = costs.shifted - costs.floor > 0.4 + 0.1 * noise
         self.dbg = (costs, textured, against, distinct, fit, profile)
         evidence = judge(view, profile, below, textured, against, table, self._settings)
         mask = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
         evidence = Evidence(mask, evidence.height_m)
         mask = self._recall(view, mask, T_map_base)
+        consistent = ~against & (costs.floor < 4 + 2 * noise)
+        mask = fill_regions(mask, left[first_row:], consistent, 0.1)
         mask = fill_gaps(view, profile, mask, self._settings.fill_gap_m)
         scan = self._scan(view, below, evidence, mask, T_map_base)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
