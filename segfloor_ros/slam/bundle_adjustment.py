@@ -114,31 +114,39 @@ class _Step:
 
 @dataclass(frozen=True)
 class _System:
-    """The normal equations by blocks: cameras U, points V, mixed W (dense: 6 K x 3 P), right-
-    hand sides.
+    """The normal equations by blocks: cameras U (K, 6, 6), points V (P, 3, 3), and W (M, 6, 3) of
+    each pair (keyframe[m], point[m]) that an observation ties together; right-hand sides.
     """
 
     U: Array
     V: Array
     W: Array
+    keyframe: NDArray[np.intp]
+    point: NDArray[np.intp]
     camera_rhs: Array
     point_rhs: Array
 
     def solve(self, damping: float) -> _Step:
         """Solve the damped system by the Schur complement on the cameras."""
         free, points = len(self.U), len(self.V)
-        V_inverse = np.linalg.inv(_damped(self.V, damping))
-        WV = np.einsum('apb,pbc->apc', self.W, V_inverse).reshape(6 * free, 3 * points)
-        W = self.W.reshape(6 * free, 3 * points)
-        S = -WV @ W.T
+        V_inverse = _inverse_symmetric(_damped(self.V, damping))
+        W = self._dense(self.W, free, points)
+        WV = self._dense(self.W @ V_inverse[self.point], free, points)
+        S = -WV.T @ W
         diagonal = _damped(self.U, damping)
         for k in range(free):
             S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += diagonal[k]
-        rhs = self.camera_rhs.ravel() - WV @ self.point_rhs.ravel()
+        rhs = self.camera_rhs.ravel() - self.point_rhs.ravel() @ WV
         twists = np.linalg.solve(S, rhs)
-        back = self.point_rhs - (W.T @ twists).reshape(points, 3)
-        shifts = np.einsum('pab,pb->pa', V_inverse, back)
+        back = self.point_rhs - (W @ twists).reshape(points, 3)
+        shifts = (V_inverse @ back[..., None])[..., 0]
         return _Step(twists.reshape(free, 6), shifts)
+
+    def _dense(self, blocks: Array, free: int, points: int) -> Array:
+        """Return the transpose (3 P, 6 K) of the matrix that the blocks (M, 6, 3) are part of."""
+        dense = np.zeros((points, 3, free, 6))
+        dense[self.point, :, self.keyframe] = blocks.transpose(0, 2, 1)
+        return dense.reshape(3 * points, 6 * free)
 
     def predicted_decrease(self, step: _Step, damping: float) -> float:
         """Return how much the cost falls by the quadratic model."""
@@ -148,6 +156,22 @@ class _System:
             (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
             + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs)).sum()
         )
+
+
+def _inverse_symmetric(A: Array) -> Array:
+    """Return the inverses of symmetric matrices (N, 3, 3) by cofactors; far faster than
+    LAPACK's.
+    """
+    a, b, c = A[:, 0, 0], A[:, 0, 1], A[:, 0, 2]
+    d, e, f = A[:, 1, 1], A[:, 1, 2], A[:, 2, 2]
+    inverse = np.empty_like(A)
+    inverse[:, 0, 0], inverse[:, 1, 1] = d * f - e * e, a * f - c * c
+    inverse[:, 2, 2] = a * d - b * b
+    inverse[:, 0, 1] = inverse[:, 1, 0] = c * e - b * f
+    inverse[:, 0, 2] = inverse[:, 2, 0] = b * e - c * d
+    inverse[:, 1, 2] = inverse[:, 2, 1] = b * c - a * e
+    determinant = a * inverse[:, 0, 0] + b * inverse[:, 0, 1] + c * inverse[:, 0, 2]
+    return inverse / determinant[:, None, None]
 
 
 def _damped(blocks: Array, damping: float) -> Array:
@@ -177,9 +201,8 @@ def _linearise(camera: StereoCamera, problem: BundleProblem, state: _State) -> _
     camera_rhs = -_sum_by(
         k, _products(WJ_pose, state.residual[free][..., None])[..., 0], problem.num_free
     )
-    W = np.zeros((problem.num_free, 6, num_points, 3))
-    W[k, :, p] = _products(WJ_pose, J_point[free])
-    return _System(U, V, W.reshape(problem.num_free * 6, num_points, 3), camera_rhs, point_rhs)
+    W = _products(WJ_pose, J_point[free])
+    return _System(U, V, W, k, p, camera_rhs, point_rhs)
 
 
 def _products(A: Array, B: Array) -> Array:

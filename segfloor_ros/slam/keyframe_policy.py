@@ -12,6 +12,9 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 SEEN_BY_SEVERAL = 2
 """Keyframes that must observe a point for it to count as reliable."""
 
+MUCH_NEW = 2.5
+"""Novelty at which condition A2 does not count frames any more."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -35,16 +38,19 @@ def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
     """Decide by the published conditions; A1 and A2 also ask for a view that is new, so that a
     robot that stands still adds nothing.
     """
-    new_view = _is_new_view(view, settings)
+    novelty = _novelty(view, settings)
+    new_view = novelty > 1
+    due = view.frames_since >= settings.keyframe_min_frames or novelty > MUCH_NEW
     a1 = view.frames_since >= settings.keyframe_max_frames and new_view
-    a2 = view.mapper_idle and view.frames_since >= settings.keyframe_min_frames and new_view
+    a2 = view.mapper_idle and due and new_view
     a3 = view.num_tracked < settings.keyframe_tracked_ratio * view.num_reliable
     b = view.num_tracked > settings.keyframe_min_tracked
     return b and (a1 or a2 or a3)
 
 
-def _is_new_view(view: View, settings: StereoSlamSettings) -> bool:
+def _novelty(view: View, settings: StereoSlamSettings) -> float:
+    """Return the motion since the last keyframe, in units of what makes a view new."""
     moved = float(np.linalg.norm(view.T_last_now[:3, 3]))
     turned = rotation_angle(view.T_last_now[:3, :3])
-    far = moved > settings.keyframe_motion_ratio * view.median_depth_m
-    return far or turned > settings.keyframe_turn_rad
+    near = settings.keyframe_motion_ratio * view.median_depth_m
+    return max(moved / near, turned / settings.keyframe_turn_rad)

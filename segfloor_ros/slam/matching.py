@@ -14,7 +14,7 @@ from segfloor_ros.slam.features import Features
 _BITS = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
 _BITS16 = (_BITS[:, None] + _BITS[None, :]).ravel()
 
-NEIGHBOURS = 16
+NEIGHBOURS = 12
 """Features looked at around a predicted pixel; a radius holds about ten."""
 
 Matches = tuple[NDArray[np.intp], NDArray[np.intp]]

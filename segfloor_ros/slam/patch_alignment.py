@@ -32,6 +32,8 @@ MAX_UNEXPLAINED = 0.5
 
 MAX_SHIFT_PX = 2.0
 MAX_LAST_STEP_PX = 0.1
+MAX_SHIFT_STEP_PX = 1.0
+MAX_SLOPE_STEP = 0.3
 
 Patches = NDArray[np.float32]
 
@@ -71,24 +73,25 @@ def align_patches(
     A = zoom[:, None, None] * np.eye(2)
     offset = np.zeros((len(template), 2))
     prior = np.where(np.arange(J.shape[1]) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
+    max_step = np.where(prior > 0, MAX_SLOPE_STEP, MAX_SHIFT_STEP_PX)
     step = np.zeros((len(template), 2, 3))
-    for _ in range(STEPS):
+    for iteration in range(STEPS):
         warped = _warp(A, x, y) + (start_uv_px + offset)[:, :, None].astype(np.float32)
         residual = _match_brightness(_remap(image, warped[:, 0], warped[:, 1]), target, weight)
         residual -= target
         noise = residual**2 @ weight
         level = np.maximum(noise, GREY_NOISE**2).astype(np.float64) / pixels
+        if iteration == 0:
+            prior_level = level[:, None]
+            inverse = np.linalg.inv(H + prior_level[..., None] * np.diag(prior + 1e-9))
         rhs = (weighted @ residual[..., None])[..., 0].astype(np.float64)
         deviation = (A / zoom[:, None, None] - np.eye(2))[:, : J.shape[1] // 3]
-        rhs += (
-            level[:, None] * prior * np.pad(deviation, ((0, 0), (0, 0), (1, 0))).reshape(rhs.shape)
-        )
-        covariance = np.linalg.inv(H + level[:, None, None] * np.diag(prior + 1e-9))
-        found = np.clip(np.einsum('nab,nb->na', covariance, rhs), -1.0, 1.0)
+        rhs += prior_level * prior * np.pad(deviation, ((0, 0), (0, 0), (1, 0))).reshape(rhs.shape)
+        found = np.clip((inverse @ rhs[..., None])[..., 0], -max_step, max_step)
         step[:, : J.shape[1] // 3] = found.reshape(len(found), J.shape[1] // 3, 3)
-        A = A @ np.linalg.inv(np.eye(2) + step[:, :, 1:])
-        offset -= np.einsum('nij,nj->ni', A, step[:, :, 0])
-    variance = np.einsum('naa->na', covariance)[:, ::3] * level[:, None]
+        A = A @ _inverse_2x2(np.eye(2) + step[:, :, 1:])
+        offset -= (A @ step[:, :, :1])[..., 0]
+    variance = np.einsum('naa->na', inverse)[:, ::3] * level[:, None]
     sigma = np.zeros((len(template), 2))
     sigma[:, : variance.shape[1]] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
     sound = (
@@ -116,6 +119,14 @@ def _warp(A: Array, x: Patches, y: Patches) -> Patches:
     return A.astype(np.float32) @ np.stack([x, y])
 
 
+def _inverse_2x2(A: Array) -> Array:
+    inverse = np.empty_like(A)
+    inverse[:, 0, 0], inverse[:, 1, 1] = A[:, 1, 1], A[:, 0, 0]
+    inverse[:, 0, 1], inverse[:, 1, 0] = -A[:, 0, 1], -A[:, 1, 0]
+    determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
+    return inverse / determinant[:, None, None]
+
+
 def correlation_along_row(
     template: Patches, image: NDArray[np.float32], uv_px: Array, reach_px: int
 ) -> Array:
@@ -124,14 +135,16 @@ def correlation_along_row(
     row around positions (N, 2).
     """
     strip = sample_patches(image, uv_px, HALF_PATCH_PX + reach_px, HALF_PATCH_PX)
-    template = template - template.mean(axis=(1, 2), keepdims=True)
-    windows = np.lib.stride_tricks.sliding_window_view(strip, SIDE_PX, axis=2)
-    total = windows.sum(axis=(1, 3))
-    square = np.einsum('nhsw,nhsw->ns', windows, windows)
-    product = np.einsum('nhw,nhsw->ns', template, windows)
-    variance = np.maximum(square - total**2 / SIDE_PX**2, 1e-3)
-    energy = np.maximum((template**2).sum(axis=(1, 2)), 1e-3)
-    return product / np.sqrt(variance * energy[:, None])
+    flat = template.reshape(len(template), SIDE_PX**2)
+    centred = flat - flat.mean(axis=1, keepdims=True)
+    energy = np.maximum((centred**2).sum(axis=1), 1e-3)
+    scores = np.empty((len(template), 2 * reach_px + 1))
+    for shift in range(2 * reach_px + 1):
+        window = strip[:, :, shift : shift + SIDE_PX].reshape(len(template), SIDE_PX**2)
+        product = np.einsum('np,np->n', centred, window)
+        variance = np.einsum('np,np->n', window, window) - window.sum(axis=1) ** 2 / SIDE_PX**2
+        scores[:, shift] = product / np.sqrt(np.maximum(variance, 1e-3) * energy)
+    return scores
 
 
 def sample_patches(

@@ -76,6 +76,7 @@ def refine_pose(
     T_camera_world: Array,
     points_world: Array,
     observations: Observations,
+    max_noise_factor: float = MAX_NOISE_FACTOR,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
         between rounds.
@@ -90,7 +91,7 @@ def refine_pose(
         pose = _minimise(camera, pose, points_world[inliers], observations.take(inliers))
         chi2 = _chi2(camera, pose, points_world, observations)
         excess = chi2 / observations.chi2_median
-        factor = float(np.sqrt(np.clip(np.median(excess), 1.0, MAX_NOISE_FACTOR**2)))
+        factor = float(np.sqrt(np.clip(np.median(excess), 1.0, max_noise_factor**2)))
         inliers = chi2 <= factor**2 * observations.chi2_limit
         if inliers.sum() < 4:
             break

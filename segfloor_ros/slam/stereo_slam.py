@@ -12,6 +12,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, se3_exp, se3_log, transform_points
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.image_check import image_fault
+from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.patch_alignment import sample_patches
@@ -31,6 +32,8 @@ from segfloor_ros.timing import StageTimes
 LOCAL_MAP_KEYFRAMES = 20
 RECOVERY_KEYFRAMES = 3
 UNKNOWN_COVARIANCE = 1e6
+RIGHT_FEATURES = 2
+"""Right features per left feature: what the left image has must be found among them."""
 
 
 class MountMeter(Protocol):
@@ -102,6 +105,10 @@ class StereoSlam:
         self._settings = settings
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
+        self._right_extractor = FeatureExtractor(
+            settings.replaced(num_features=RIGHT_FEATURES * settings.num_features)
+        )
+        self._rotation = ImageRotation(camera)
         self._tracker = Tracker(camera, settings)
         self._mapper = LocalMapper(camera, settings)
         self._held: list[_Outcome] = []
@@ -140,9 +147,10 @@ class StereoSlam:
         features: Features,
     ) -> Track | None:
         dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
-        predicted: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
+        steady: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
+        turned = self._rotation.turn_since_last(left) @ self._T_camera_world
         ids = self._local_ids
-        track = self._tracker.track(left, right, features, self.map, ids, predicted)
+        track = self._tracker.track(left, right, features, self.map, ids, [steady, turned])
         if track is None and self._lost:
             track = self._recover(left, right, features)
         if track is None or not (self._lost or self._plausible(track, dt_s)):
@@ -173,7 +181,7 @@ class StereoSlam:
         if estimate is None:
             return None
         ids = self._choose_local_points(ids)
-        return self._tracker.track(left, right, features, self.map, ids, estimate.T_camera_world)
+        return self._tracker.track(left, right, features, self.map, ids, [estimate.T_camera_world])
 
     def _plausible(self, track: Track, dt_s: float) -> bool:
         motion = track.T_camera_world @ invert(self._T_camera_world)
@@ -207,7 +215,7 @@ class StereoSlam:
         features: Features,
         track: Track | None,
     ) -> _MapSnapshot:
-        right_features = self._extractor.extract(frame.right)
+        right_features = self._right_extractor.extract(frame.right)
         point_id = np.full(len(features), NO_POINT, np.int32)
         if track is None:
             observations = self._tracker.pixel_observations(features)

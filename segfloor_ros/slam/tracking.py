@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,12 @@ SIGMA_PIXEL = 0.6
 """Standard deviation of a corner's position at the finest pyramid level, px; grows with the
 level.
 """
+
+MIN_AGREEMENT = 0.5
+"""Share of the matches that must agree on a pose: a wrong one has followers too, but not most."""
+
+MAX_CORNER_NOISE_FACTOR = 2.0
+"""Corners are not worse than this times `SIGMA_PIXEL`; beyond it the matches are wrong."""
 
 MIN_SIGMA_PIXEL = 0.15
 MIN_SIGMA_DISPARITY = 0.1
@@ -87,17 +94,18 @@ class Tracker:
         features: Features,
         sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
-        T_predicted: Array,
+        predictions: Sequence[Array],
     ) -> Track | None:
-        """Find the pose of a frame near a predicted one; None when too few points are found
-        again.
+        """Find the pose of a frame near one of the predicted ones, tried in order.
+
+        None when too few points are found again.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
         tree = cKDTree(features.uv_px)
         observations = self.pixel_observations(features)
         estimate = self._coarse_pose(
-            features, tree, observations, sparse_map, local_ids, T_predicted
+            features, tree, observations, sparse_map, local_ids, predictions
         )
         if estimate is None:
             return None
@@ -114,7 +122,7 @@ class Tracker:
             sparse_map.xyz_world[ids],
             observations.take(rows),
         )
-        if estimate.inliers.sum() < self._settings.min_tracked:
+        if not self._agree(estimate):
             return None
         return Track(
             estimate.T_camera_world,
@@ -132,11 +140,12 @@ class Tracker:
         observations: Observations,
         sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
-        T_predicted: Array,
+        predictions: Sequence[Array],
     ) -> PoseEstimate | None:
-        """Search around the prediction, then wider, then without any."""
-        seen = self._predict(sparse_map, local_ids, T_predicted)
-        for factor in (1.0, WIDE_SEARCH):
+        """Search around the predictions, then wider around the first, then without any."""
+        attempts = [(T, 1.0) for T in predictions] + [(T, WIDE_SEARCH) for T in predictions[:1]]
+        for T_predicted, factor in attempts:
+            seen = self._predict(sparse_map, local_ids, T_predicted)
             points, rows = self._search(features, tree, sparse_map, seen, factor)
             estimate = self._believable(
                 observations, sparse_map, seen.ids[points], rows, T_predicted
@@ -177,12 +186,17 @@ class Tracker:
         if len(rows) < self._settings.min_tracked:
             return None
         estimate = refine_pose(
-            self._camera, T_start, sparse_map.xyz_world[ids], observations.take(rows)
+            self._camera,
+            T_start,
+            sparse_map.xyz_world[ids],
+            observations.take(rows),
+            MAX_CORNER_NOISE_FACTOR,
         )
+        return estimate if self._agree(estimate) else None
+
+    def _agree(self, estimate: PoseEstimate) -> bool:
         agreeing = int(estimate.inliers.sum())
-        if agreeing < max(self._settings.min_tracked, 0.3 * len(rows)):
-            return None
-        return estimate
+        return agreeing >= max(self._settings.min_tracked, MIN_AGREEMENT * len(estimate.inliers))
 
     def _predict(
         self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array

@@ -29,6 +29,7 @@ TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
         (View(10, 200, 300, MOVED, 8.0), False),  # moved little for a scene that far away
         (View(10, 200, 300, TURNED, 2.0), True),  # A2: turned
         (View(2, 200, 300, MOVED, 2.0), False),  # too soon
+        (View(1, 200, 300, MOVED, 1.0), True),  # moved 0.2 = 4 · 0.05 · 1: waits for no frames
         (View(10, 200, 300, MOVED, 2.0, mapper_idle=False), False),  # mapper busy
         (View(30, 200, 300, MOVED, 2.0, mapper_idle=False), True),  # A1: too many frames
         (View(500, 200, 300, STILL, 2.0), False),  # standing still adds nothing
