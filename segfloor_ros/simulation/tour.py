@@ -56,7 +56,7 @@ def _graph(places: Mask, room_m: Array, cell_m: float) -> csr_array:
     """Return the symmetric graph of steps between neighbouring places, weighted by their length and
     by how tight it is there.
     """
-    index = np.full(np.array(places.shape) + 2, -1)
+    index = np.full(np.array(places.shape) + 2, -1, np.int32)
     index[1:-1, 1:-1][places] = np.arange(places.sum())
     tightness = np.clip((COMFORT_M - room_m) / (COMFORT_M - CLEARANCE_M), 0, 1)
     here = index[1:-1, 1:-1][places]
