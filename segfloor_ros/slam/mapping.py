@@ -59,25 +59,28 @@ class LocalMapper:
         observations.uvd_px[rows, 2] = disparity
         observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
 
-    def insert(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+    def insert(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
+    ) -> None:
         """Add a keyframe, new points from its stereo features, adjust its neighbourhood and
         cull poor points.
         """
-        sparse_map.add_keyframe(keyframe)
-        self._add_new_points(sparse_map, keyframe)
+        rows, points = self._new_points(keyframe)
+        sparse_map.add_keyframe(keyframe, patches, rows, points)
         if len(sparse_map.keyframes) > 1:
             self._adjust_neighbourhood(sparse_map, keyframe)
             poor = sparse_map.poor_points(keyframe.index - SETTLING_KEYFRAMES, MIN_FOUND_RATIO)
             sparse_map.remove_points(poor)
 
-    def _add_new_points(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+    def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
+        """Return features (N,) that are measured but belong to no point yet, and where they are."""
         uvd = keyframe.observations.uvd_px
         with np.errstate(invalid='ignore'):
             measured = uvd[:, 2] >= MIN_DISPARITY_PX
         rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
         depth = self._camera.disparity_times_depth / uvd[rows, 2]
         points = self._camera.back_project(uvd[rows, :2], depth)
-        sparse_map.add_points(keyframe, rows, transform_points(keyframe.T_world_camera, points))
+        return rows, transform_points(keyframe.T_world_camera, points)
 
     def _adjust_neighbourhood(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
         free, fixed = self._choose_keyframes(sparse_map, keyframe)

@@ -36,7 +36,6 @@ class KeyframeRecord:
     features: Features
     observations: Observations
     point_id: NDArray[np.int32]
-    patches: NDArray[np.uint8]
 
     @property
     def T_world_camera(self) -> Array:
@@ -146,19 +145,24 @@ class SparseMap:
         """Number of keyframes (P,) that observe each point."""
         return self._observer_count.rows
 
-    def add_keyframe(self, keyframe: KeyframeRecord) -> None:
-        """Add a keyframe; its matched points take on its view of them."""
-        self.keyframes.append(keyframe)
-        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-        self._link(keyframe, rows)
-
-    def add_points(
-        self, keyframe: KeyframeRecord, rows: NDArray[np.intp], xyz_world: Array
+    def add_keyframe(
+        self,
+        keyframe: KeyframeRecord,
+        patches: NDArray[np.uint8],
+        new_rows: NDArray[np.intp],
+        new_xyz_world: Array,
     ) -> None:
-        """Add new points (N, 3), seen by the features `rows` (N,) of a keyframe that is
-        already in the map.
+        """Add a keyframe with new points (N, 3) at its features `new_rows` (N,).
+
+        patches: (F, SIDE_PX, SIDE_PX) grey levels around all of its features. The points it sees take
+        on its view of them.
         """
-        count = len(rows)
+        self.keyframes.append(keyframe)
+        keyframe.point_id[new_rows] = self._add_points(new_xyz_world, keyframe.index)
+        self._link(keyframe, patches)
+
+    def _add_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
+        count = len(xyz_world)
         first_id = len(self.alive)
         self._xyz.extend(xyz_world)
         self._descriptor.extend(np.zeros((count, 32), np.uint8))
@@ -171,11 +175,11 @@ class SparseMap:
         self._visible_count.extend(np.ones(count, np.int32))
         self._found_count.extend(np.ones(count, np.int32))
         self._observer_count.extend(np.zeros(count, np.int32))
-        self._born.extend(np.full(count, keyframe.index, np.int32))
-        keyframe.point_id[rows] = np.arange(first_id, first_id + count, dtype=np.int32)
-        self._link(keyframe, rows)
+        self._born.extend(np.full(count, born, np.int32))
+        return np.arange(first_id, first_id + count, dtype=np.int32)
 
-    def _link(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
+    def _link(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
         ids = keyframe.point_id[rows]
         self._edge_point.extend(ids)
         self._edge_keyframe.extend(np.full(len(ids), keyframe.index, np.int32))
@@ -189,7 +193,7 @@ class SparseMap:
         self.viewing_direction[ids] = sight / distance[:, None]
         zoom = np.abs(np.log(np.maximum(self.patch_distance_m[ids], 1e-6) / distance))
         stale = zoom > np.log(MAX_PATCH_ZOOM)
-        self.patch[ids[stale]] = keyframe.patches[rows[stale]]
+        self.patch[ids[stale]] = patches[rows[stale]]
         self.patch_distance_m[ids[stale]] = distance[stale]
 
     def unlink(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:

@@ -231,10 +231,10 @@ class StereoSlam:
             features,
             observations,
             point_id,
-            sample_patches(left, observations.uvd_px[:, :2]).astype(np.uint8),
         )
         T_odom_camera = invert(self._T_world_odom) @ keyframe.T_world_camera
-        self._mapper.insert(self.map, keyframe)
+        patches = sample_patches(left, observations.uvd_px[:, :2]).astype(np.uint8)
+        self._mapper.insert(self.map, keyframe, patches)
         self._T_camera_world = keyframe.T_camera_world
         self._T_world_odom = keyframe.T_world_camera @ invert(T_odom_camera)
         self._frames_since_keyframe = 0

@@ -25,8 +25,13 @@ def keyframe(index, point_id, x=0.0):
         found,
         Observations(np.zeros((count, 3)), np.ones((count, 3))),
         np.array(point_id, np.int32),
-        np.full((count, SIDE_PX, SIDE_PX), index, np.uint8),
     )
+
+
+def add(sparse_map, record, new_rows=(), new_xyz=()):
+    patches = np.full((len(record.point_id), SIDE_PX, SIDE_PX), record.index, np.uint8)
+    new_xyz = np.array(new_xyz, np.float64).reshape(-1, 3)
+    sparse_map.add_keyframe(record, patches, np.array(new_rows, np.intp), new_xyz)
 
 
 def two_keyframes():
@@ -35,10 +40,9 @@ def two_keyframes():
     """
     sparse_map = SparseMap()
     first = keyframe(0, [NO_POINT] * 4)
-    sparse_map.add_keyframe(first)
-    sparse_map.add_points(first, np.array([0, 1, 3]), np.array([[0.0, 0, 2], [1, 0, 2], [2, 0, 2]]))
+    add(sparse_map, first, [0, 1, 3], [[0, 0, 2], [1, 0, 2], [2, 0, 2]])
     second = keyframe(1, [2, NO_POINT, 1], x=1.0)
-    sparse_map.add_keyframe(second)
+    add(sparse_map, second)
     return sparse_map, first, second
 
 
@@ -60,7 +64,7 @@ def test_a_point_takes_on_the_latest_view_but_keeps_its_patch_while_its_size_sta
     np.testing.assert_array_equal(sparse_map.patch[:, 0, 0], [0, 0, 0])
     nearer = keyframe(2, [2], x=2.0)
     nearer.T_camera_world[2, 3] = -1.0
-    sparse_map.add_keyframe(nearer)
+    add(sparse_map, nearer)
     assert sparse_map.patch[2, 0, 0] == 2
 
 
@@ -70,8 +74,9 @@ def test_removed_points_vanish_everywhere_and_their_ids_stay_unused():
     np.testing.assert_array_equal(first.point_id, [0, NO_POINT, NO_POINT, 2])
     np.testing.assert_array_equal(second.point_id, [2, NO_POINT, NO_POINT])
     np.testing.assert_array_equal(sparse_map.alive, [True, False, True])
-    sparse_map.add_points(second, np.array([1]), np.array([[0.0, 0, 5]]))
-    np.testing.assert_array_equal(second.point_id, [2, 3, NO_POINT])
+    third = keyframe(2, [NO_POINT])
+    add(sparse_map, third, [0], [[0, 0, 5]])
+    np.testing.assert_array_equal(third.point_id, [3])
 
 
 def test_unlinking_the_last_observer_removes_the_point():
@@ -97,8 +102,6 @@ def test_points_that_tracking_seldom_finds_are_poor():
 
 def test_grows_beyond_its_first_buffer():
     sparse_map = SparseMap()
-    first = keyframe(0, [NO_POINT] * 3000)
-    sparse_map.add_keyframe(first)
     xyz = np.random.default_rng(0).normal(size=(3000, 3))
-    sparse_map.add_points(first, np.arange(3000), xyz)
+    add(sparse_map, keyframe(0, [NO_POINT] * 3000), np.arange(3000), xyz)
     np.testing.assert_array_equal(sparse_map.xyz_world, xyz)
