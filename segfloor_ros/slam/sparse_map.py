@@ -154,8 +154,8 @@ class SparseMap:
     ) -> None:
         """Add a keyframe with new points (N, 3) at its features `new_rows` (N,).
 
-        patches: (F, SIDE_PX, SIDE_PX) grey levels around all of its features. The points it sees take
-        on its view of them.
+        patches: (F, SIDE_PX, SIDE_PX) grey levels around all of its features. The points it
+        sees take on its view of them.
         """
         self.keyframes.append(keyframe)
         keyframe.point_id[new_rows] = self._add_points(new_xyz_world, keyframe.index)
