@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
+from segfloor_ros.evaluation.trajectory_plot import plane_axes, save_trajectory_plot
 from segfloor_ros.geometry import se3_exp
 
 
@@ -144,3 +144,16 @@ def test_plot_is_a_picture(tmp_path):
     matched = match_files(tmp_path / 'a.txt', tmp_path / 'a.txt')
     save_trajectory_plot(matched, tmp_path / 'plot.png')
     assert (tmp_path / 'plot.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_plot_looks_from_above_along_the_first_stretch():
+    # In an optical frame: three metres ahead (z), then two to the right (x); up is -y.
+    corner = np.concatenate(
+        [np.linspace([0, 0, 0], [0, 0, 3], 30), np.linspace([0, 0, 3], [2, 0, 3], 20)]
+    )
+    np.testing.assert_allclose(plane_axes(corner), [[0, 0, 1], [-1, 0, 0]], atol=1e-9)
+    # In a base frame: along y, then to the left, -x; up is +z.
+    corner = np.concatenate(
+        [np.linspace([0, 0, 0], [0, 3, 0], 30), np.linspace([0, 3, 0], [-2, 3, 0], 20)]
+    )
+    np.testing.assert_allclose(plane_axes(corner), [[0, 1, 0], [-1, 0, 0]], atol=1e-9)
