@@ -102,10 +102,11 @@ def judge(
     above = height > table.up[index]
     off = above | (height < -table.down[index])
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
-    mask[textured & (disparity > 0) & ~off] = FLOOR
+    near = disparity >= np.float32(settings.min_disparity_px)
+    mask[textured & near & ~off & ~against] = FLOOR
     sure = textured & against
     mask[off & sure] = NOT_FLOOR
-    low = above & sure & (height < _CONTACT_HEIGHT_M + np.float32(settings.step_height_m))
+    low = above & sure & (height < table.up[index] + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, profile, disparity, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     return Evidence(mask, height)

@@ -48,8 +48,8 @@ def fill_regions(
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike, continue
     floor, and that the images do not contradict (`consistent`).
 
-    A region is bounded by edges of the image stronger than the floor's own; `min_share` of it must
-    be floor by evidence. Within it a pixel becomes floor below floor, the next evidence up its
+    A region is bounded by edges of the image stronger than the floor's own; floor by evidence must
+    be in `min_share` of its columns. Within it a pixel becomes floor below floor, the next evidence up its
     column, or between floor on its left and right. Half the resolution does.
     """
     step = 2
@@ -67,9 +67,13 @@ def fill_regions(
     count, region = cv2.connectedComponents(
         cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8)), connectivity=4
     )
-    area = np.bincount(region.ravel(), minlength=count)
     supported = np.bincount(region[floor], minlength=count)
-    good = (supported >= _MIN_REGION_PX) & (supported >= min_share * area)
+    columns = np.broadcast_to(np.arange(small.shape[1]), small.shape)
+    spread = np.zeros((2, count, small.shape[1]), np.bool_)
+    spread[0, region, columns] = True
+    spread[1, region[floor], columns[floor]] = True
+    wide = spread[1].sum(axis=1) >= min_share * spread[0].sum(axis=1)
+    good = (supported >= _MIN_REGION_PX) & wide
     good[0] = False
     inside = cv2.dilate(good[region].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     fill = inside & alike & (small == NO_EVIDENCE) & (_under_floor(small) | _between_floor(small))

@@ -28,7 +28,7 @@ from segfloor_ros.floor.observation import (
     FloorScan,
 )
 from segfloor_ros.floor.photometric import floor_costs
-from segfloor_ros.floor.plane import PlaneFit, Samples, refine
+from segfloor_ros.floor.plane import PlaneFit, Samples, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
 from segfloor_ros.floor.scan import ScanGeometry, make_scan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
@@ -41,6 +41,8 @@ _ROWS_ABOVE_HORIZON = 16
 _TEXTURE_WINDOW_PX = 11
 _PLANE_SAMPLES = 4000
 _PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
+_FAITH = 1.3
+"""So much more must speak for the second expectation than for the first."""
 
 
 class FloorSegmentation:
@@ -69,13 +71,13 @@ class FloorSegmentation:
         the map, where known; with it the floor found by earlier keyframes helps.
         """
         self._prepare(mount)
-        expected, sigma = self._tracker.predict(mount, T_map_base)
-        first_row = self._first_row(_with_angles(mount, expected))
+        expected = self._tracker.predictions(mount, T_map_base)
+        first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         disparity = self._disparity(first_row, left, right)
         below = disparity[first_row:]
         texture = texture_grey(left[first_row:], _TEXTURE_WINDOW_PX)
         enough = enough_texture_grey(left[first_row:], self._settings.min_texture_grey)
-        fit = self._plane(first_row, below, texture, enough, expected, sigma)
+        fit = self._plane(first_row, below, texture, enough, expected)
         self._tracker.update(mount, T_map_base, fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         textured = texture > enough
@@ -91,7 +93,7 @@ class FloorSegmentation:
         evidence = Evidence(mask, evidence.height_m)
         mask = self._recall(view, mask, T_map_base)
         consistent = ~against & (costs.floor < 4 + 2 * noise)
-        mask = fill_regions(mask, left[first_row:], consistent, 0.1)
+        mask = fill_regions(mask, left[first_row:], consistent, 0.3)
         mask = fill_gaps(view, profile, mask, self._settings.fill_gap_m)
         scan = self._scan(view, below, evidence, mask, T_map_base)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
@@ -137,9 +139,10 @@ class FloorSegmentation:
         texture: NDArray[np.float32],
         enough: float,
         expected: Array,
-        sigma: Array,
     ) -> PlaneFit:
-        """Return the plane of the floor in this frame, in its own camera's axes."""
+        """Return the plane of the floor in this frame, in its own camera's axes, starting from
+        what is expected (P, 3).
+        """
         camera = self._camera
         step = max(2, round(math.sqrt(disparity.size / _PLANE_SAMPLES)))
         rows, columns = np.nonzero(disparity[::step, ::step] > 0)
@@ -153,8 +156,13 @@ class FloorSegmentation:
             weight=grey**4 / (grey**4 + 1),
             disparity_m=camera.disparity_times_depth,
         )
+        likelihood = scores(samples, expected)
+        likelihood[0] *= _FAITH
+        start = expected[int(np.argmax(likelihood))]
+        assert self._mount is not None
+        sigma = self._tracker.sigma(self._mount)
         unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
-        return refine([samples], expected, unknown, no_travel, sigma, _PLANE_SCALES_PX)
+        return refine([samples], start, unknown, no_travel, sigma, _PLANE_SCALES_PX)
 
     def _profile(
         self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]

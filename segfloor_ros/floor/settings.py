@@ -35,6 +35,14 @@ class FloorSegmentationSettings(StageSettings):
         maximum=4.0,
         live=True,
     )
+    min_disparity_px: float = setting(
+        2.5,
+        'Floor farther than where it has this disparity is not judged.',
+        unit='px',
+        minimum=0.5,
+        maximum=32.0,
+        live=True,
+    )
     num_disparities: int = setting(
         0,
         'Disparities searched, a multiple of 16; 0 derives it from camera and mount.',

@@ -1,12 +1,11 @@
 """What earlier keyframes know of the floor: one surface, fixed in the map.
 
-The floor is tracked as a plane in the map. A keyframe whose camera has tilted, on a cart that
-sways or by hand, still knows where to look for it; on a ramp the plane follows what is seen.
+How the floor lies in the map is followed from keyframe to keyframe, so that a camera that sways,
+on a cart or in a hand, still knows where to look. The camera's height above it is the mount's:
+the robot stands on the floor, whatever height SLAM has drifted to.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -15,11 +14,10 @@ from segfloor_ros.floor.plane import PlaneFit, angles_height_of
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
-_TILT_PER_M = math.radians(0.4)
-"""How far a floor's slope drifts from what it was a metre ago, with SLAM's drift; one sigma."""
-_CLIMB_PER_M = 0.01
-_MAX_PRIOR_TILT_RAD = math.radians(5.0)
-_MAX_PRIOR_HEIGHT = 0.15
+_FULL_SUPPORT = 0.5
+"""From this support on a keyframe counts in full."""
+_NEW_SHARE = 0.3
+"""So much of the floor's direction in the map comes from the newest keyframe, at most."""
 
 
 class FloorTracker:
@@ -28,44 +26,33 @@ class FloorTracker:
     def __init__(self, settings: FloorSegmentationSettings) -> None:
         self._settings = settings
         self._normal_map = np.array([0.0, 0.0, 1.0])
-        self._point_map = np.zeros(3)
-        self._sigma: Array | None = None
-        self._position: Array | None = None
 
-    def predict(self, mount: Mount, T_map_base: Array | None) -> tuple[Array, Array]:
-        """Return pitch, roll, height (3,) of the camera above the floor and their sigmas (3,).
+    def predictions(self, mount: Mount, T_map_base: Array | None) -> Array:
+        """Return what to expect, (P, 3) of pitch, roll and height, the likeliest first.
 
-        Without a pose they are the mount's.
+        By the floor's direction in the map, where the pose is known; else, or on a slope of
+        its own, as the camera is mounted.
         """
-        level = self._level_sigma(mount)
+        mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
         if T_map_base is None:
-            return np.array([mount.pitch_rad, mount.roll_rad, mount.height_m]), level
-        T_map_left = T_map_base @ mount.T_base_left
-        normal = T_map_left[:3, :3].T @ self._normal_map
-        height = float(self._normal_map @ (T_map_left[:3, 3] - self._point_map))
-        if height <= 0.2 * mount.height_m:
-            return np.array([mount.pitch_rad, mount.roll_rad, mount.height_m]), level
-        if self._sigma is None or self._position is None:
-            return angles_height_of(normal / height), level
-        moved = float(np.linalg.norm(T_map_base[:3, 3] - self._position))
-        drift = np.array([_TILT_PER_M, _TILT_PER_M, _CLIMB_PER_M]) * moved
-        sigma = np.hypot(self._sigma, drift)
-        limit = np.array([*[_MAX_PRIOR_TILT_RAD] * 2, _MAX_PRIOR_HEIGHT * mount.height_m])
-        return angles_height_of(normal / height), np.clip(sigma, 0.3 * level, limit)
+            return mounted[None]
+        R_map_left = T_map_base[:3, :3] @ mount.T_base_left[:3, :3]
+        normal = R_map_left.T @ self._normal_map
+        return np.stack([angles_height_of(normal / mount.height_m), mounted])
+
+    def sigma(self, mount: Mount) -> Array:
+        """Return how far pitch, roll and height (3,) may be from a prediction."""
+        tilt = self._settings.pitch_sigma_rad
+        return np.array([tilt, tilt, self._settings.height_sigma * mount.height_m])
 
     def update(self, mount: Mount, T_map_base: Array | None, fit: PlaneFit) -> None:
         """Keep what a keyframe at T_map_base found."""
         if T_map_base is None:
             return
-        T_map_left = T_map_base @ mount.T_base_left
-        pitch, roll, height = fit.angles_height
-        seen = Mount(float(height), float(pitch), float(roll))
-        self._normal_map = T_map_left[:3, :3] @ seen.up_in_camera
-        self._point_map = T_map_left[:3, 3] - height * self._normal_map
-        self._sigma = fit.sigma
-        self._position = T_map_base[:3, 3].copy()
-
-    def _level_sigma(self, mount: Mount) -> Array:
-        settings = self._settings
-        tilt = settings.pitch_sigma_rad
-        return np.array([tilt, tilt, settings.height_sigma * mount.height_m])
+        pitch, roll, height = (float(value) for value in fit.angles_height)
+        seen = (
+            T_map_base[:3, :3] @ mount.T_base_left[:3, :3] @ Mount(height, pitch, roll).up_in_camera
+        )
+        share = _NEW_SHARE * min(fit.support / _FULL_SUPPORT, 1.0)
+        normal = (1 - share) * self._normal_map + share * seen
+        self._normal_map = normal / np.linalg.norm(normal)
