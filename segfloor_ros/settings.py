@@ -10,6 +10,7 @@ import builtins
 import dataclasses
 import difflib
 import math
+import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -127,9 +128,9 @@ class StageSettings:
     @classmethod
     def specs(cls) -> list[SettingSpec]:
         """Return the settings of this stage in order of declaration."""
-        types = {'bool': bool, 'int': int, 'float': float, 'str': str}
+        types = typing.get_type_hints(cls)
         return [
-            SettingSpec(name=f.name, type=types[str(f.type)], default=f.default, **f.metadata)  # type: ignore[arg-type]
+            SettingSpec(name=f.name, type=types[f.name], default=f.default, **f.metadata)
             for f in dataclasses.fields(cls)
         ]
 

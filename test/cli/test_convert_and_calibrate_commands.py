@@ -1,0 +1,46 @@
+"""`segfloor convert` and `segfloor calibrate` for real."""
+
+import numpy as np
+from stereo_drive import room_drive, write_kitti
+from test_run_command import segfloor
+
+from segfloor_ros.camera.calibration_files import read_calibration
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+
+
+def test_a_converted_recording_has_the_same_frames(tmp_path):
+    frames, _ = room_drive(4)
+    folder = write_kitti(tmp_path / 'drive', frames)
+    done = segfloor('convert', folder, tmp_path / 'drive.mcap', '--images', 'png')
+    assert done.returncode == 0, done.stderr
+    assert '4 pairs' in done.stdout
+    source = open_source(StereoCameraSettings(input=str(tmp_path / 'drive.mcap')))
+    for frame, original in zip(source.frames(), frames, strict=True):
+        assert frame.stamp_ns == original.stamp_ns
+        np.testing.assert_array_equal(frame.left, original.left)
+        np.testing.assert_array_equal(frame.right, original.right)
+
+
+def test_convert_does_not_overwrite(tmp_path):
+    folder = write_kitti(tmp_path / 'drive', room_drive(2)[0])
+    (tmp_path / 'drive.mcap').write_text('precious')
+    done = segfloor('convert', folder, tmp_path / 'drive.mcap')
+    assert done.returncode == 2
+    assert 'exists already' in done.stderr
+    assert (tmp_path / 'drive.mcap').read_text() == 'precious'
+
+
+def test_calibrate_writes_what_the_reader_reads(shared_data, tmp_path):
+    done = segfloor('calibrate', shared_data / 'chessboard', '--square', 0.025, '--out', tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert '13 of 13' in done.stdout
+    calibration = read_calibration(tmp_path / 'left.yaml', tmp_path / 'right.yaml')
+    # OpenCV's sample publishes fx = 534 px for these pictures.
+    assert abs(calibration.left.K[0, 0] - 534) < 10
+
+
+def test_calibrate_refuses_a_board_in_no_form(tmp_path):
+    done = segfloor('calibrate', tmp_path, '--square', 0.03, '--board', 'nine')
+    assert done.returncode == 2
+    assert '--board nine' in done.stderr

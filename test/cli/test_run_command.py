@@ -1,0 +1,253 @@
+"""`segfloor run` for real: a small recording to a results folder, and every kind of bad input."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
+
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.occupancy import FREE, OCCUPIED
+
+FRAMES = 16
+
+
+def segfloor(*arguments, cwd=None):
+    """Run the command line in a process of its own."""
+    environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parents[2])}
+    return subprocess.run(
+        [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env=environment,
+        timeout=120,
+    )
+
+
+def with_mount():
+    values = {
+        'camera_height_m': MOUNT.height_m,
+        'camera_pitch_rad': MOUNT.pitch_rad,
+        'camera_roll_rad': MOUNT.roll_rad,
+    }
+    return [part for k, v in values.items() for part in ('--set', f'stereo_slam.{k}={v}')]
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    frames, _ = room_drive(FRAMES)
+    return write_kitti(tmp_path_factory.mktemp('recording') / 'drive', frames)
+
+
+@pytest.fixture(scope='module')
+def result(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp('result') / 'out'
+    done = segfloor('run', recording, '--out', out, '--save-masks', 'all', *with_mount())
+    assert done.returncode == 0, done.stderr
+    return out, done
+
+
+def test_every_promised_file_is_there(result):
+    out, done = result
+    assert {path.name for path in out.iterdir()} == {
+        'map.pgm',
+        'map.yaml',
+        'trajectory.txt',
+        'keyframes.txt',
+        'camera_trajectory.txt',
+        'labelled_cloud.ply',
+        'floor_masks',
+        'summary.json',
+        'settings.yaml',
+    }
+    assert len(list((out / 'floor_masks').iterdir())) == FRAMES
+    assert 'frames tracked' in done.stdout
+
+
+def test_summary_has_the_promised_figures(result):
+    summary = json.loads((result[0] / 'summary.json').read_text())
+    assert summary['frames'] == summary['tracked_frames'] == FRAMES
+    assert summary['lost_intervals'] == []
+    assert summary['map_updates'] == summary['keyframes'] >= 2
+    assert summary['loops'] == 0
+    assert summary['camera_height_m'] == pytest.approx(MOUNT.height_m)
+    assert summary['camera_pitch_rad'] == pytest.approx(MOUNT.pitch_rad)
+    assert summary['frames_per_s'] == pytest.approx(FRAMES / summary['wall_s'], rel=0.01)
+    assert set(summary['rss_mb']) == {'start', 'peak', 'slope_per_update'}
+    for name in ('tracking', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'):
+        stage = summary['stages'][name]
+        assert set(stage) == {'count', 'mean_ms', 'p50_ms', 'p95_ms', 'max_ms'}
+        assert 0 < stage['p50_ms'] <= stage['p95_ms'] <= stage['max_ms']
+
+
+def test_trajectory_follows_the_drive(result):
+    estimate = np.loadtxt(result[0] / 'trajectory.txt')
+    assert len(estimate) == FRAMES
+    np.testing.assert_allclose(estimate[:, 0], 0.1 * np.arange(FRAMES), atol=1e-6)
+    # room_drive: 6 cm a frame straight ahead.
+    np.testing.assert_allclose(estimate[:, 1], 0.06 * np.arange(FRAMES), atol=0.01)
+    np.testing.assert_allclose(estimate[:, 2:4], 0, atol=0.015)
+    camera = np.loadtxt(result[0] / 'camera_trajectory.txt')
+    np.testing.assert_allclose(camera[0, 1:], [0, 0, 0, 0, 0, 0, 1], atol=1e-6)
+    assert len(np.loadtxt(result[0] / 'keyframes.txt', ndmin=2)) >= 2
+
+
+def test_map_is_free_ahead_and_never_outside_the_room(result):
+    grid = load_map(result[0] / 'map.yaml')
+    rows, columns = np.indices(grid.cells.shape)
+    x = grid.origin_xy_m[0] + (columns + 0.5) * grid.resolution_m
+    y = grid.origin_xy_m[1] + (rows + 0.5) * grid.resolution_m
+    ahead = (x > 0.5) & (x < 2.5) & (np.abs(y) < 0.3)
+    assert (grid.cells[ahead] == FREE).mean() > 0.95
+    outside = (x > 6.1) | (np.abs(y) > 2.6)
+    assert not (grid.cells[outside] == FREE).any()
+    occupied = grid.cells == OCCUPIED
+    if occupied.any():
+        to_wall = np.minimum(np.abs(x - 6.0), np.abs(np.abs(y) - 2.5))
+        assert np.median(to_wall[occupied]) < 0.15
+
+
+def test_settings_are_written_as_resolved(result):
+    settings = yaml.safe_load((result[0] / 'settings.yaml').read_text())
+    slam = settings['stereo_slam']['ros__parameters']
+    assert slam['camera_height_m'] == MOUNT.height_m
+    assert slam['num_features'] == 1500
+
+
+def test_masks_show_floor_low_and_none_above_the_horizon(result):
+    mask = cv2.imread(str(result[0] / 'floor_masks' / '000005.png'), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(mask)) <= {0, 127, 255}
+    assert (mask[-40:, 120:200] == 255).mean() > 0.9
+    assert not (mask[:90] == 255).any()
+
+
+def test_a_second_run_gives_the_same_bytes(recording, result, tmp_path):
+    again = segfloor(
+        'run', recording, '--out', tmp_path / 'out', '--save-masks', 'none', *with_mount()
+    )
+    assert again.returncode == 0, again.stderr
+    for name in ('map.pgm', 'map.yaml', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply'):
+        assert (tmp_path / 'out' / name).read_bytes() == (result[0] / name).read_bytes(), name
+    assert not (tmp_path / 'out' / 'floor_masks').exists()
+
+
+def test_a_truncated_image_is_skipped_and_counted(recording, tmp_path):
+    spoiled = tmp_path / 'drive'
+    shutil.copytree(recording, spoiled)
+    image = spoiled / 'image_1' / '000003.png'
+    image.write_bytes(image.read_bytes()[:200])
+    done = segfloor('run', spoiled, '--out', tmp_path / 'out', *with_mount())
+    assert done.returncode == 0, done.stderr
+    assert '000003.png' in done.stderr
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert (summary['frames'], summary['skipped_frames']) == (FRAMES - 1, 1)
+
+
+def missing_folder(folder):
+    return folder / 'nowhere', 'nowhere'
+
+
+def unequal_numbers(folder):
+    (folder / 'image_1' / '000004.png').unlink()
+    return folder, '16 left and 15 right images'
+
+
+def calibration_missing(folder):
+    (folder / 'calib.txt').unlink()
+    return folder, 'calib.txt'
+
+
+def changed_calibration(folder, change):
+    lines = (folder / 'calib.txt').read_text().splitlines()
+    rows = [line.split() for line in lines]
+    for row in rows:
+        change(row)
+    (folder / 'calib.txt').write_text('\n'.join(' '.join(row) for row in rows) + '\n')
+    return folder
+
+
+def uncalibrated(folder):
+    def change(row):
+        row[1] = '0.0'
+
+    return changed_calibration(folder, change), 'not calibrated'
+
+
+def zero_baseline(folder):
+    def change(row):
+        row[4] = '0.0'
+
+    return changed_calibration(folder, change), 'baseline'
+
+
+def negative_baseline(folder):
+    def change(row):
+        row[4] = str(-float(row[4]))
+
+    return changed_calibration(folder, change), 'baseline'
+
+
+def backwards_stamps(folder):
+    times = (folder / 'times.txt').read_text().split()
+    times[5], times[6] = times[6], times[5]
+    (folder / 'times.txt').write_text('\n'.join(times) + '\n')
+    return folder, 'times.txt'
+
+
+@pytest.mark.parametrize(
+    'spoil',
+    [
+        missing_folder,
+        unequal_numbers,
+        calibration_missing,
+        uncalibrated,
+        zero_baseline,
+        negative_baseline,
+        backwards_stamps,
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
+    folder = tmp_path / 'drive'
+    shutil.copytree(recording, folder)
+    given, words = spoil(folder)
+    done = segfloor('run', given, '--out', tmp_path / 'out')
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len([line for line in done.stderr.splitlines() if line.startswith('segfloor')]) == 1
+    assert 'Traceback' not in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['drive']
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--set', 'occupancy_grid.resolution_m=7'], 'occupancy_grid.resolution_m = 7'),
+        (['--set', 'occupancy_grid.resolution=0.05'], 'did you mean resolution_m'),
+        (['--params', 'nowhere.yaml'], 'nowhere.yaml'),
+    ],
+)
+def test_bad_settings_are_one_line(recording, tmp_path, arguments, words):
+    done = segfloor('run', recording, '--out', tmp_path / 'out', *arguments)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_floor_no_map_and_no_success(tmp_path, recording):
+    blank = tmp_path / 'drive'
+    shutil.copytree(recording, blank)
+    for image in blank.glob('image_*/*.png'):
+        cv2.imwrite(str(image), np.zeros((240, 320), np.uint8))
+    done = segfloor('run', blank, '--out', tmp_path / 'out')
+    assert done.returncode == 1
+    assert 'no' in done.stderr and 'Traceback' not in done.stderr
+    assert not (tmp_path / 'out').exists()

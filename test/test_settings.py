@@ -1,0 +1,146 @@
+"""Settings: declaration, checks, and the order defaults < file < command line."""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import yaml
+
+from segfloor_ros.configuration import STAGE_SETTINGS, resolve
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.settings import StageSettings, setting
+
+
+@dataclass(frozen=True)
+class TwoWordSettings(StageSettings):
+    size_m: float = setting(0.5, 'A size.', unit='m', minimum=0.1, maximum=2.0, live=True)
+    count: int = setting(3, 'A count.', minimum=1)
+    kind: str = setting('a', 'A kind.', choices=('a', 'b'))
+    fast: bool = setting(False, 'A switch.')
+    height_m: float = setting(float('nan'), 'Measured when not given.', minimum=0.0)
+
+
+def test_stage_name_comes_from_the_class():
+    assert TwoWordSettings.stage_name() == 'two_word'
+    assert list(STAGE_SETTINGS) == [
+        'stereo_camera',
+        'stereo_slam',
+        'floor_segmentation',
+        'cloud_labelling',
+        'occupancy_grid',
+    ]
+
+
+def test_whole_numbers_serve_as_floats_and_nothing_else_is_converted():
+    assert TwoWordSettings(size_m=1).size_m == 1.0
+    assert isinstance(TwoWordSettings(size_m=1).size_m, float)
+    for bad in ({'size_m': '1'}, {'count': 1.5}, {'count': True}, {'fast': 1}, {'kind': 3}):
+        with pytest.raises(SettingsError, match='expected'):
+            TwoWordSettings(**bad)
+
+
+@pytest.mark.parametrize(
+    ('bad', 'words'),
+    [
+        ({'size_m': 5.0}, ['two_word.size_m', '5.0', '0.1 to 2 m']),
+        ({'count': 0}, ['two_word.count', '0', 'at least 1']),
+        ({'kind': 'c'}, ['two_word.kind', "'c'", 'one of a, b']),
+        ({'size_m': math.inf}, ['two_word.size_m', 'finite']),
+        ({'size_m': math.nan}, ['two_word.size_m', 'nan']),
+    ],
+)
+def test_errors_name_parameter_value_and_range(bad, words):
+    with pytest.raises(SettingsError) as error:
+        TwoWordSettings(**bad)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_not_a_number_means_not_given_only_where_it_is_the_default():
+    assert math.isnan(TwoWordSettings().height_m)
+    assert TwoWordSettings(height_m=0.3).height_m == 0.3
+
+
+def test_unknown_names_get_a_suggestion():
+    with pytest.raises(SettingsError, match=r'two_word.siz_m: did you mean size_m'):
+        TwoWordSettings.from_mapping({'siz_m': 1.0})
+
+
+def test_replaced_checks_like_the_original():
+    assert TwoWordSettings().replaced(count=7).count == 7
+    with pytest.raises(SettingsError, match='out of range'):
+        TwoWordSettings().replaced(count=-7)
+
+
+@pytest.mark.parametrize('stage', list(STAGE_SETTINGS.values()))
+def test_every_setting_is_described_and_its_default_is_valid(stage):
+    stage()
+    for spec in stage.specs():
+        assert spec.description.endswith('.'), spec.name
+
+
+def test_command_line_beats_file_beats_default(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text('occupancy_grid:\n  ros__parameters:\n    resolution_m: 0.1\n')
+    assert resolve().occupancy_grid.resolution_m == 0.05
+    assert resolve(file).occupancy_grid.resolution_m == 0.1
+    both = resolve(file, ['occupancy_grid.resolution_m=0.02'])
+    assert both.occupancy_grid.resolution_m == 0.02
+    assert both.stereo_slam == resolve().stereo_slam
+
+
+def test_wildcard_and_foreign_nodes_in_a_file(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text(
+        '/**:\n  ros__parameters:\n    use_sim_time: true\n    camera_height_m: 0.4\n'
+        '/robot/stereo_slam:\n  ros__parameters:\n    num_features: 900\n'
+        'planner_server:\n  ros__parameters:\n    anything: 1\n'
+    )
+    slam = resolve(file).stereo_slam
+    assert (slam.camera_height_m, slam.num_features) == (0.4, 900)
+
+
+def test_written_settings_read_back_to_the_same(tmp_path):
+    first = resolve(None, ['stereo_slam.num_features=777', 'stereo_slam.camera_height_m=0.25'])
+    file = tmp_path / 'settings.yaml'
+    file.write_text(yaml.safe_dump(first.as_ros_parameters()))
+    again = resolve(file)
+    assert again.stereo_slam.num_features == 777
+    assert again.stereo_slam.camera_height_m == 0.25
+    assert math.isnan(again.stereo_slam.camera_pitch_rad)
+    assert again.occupancy_grid == first.occupancy_grid
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('stereo_slam: [1, 2', 'line 1: not valid YAML'),
+        ('- a\n- b\n', 'expected node names'),
+        ('stereo_slam:\n  num_features: 3\n', 'stereo_slam has no ros__parameters'),
+        ('/**:\n  ros__parameters:\n    camera_hight_m: 1.0\n', 'camera_hight_m'),
+        ('stereo_slam:\n  ros__parameters:\n    num_feature: 3\n', 'did you mean num_features'),
+    ],
+)
+def test_bad_parameter_files_are_refused_in_one_line(tmp_path, text, words):
+    file = tmp_path / 'params.yaml'
+    file.write_text(text)
+    with pytest.raises(SettingsError) as error:
+        resolve(file)
+    assert words in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+def test_missing_parameter_file_is_named(tmp_path):
+    with pytest.raises(SettingsError, match=r'nowhere.*cannot read'):
+        resolve(tmp_path / 'nowhere.yaml')
+
+
+@pytest.mark.parametrize('assignment', ['resolution_m=0.1', 'occupancy_grid.resolution_m', '='])
+def test_assignments_need_stage_name_and_value(assignment):
+    with pytest.raises(SettingsError):
+        resolve(None, [assignment])
+
+
+def test_unknown_stage_gets_a_suggestion():
+    with pytest.raises(SettingsError, match='did you mean stereo_slam'):
+        resolve(None, ['stereo_slm.num_features=3'])
