@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.grid.fan import SAME_SURFACE_SHARE, unit_vectors
+from segfloor_ros.grid.fan import find_jumps, unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
@@ -52,7 +52,7 @@ def gather_evidence(
     floor, obstacles = _seen_points(points, features, T_map_base)
     if not settings.use_points:
         floor, obstacles = floor[:0], obstacles[:0]
-    free_m = np.minimum(_certain(_floor_end(scan, settings), settings), settings.max_range_m)
+    free_m = np.minimum(_floor_end(scan, settings), settings.max_range_m)
     rays = _rays(floor, scan, settings)
     contacts = _contacts(scan, settings)
     obstacles = obstacles[np.hypot(obstacles[:, 0], obstacles[:, 1]) <= hit_range_m(settings)]
@@ -98,19 +98,22 @@ def _seen_points(
 
 
 def _floor_end(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
-    """Return how far the floor reaches, (S,), 0 where unknown.
+    """Return how far the floor certainly reaches along the scan's bearings, (S,), 0 where unknown.
 
-    Matching blurs the seam between floor and wall: a gap there, no wider than the error, is floor
-    up to the foot of what stands behind it.
+    Where the floor fades out, its end is as uncertain as its distance. Where it ends at something
+    that was placed itself, that is the end; matching blurs the seam between the two, and a gap no
+    wider than the blur is floor up to the foot of what stands there.
     """
     seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
+    end_m = _certain(seen_m, settings)
     if scan.obstacle_m is None:
-        return seen_m
+        return end_m
     standing_m = scan.obstacle_m.astype(np.float64)
-    seam_m = settings.seam_m + 3 * settings.range_error_per_m * standing_m**2
+    seam_m = settings.seam_m + settings.seam_per_m * standing_m**2
     with np.errstate(invalid='ignore'):
-        joined = (seen_m > 0) & (standing_m > seen_m) & (standing_m - seen_m <= seam_m)
-    return np.where(joined, standing_m, seen_m)
+        joined = (seen_m > 0) & (standing_m - seen_m <= seam_m)
+        joined &= standing_m <= hit_range_m(settings)
+    return np.where(joined, standing_m, end_m)
 
 
 def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
@@ -125,8 +128,7 @@ def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
     distance_m = scan.obstacle_m[near].astype(np.float64)
     start = (unit_vectors(scan.bearings_rad[near]) * distance_m).T
     joined = np.zeros(len(near), np.bool_)
-    step_m = np.abs(np.diff(distance_m))
-    joined[:-1] = (np.diff(near) == 1) & (step_m <= SAME_SURFACE_SHARE * distance_m[:-1])
+    joined[:-1] = (np.diff(near) == 1) & ~find_jumps(distance_m)
     end = np.where(joined[:, None], np.roll(start, -1, axis=0), start)
     return np.stack([start, end], axis=1).reshape(-1, 2)
 

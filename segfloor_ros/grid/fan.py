@@ -20,8 +20,8 @@ class Fan:
     """A star-shaped area around `centre` (x, y), in cells, x along columns and y along rows.
 
     Bearing i is first_rad + i * step_rad; directions: (2, S), their unit vectors; lengths: (S,),
-    how far the area reaches. Where two neighbours end at different things, the area between them
-    ends at the nearer one.
+    how far the area reaches. jumps: (S - 1,) bool, where a bearing and the next one end at
+    different things; there, the area between them ends at the nearer one.
     """
 
     centre: Array
@@ -29,6 +29,7 @@ class Fan:
     step_rad: float
     directions: Array
     lengths: Array
+    jumps: NDArray[np.bool_]
 
     def draw(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         """Return a raster (rows, columns) that is 1 where a cell's centre lies in the fan."""
@@ -50,13 +51,38 @@ class Fan:
             area[row, column] = self._contains(x, y, left, right)
         return area
 
+    def shadow(self, shape: tuple[int, ...], start: Array) -> NDArray[np.uint8] | None:
+        """Return a raster that is 1 in all cells farther than `start` (S,) along a bearing, or on
+        the border of that; None where `start` lies beyond the fan.
+        """
+        hidden = start < self.lengths
+        if not hidden.any():
+            return None
+        wedge = np.flatnonzero(hidden[:-1] | hidden[1:])
+        inner = self.directions * np.minimum(start, self.lengths)
+        outer = self.directions * (self.lengths + 1)
+        corners = [inner[:, wedge], outer[:, wedge], outer[:, wedge + 1], inner[:, wedge + 1]]
+        quads = self.centre[:, None, None] + np.stack(corners, axis=2)
+        area = np.zeros(shape, np.uint8)
+        pixels = fixed_point(quads.reshape(2, -1)).reshape(-1, 4, 2)
+        cv2.fillPoly(area, list(pixels), 1, shift=SUBPIXEL_BITS)
+        return area
+
+    def edges(self) -> NDArray[np.bool_]:
+        """Tell which bearings (S,) bound the fan: the outermost ones, and those that see past
+        something. A single bearing that reaches farther than both its neighbours does not.
+        """
+        first, second = self.lengths[:-1], self.lengths[1:]
+        past_next = np.append(self.jumps & (first > second), True)
+        past_previous = np.append(True, self.jumps & (second > first))
+        return past_next ^ past_previous
+
     def _ends(self) -> tuple[Array, Array]:
         """Return where the S - 1 wedges end at their first and second bearing, (2, S - 1) each."""
         first, second = self.lengths[:-1], self.lengths[1:]
         nearer = np.minimum(first, second)
-        jump = np.abs(first - second) > SAME_SURFACE_SHARE * nearer
-        left = np.where(jump, nearer, first) * self.directions[:, :-1]
-        right = np.where(jump, nearer, second) * self.directions[:, 1:]
+        left = np.where(self.jumps, nearer, first) * self.directions[:, :-1]
+        right = np.where(self.jumps, nearer, second) * self.directions[:, 1:]
         return left, right
 
     def _contains(self, x: Array, y: Array, left: Array, right: Array) -> NDArray[np.bool_]:
@@ -69,6 +95,12 @@ class Fan:
         beyond = edge_x * left[1] - edge_y * left[0]
         side = edge_x[index] * y - edge_y[index] * x
         return within & (side >= beyond[index])
+
+
+def find_jumps(lengths: Array) -> NDArray[np.bool_]:
+    """Tell where neighbouring lengths (S,) end at different things, (S - 1,)."""
+    first, second = lengths[:-1], lengths[1:]
+    return np.abs(first - second) > SAME_SURFACE_SHARE * np.minimum(first, second)
 
 
 def unit_vectors(bearing_rad: Array) -> Array:

@@ -8,8 +8,6 @@ through it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +15,12 @@ from numpy.typing import NDArray
 from segfloor_ros.grid.blocking import Horizon
 from segfloor_ros.grid.evidence import KeyframeEvidence, hit_range_m
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
-from segfloor_ros.grid.hits import draw_hits, draw_lines
+from segfloor_ros.grid.hits import draw_hits, draw_rays
 from segfloor_ros.grid.log_odds import ZERO, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
+
+_BODY_M = 0.05
 
 
 class EvidenceFolder:
@@ -37,11 +37,12 @@ class EvidenceFolder:
         most = ZERO + steps(settings.max_log_odds)
         self._raised = np.minimum(value + hit, most).astype(np.uint8)
         self._lowered = np.maximum(value - free, self._least).astype(np.uint8)
-        # Floor seen from farther than an obstacle could have been placed from is free as long as
-        # nothing says otherwise: it clears no obstacle, and counts no more than one look.
+        # Floor seen from farther than an obstacle could have been placed from, or in a part of a
+        # cell, is free as long as nothing says otherwise: it clears no obstacle, and counts no
+        # more than one look.
         tentative = np.minimum(value, np.maximum(value - free, ZERO - free))
-        far = np.where(value >= self._occupied, value, tentative)
-        self._lowered_far = far.astype(np.uint8)
+        tentative = np.where(value >= self._occupied, value, tentative)
+        self._lowered_tentatively = tentative.astype(np.uint8)
 
     def place(
         self, evidence: KeyframeEvidence, pose: Pose2d, previous: Pose2d | None
@@ -53,34 +54,49 @@ class EvidenceFolder:
 
     def fold(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
         """Add evidence to the cells from `placed.low` up to, not including, `placed.high`."""
-        free = self._draw_free(cells, placed)
+        free = self._draw_free(cells.shape, placed)
         hits = draw_hits(free, placed)
-        free[hits > 0] = 0
+        partly = self._draw_partly_free(free, placed)
+        hidden = self._draw_hidden(cells, placed)
+        for area in (free, partly):
+            area[hits > 0] = 0
+            if hidden is not None:
+                area[hidden > 0] = 0
         near = self._draw_near(free, placed)
         _replace(cells, near, self._lowered)
-        if near is not free:
-            _replace(cells, free - near, self._lowered_far)
+        _replace(cells, partly - near, self._lowered_tentatively)
         _replace(cells, hits, self._raised)
         self._drive(cells, placed)
 
-    def _draw_free(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
-        """Return the cells that this keyframe sees to be free, 1, in a raster like `cells`.
+    def _draw_free(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
+        """Return the cells (rows, columns) that this keyframe sees to be free, 1."""
+        free = placed.fan.draw(shape)
+        if placed.rays.size:
+            draw_rays(free, placed.base, placed.rays - placed.base[:, None], 0.5)
+        return free
 
-        What it sees ends in the first cell that is occupied so far. That cell still gets its
-        share, so that what has left is cleared in the end.
+    def _draw_partly_free(
+        self, free: NDArray[np.uint8], placed: PlacedEvidence
+    ) -> NDArray[np.uint8]:
+        """Return the free cells and those that the fan's edges cross, 1."""
+        partly = free.copy()
+        fan = placed.fan
+        edge = fan.edges() & (fan.lengths > 1)
+        draw_rays(partly, placed.base, fan.directions[:, edge] * fan.lengths[edge], 1.0)
+        return partly
+
+    def _draw_hidden(
+        self, cells: NDArray[np.uint8], placed: PlacedEvidence
+    ) -> NDArray[np.uint8] | None:
+        """Return the cells behind what is occupied so far, 1.
+
+        What stands there itself still gets its share, so that it is cleared once it has left.
         """
         occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
         fan = placed.fan
         horizon = Horizon(occupied, placed.base, fan.first_rad, fan.step_rad)
-        lengths = np.minimum(fan.lengths, horizon.along_fan(len(fan.lengths)) + 1)
-        free = replace(fan, lengths=lengths).draw(cells.shape)
-        offset = placed.rays - placed.base[:, None]
-        if offset.size:
-            distance = np.sqrt((offset**2).sum(axis=0))
-            reached = np.minimum(distance, horizon.towards(offset) + 1) - 0.5
-            ends = placed.base[:, None] + offset * (np.maximum(reached, 0) / distance)
-            draw_lines(free, np.broadcast_to(placed.base[:, None], ends.shape), ends)
-        return free
+        body = max(2.0, _BODY_M / self._resolution_m)
+        return fan.shadow(cells.shape, horizon.along_fan(len(fan.lengths)) + body)
 
     def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the free cells that are near enough for an obstacle there to be placed, 1."""

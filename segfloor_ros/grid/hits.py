@@ -45,9 +45,14 @@ def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
     hits[row, column] = 1
 
 
-def draw_lines(raster: NDArray[np.uint8], start: Array, end: Array) -> None:
-    """Set the cells on straight lines between positions (2, N) and (2, N), in cells, to 1."""
-    lines = np.stack([start, end], axis=2)
+def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: float) -> None:
+    """Set the cells that rays from the base to base + offset (2, N) cross to 1.
+
+    The rays end `short` cells before that.
+    """
+    length = np.sqrt((offset**2).sum(axis=0))
+    ends = base[:, None] + offset * (np.maximum(length - short, 0) / np.maximum(length, 1e-9))
+    lines = np.stack([np.broadcast_to(base[:, None], ends.shape), ends], axis=2)
     pixels = fixed_point(lines.reshape(2, -1)).reshape(-1, 2, 2)
     if len(pixels):
         cv2.polylines(raster, list(pixels), False, 1, shift=SUBPIXEL_BITS)

@@ -8,7 +8,7 @@ import numpy as np
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.evidence import KeyframeEvidence
-from segfloor_ros.grid.fan import Fan, unit_vectors
+from segfloor_ros.grid.fan import Fan, find_jumps, unit_vectors
 
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""
@@ -74,7 +74,7 @@ def place(
     return PlacedEvidence(
         low=(int(low[1, 0]), int(low[0, 0])),
         high=(int(high[1, 0]), int(high[0, 0])),
-        fan=Fan(way[:, 0], first_rad, evidence.step_rad, directions, lengths),
+        fan=Fan(way[:, 0], first_rad, evidence.step_rad, directions, lengths, find_jumps(lengths)),
         previous=way[:, 1],
         rays=positions[:, :rays],
         contacts=positions[:, rays:contacts],

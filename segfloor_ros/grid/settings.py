@@ -50,6 +50,14 @@ class OccupancyGridSettings(StageSettings):
         maximum=0.5,
         live=True,
     )
+    seam_per_m: float = setting(
+        0.02,
+        'Growth of that width: this times the square of the distance in metres.',
+        unit='1/m',
+        minimum=0.0,
+        maximum=0.2,
+        live=True,
+    )
     min_thickness_m: float = setting(
         0.03,
         'What stands on the floor is at least this deep behind the face that is seen.',
@@ -63,7 +71,7 @@ class OccupancyGridSettings(StageSettings):
     )
     use_scan: bool = setting(True, 'The floor scan marks free cells and what it ended at.')
     hit_log_odds: float = setting(
-        0.85,
+        0.7,
         'Evidence of one keyframe that sees an obstacle in a cell.',
         minimum=0.05,
         maximum=3.0,
