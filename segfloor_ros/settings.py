@@ -130,7 +130,7 @@ class StageSettings:
         """Return the settings of this stage in order of declaration."""
         types = typing.get_type_hints(cls)
         return [
-            SettingSpec(name=f.name, type=types[f.name], default=f.default, **f.metadata)
+            SettingSpec(f.name, types[f.name], typing.cast(Value, f.default), **f.metadata)
             for f in dataclasses.fields(cls)
         ]
 
