@@ -9,6 +9,7 @@ import typer
 
 from segfloor_ros.cli.calibrate import calibrate
 from segfloor_ros.cli.convert import convert
+from segfloor_ros.cli.demo import demo
 from segfloor_ros.cli.evaluate import app as evaluate
 from segfloor_ros.cli.output import print_error
 from segfloor_ros.cli.replay import replay
@@ -22,7 +23,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, simulate, calibrate, convert):
+for command in (run, replay, simulate, calibrate, convert, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')
 
