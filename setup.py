@@ -39,6 +39,7 @@ setup(
     maintainer='Segfloor maintainers',
     maintainer_email='segfloor@example.org',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*']},
     data_files=data_files,
     python_requires='>=3.10',
     # colcon does not install these: on a ROS install rosdep brings the distribution's own packages,
@@ -52,7 +53,7 @@ setup(
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'cli': ['typer>=0.12', 'rich>=13', 'rosbags>=0.10', 'evo>=1.28', 'matplotlib>=3.6'],
-        'sim': ['mujoco>=3.1'],
+        'sim': ['mujoco>=3.3'],
         # colcon takes the tests to be pytest's by this name.
         'test': ['pytest', 'pytest-timeout'],
         'dev': [
