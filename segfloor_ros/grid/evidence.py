@@ -24,10 +24,9 @@ class KeyframeEvidence:
 
     fan_m: (S,) float32, how far the floor is free along bearing first_rad + i * step_rad.
     positions_m: (2, M) float32; the first num_rays are the ends of single rays to floor points
-    that reach farther than the fan, then num_contacts ends of lines along what the floor ends at,
-    two for each; the others are obstacle points at any height that concerns the robot.
-    thickness_m: (num_contacts / 2,) float32, how deep the things behind these lines are taken to
-    be.
+    that reach farther than the fan. Then come lines along what the floor ends at, num_contacts
+    ends and as many starts; the others are obstacle points at any height that concerns the robot.
+    thickness_m: (num_contacts,) float32, how deep the things behind these lines are taken to be.
     """
 
     first_rad: float
@@ -54,16 +53,16 @@ def gather_evidence(
         floor, obstacles = floor[:0], obstacles[:0]
     free_m = np.minimum(_floor_end(scan, settings), settings.max_range_m)
     rays = _rays(floor, scan, settings)
-    contacts = _contacts(scan, settings)
+    starts, ends = _contacts(scan, settings)
     obstacles = obstacles[np.hypot(obstacles[:, 0], obstacles[:, 1]) <= hit_range_m(settings)]
     return KeyframeEvidence(
         first_rad=scan.angle_min_rad,
         step_rad=scan.angle_increment_rad,
         fan_m=free_m.astype(np.float32),
-        positions_m=np.concatenate([rays, contacts, obstacles]).T.astype(np.float32),
+        positions_m=np.concatenate([rays, ends, starts, obstacles]).T.astype(np.float32),
         num_rays=len(rays),
-        num_contacts=len(contacts),
-        thickness_m=_thickness_m(contacts[::2], settings),
+        num_contacts=len(starts),
+        thickness_m=_thickness_m(starts, settings),
     )
 
 
@@ -116,21 +115,21 @@ def _floor_end(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
     return np.where(joined, standing_m, end_m)
 
 
-def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
-    """Return the faces that the scan's bearings end at, as lines: their starts and ends (2 C, 2)
-    in turn, in the base frame.
+def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> tuple[Array, Array]:
+    """Return the faces that the scan's bearings end at, as lines: starts (C, 2) and ends (C, 2)
+    in the base frame.
 
     A line joins neighbouring bearings where they see the same surface, and is a point elsewhere.
     """
     if scan.obstacle_m is None:
-        return np.zeros((0, 2))
+        return np.zeros((0, 2)), np.zeros((0, 2))
     near = np.flatnonzero(scan.obstacle_m <= hit_range_m(settings))
     distance_m = scan.obstacle_m[near].astype(np.float64)
     start = (unit_vectors(scan.bearings_rad[near]) * distance_m).T
     joined = np.zeros(len(near), np.bool_)
     joined[:-1] = (np.diff(near) == 1) & ~find_jumps(distance_m)
     end = np.where(joined[:, None], np.roll(start, -1, axis=0), start)
-    return np.stack([start, end], axis=1).reshape(-1, 2)
+    return start, end
 
 
 def _thickness_m(faces: Array, settings: OccupancyGridSettings) -> NDArray[np.float32]:

@@ -58,10 +58,9 @@ class EvidenceFolder:
         hits = draw_hits(free, placed)
         partly = self._draw_partly_free(free, placed)
         hidden = self._draw_hidden(cells, placed)
-        for area in (free, partly):
-            area[hits > 0] = 0
-            if hidden is not None:
-                area[hidden > 0] = 0
+        visible = 1 - (hits if hidden is None else hits | hidden)
+        free &= visible
+        partly &= visible
         near = self._draw_near(free, placed)
         _replace(cells, near, self._lowered)
         _replace(cells, partly - near, self._lowered_tentatively)
@@ -72,7 +71,7 @@ class EvidenceFolder:
         """Return the cells (rows, columns) that this keyframe sees to be free, 1."""
         free = placed.fan.draw(shape)
         if placed.rays.size:
-            draw_rays(free, placed.base, placed.rays - placed.base[:, None], 0.5)
+            draw_rays(free, placed.fan.centre, placed.rays - placed.fan.centre[:, None], 0.5)
         return free
 
     def _draw_partly_free(
@@ -82,7 +81,7 @@ class EvidenceFolder:
         partly = free.copy()
         fan = placed.fan
         edge = fan.edges() & (fan.lengths > 1)
-        draw_rays(partly, placed.base, fan.directions[:, edge] * fan.lengths[edge], 1.0)
+        draw_rays(partly, placed.fan.centre, fan.directions[:, edge] * fan.lengths[edge], 1.0)
         return partly
 
     def _draw_hidden(
@@ -94,7 +93,7 @@ class EvidenceFolder:
         """
         occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
         fan = placed.fan
-        horizon = Horizon(occupied, placed.base, fan.first_rad, fan.step_rad)
+        horizon = Horizon(occupied, placed.fan.centre, fan.first_rad, fan.step_rad)
         body = max(2.0, _BODY_M / self._resolution_m)
         return fan.shadow(cells.shape, horizon.along_fan(len(fan.lengths)) + body)
 
@@ -103,7 +102,7 @@ class EvidenceFolder:
         if placed.reach <= self._hit_range:
             return free
         near = np.zeros_like(free)
-        centre = fixed_point(placed.base[:, None])[0].tolist()
+        centre = fixed_point(placed.fan.centre[:, None])[0].tolist()
         radius = round(self._hit_range * (1 << SUBPIXEL_BITS))
         cv2.circle(near, centre, radius, 1, cv2.FILLED, shift=SUBPIXEL_BITS)
         near &= free
@@ -113,7 +112,7 @@ class EvidenceFolder:
         """Free the cells below the base on its way here."""
         if self._radius_m == 0:
             return
-        way = fixed_point(np.stack([placed.previous, placed.base], axis=1)).tolist()
+        way = fixed_point(np.stack([placed.previous, placed.fan.centre], axis=1)).tolist()
         width = max(1, int(2 * self._radius_m / self._resolution_m) - 1)
         cv2.line(cells, way[0], way[1], self._least, width, shift=SUBPIXEL_BITS)
 

@@ -20,28 +20,36 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
     """
     hits = np.zeros_like(free)
     _draw_bands(hits, placed)
-    hits[free > 0] = 0
-    step = 0.5 * _outward(placed.points, placed.base)
-    candidates = np.stack([placed.points, placed.points + step, placed.points + 2 * step], axis=1)
+    hits &= 1 - free
+    step = 0.5 * placed.outward
+    num = placed.faces.shape[1]
+    candidates = np.empty((2, 3, num))
+    candidates[:, 0], candidates[:, 1] = placed.faces, placed.faces + step
+    candidates[:, 2] = candidates[:, 1] + step
     column, row = candidates.astype(np.intp)
-    choice = (free[row, column] == 0).argmax(axis=0)
-    point = np.arange(len(choice))
-    hits[row[choice, point], column[choice, point]] = 1
+    cell = row * free.shape[1] + column
+    solid = free.ravel()[cell] == 0
+    # Of cells without a solid one the first, which is the cell itself, is chosen.
+    chosen = cell[solid.argmax(axis=0), np.arange(num)]
+    marks = solid.any(axis=0)
+    marks[len(placed.thickness) :] = True
+    hits.ravel()[chosen[marks]] = 1
     return hits
 
 
 def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
     """Mark what stands behind the faces: a cell, and what the error of the distance may add."""
-    start, end = placed.contacts[:, ::2], placed.contacts[:, 1::2]
-    if start.size == 0:
+    num = len(placed.thickness)
+    if num == 0:
         return
-    along = end - start
+    start, outward = placed.faces[:, :num], placed.outward[:, :num]
+    along = placed.ends - start
     num_along = int(np.abs(along).max()) + 2
-    faces = start[:, :, None] + along[:, :, None] * np.linspace(0, 1, num_along)
+    share = np.arange(num_along) * (1 / (num_along - 1))
+    lines = start[:, :, None] + along[:, :, None] * share
     layers = np.arange(0.5, placed.thickness.max())
-    depth = np.minimum(layers, placed.thickness[:, None] - 0.5)
-    behind = _outward(start, placed.base)[:, :, None] * depth
-    column, row = (faces[:, :, :, None] + behind[:, :, None, :]).astype(np.intp)
+    behind = outward[:, :, None] * np.minimum(layers, placed.thickness[:, None] - 0.5)
+    column, row = (lines[:, :, :, None] + behind[:, :, None, :]).astype(np.intp)
     hits[row, column] = 1
 
 
@@ -51,14 +59,10 @@ def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: floa
     The rays end `short` cells before that.
     """
     length = np.sqrt((offset**2).sum(axis=0))
-    ends = base[:, None] + offset * (np.maximum(length - short, 0) / np.maximum(length, 1e-9))
-    lines = np.stack([np.broadcast_to(base[:, None], ends.shape), ends], axis=2)
-    pixels = fixed_point(lines.reshape(2, -1)).reshape(-1, 2, 2)
+    ends = np.empty((2, offset.shape[1], 2))
+    ends[:, :, 0] = base[:, None]
+    shortened = np.maximum(length - short, 0) / np.maximum(length, 1e-9)
+    ends[:, :, 1] = base[:, None] + offset * shortened
+    pixels = fixed_point(ends.reshape(2, -1)).reshape(-1, 2, 2)
     if len(pixels):
         cv2.polylines(raster, list(pixels), False, 1, shift=SUBPIXEL_BITS)
-
-
-def _outward(positions: Array, base: Array) -> Array:
-    """Return unit vectors (2, N) from the base to positions (2, N)."""
-    offset = positions - base[:, None]
-    return offset / np.maximum(np.sqrt((offset**2).sum(axis=0)), 1.0)

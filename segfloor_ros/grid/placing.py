@@ -19,8 +19,10 @@ class PlacedEvidence:
     """Evidence in cells, x along columns and y along rows, seen from the corner of cell `low`.
 
     low, high: (row, column) of the first cell and of one beyond the last that the evidence
-    touches. previous: (2,), where the base came from. rays, contacts, thickness and points:
-    as in `KeyframeEvidence`.
+    touches. previous: (2,), where the base came from. rays: (2, R), ends of single rays. faces:
+    (2, C + P), starts of the lines along contacts, then obstacle points; outward: (2, C + P), unit
+    vectors from the base to them. ends: (2, C), where these lines end; thickness: (C,), how deep
+    is what stands behind them.
     """
 
     low: tuple[int, int]
@@ -28,16 +30,18 @@ class PlacedEvidence:
     fan: Fan
     previous: Array
     rays: Array
-    contacts: Array
+    ends: Array
+    faces: Array
+    outward: Array
     thickness: Array
-    points: Array
 
     @property
     def reach(self) -> float:
         """How far free floor was seen at most, in cells."""
         reach = self.fan.lengths.max(initial=0.0)
         if self.rays.size:
-            reach = max(reach, np.sqrt(((self.rays - self.base[:, None]) ** 2).sum(axis=0).max()))
+            offset = self.rays - self.fan.centre[:, None]
+            reach = max(reach, np.sqrt((offset**2).sum(axis=0).max()))
         return float(reach)
 
     @property
@@ -60,7 +64,11 @@ def place(
     first_rad = evidence.first_rad + yaw
     directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
     cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
-    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m + way[:, :1]
+    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m
+    rays, faces = evidence.num_rays, evidence.num_rays + evidence.num_contacts
+    x, y = positions[:, faces:]
+    outward = positions[:, faces:] / np.maximum(np.sqrt(x * x + y * y), 1.0)
+    positions += way[:, :1]
     thickness = np.maximum(evidence.thickness_m * scale, 1.0)
     margin = margin_m * scale + 2
     body = int(np.ceil(thickness.max(initial=1.0))) + 1
@@ -70,14 +78,14 @@ def place(
     high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + body + 1
     positions -= low
     way -= low
-    rays, contacts = evidence.num_rays, evidence.num_rays + evidence.num_contacts
     return PlacedEvidence(
         low=(int(low[1, 0]), int(low[0, 0])),
         high=(int(high[1, 0]), int(high[0, 0])),
         fan=Fan(way[:, 0], first_rad, evidence.step_rad, directions, lengths, find_jumps(lengths)),
         previous=way[:, 1],
         rays=positions[:, :rays],
-        contacts=positions[:, rays:contacts],
+        ends=positions[:, rays:faces],
+        faces=positions[:, faces:],
+        outward=outward,
         thickness=thickness,
-        points=positions[:, contacts:],
     )
