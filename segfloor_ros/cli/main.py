@@ -7,6 +7,7 @@ import sys
 
 import typer
 
+from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.cli.calibrate import calibrate
 from segfloor_ros.cli.convert import convert
 from segfloor_ros.cli.demo import demo
@@ -23,7 +24,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, simulate, calibrate, convert, demo):
+for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')
 

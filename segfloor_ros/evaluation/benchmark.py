@@ -1,0 +1,117 @@
+"""What the stages cost: time, memory and throughput on generated data of growing size."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+
+from segfloor_ros import __version__
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.evaluation.benchmark_apart import Progress, run_apart
+from segfloor_ros.evaluation.benchmark_chain import ImageChain, MapChain, Workload
+from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT, Corridor
+from segfloor_ros.evaluation.benchmark_images import CorridorImages
+from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
+
+IMAGES = 'images'
+JSON_VERSION = 1
+
+Announce = Callable[[str, int], Progress]
+"""Told the name of a workload and its number of steps; returns whom to tell how many are done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BenchmarkPlan:
+    """What to measure. sizes: numbers of keyframes for labelling and grid. frames: image pairs
+    for all stages. seed: of the generated data. threads: of OpenCV; one compares best.
+    """
+
+    sizes: tuple[int, ...] = (10, 100, 1000)
+    frames: int = 100
+    seed: int = 0
+    threads: int = 1
+
+
+def parse_sizes(text: str) -> tuple[int, ...]:
+    """Return the numbers of keyframes in `10,100,1000`. Raises SettingsError."""
+    try:
+        sizes = tuple(int(part) for part in text.split(','))
+    except ValueError:
+        sizes = (0,)
+    if min(sizes) < 1:
+        raise SettingsError(f'--sizes {text}: expected numbers of keyframes, e.g. 10,100,1000')
+    return sizes
+
+
+def run_benchmark(
+    plan: BenchmarkPlan, configuration: Configuration, announce: Announce
+) -> list[Workload]:
+    """Measure all stages on images, then labelling and grid at every size, each in a process of
+    its own.
+    """
+    workloads = [
+        run_apart(measure_images, plan, configuration, on_progress=announce('images', plan.frames))
+    ]
+    for size in plan.sizes:
+        report = announce(f'{size} keyframes', size)
+        workloads.append(run_apart(measure_map, plan, size, configuration, on_progress=report))
+    return workloads
+
+
+def measure_images(
+    plan: BenchmarkPlan, configuration: Configuration, on_progress: Progress
+) -> Workload:
+    """Measure all stages on generated stereo images."""
+    cv2.setNumThreads(plan.threads)
+    reference = ReferenceWorkload()
+    reference.time()
+    chain = ImageChain(CAMERA, configuration, MOUNT)
+    for frame in CorridorImages(plan.frames, plan.seed).drive():
+        chain.process(frame)
+        on_progress(chain.frames)
+    reference.time()
+    return chain.workload(IMAGES, chain.frames, chain.tracked, reference.median_ms)
+
+
+def measure_map(
+    plan: BenchmarkPlan, keyframes: int, configuration: Configuration, on_progress: Progress
+) -> Workload:
+    """Measure labelling and grid on a number of generated keyframes."""
+    cv2.setNumThreads(plan.threads)
+    reference = ReferenceWorkload()
+    reference.time()
+    corridor = Corridor(keyframes, plan.seed)
+    chain = MapChain(configuration)
+    for done, keyframe in enumerate(corridor.drive(), start=1):
+        chain.update(keyframe)
+        on_progress(done)
+    reference.time()
+    return chain.workload(f'{keyframes} keyframes', keyframes, keyframes, reference.median_ms)
+
+
+def as_document(plan: BenchmarkPlan, workloads: list[Workload]) -> dict[str, Any]:
+    """Return plan, machine and figures as plain numbers for a JSON file."""
+    return {
+        'version': JSON_VERSION,
+        'segfloor_ros': __version__,
+        'machine': machine(),
+        'plan': dataclasses.asdict(plan),
+        'workloads': [dataclasses.asdict(workload) for workload in workloads],
+    }
+
+
+def machine() -> dict[str, str]:
+    """Return what the figures depend on besides the program."""
+    return {
+        'system': platform.platform(),
+        'processor': platform.processor() or platform.machine(),
+        'python': platform.python_version(),
+        'numpy': np.__version__,
+        'opencv': cv2.__version__,
+    }
