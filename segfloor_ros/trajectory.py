@@ -73,6 +73,6 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for stamp_ns, pose in zip(trajectory.stamp_ns.tolist(), trajectory.poses, strict=True):
         seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
         values = np.concatenate([pose[:3, 3], quaternion_xyzw(pose[:3, :3])])
-        numbers = ' '.join(f'{value:.9f}' for value in values + 0.0)
+        numbers = ' '.join(f'{value:.9f}' for value in values.round(9) + 0.0)
         lines.append(f'{seconds}.{nanoseconds:09d} {numbers}\n')
     path.write_text(''.join(lines))

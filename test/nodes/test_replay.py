@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,16 @@ from stereo_drive import room_drive, write_kitti
 from segfloor_ros.cli.replay_graph import unconnected
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
 
-FRAMES = 20
-SAME_FILES = ('map.pgm', 'map.yaml', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply')
+FRAMES, DAMAGED = 20, 7
+SAME_FILES = (
+    'map.pgm',
+    'map.yaml',
+    'trajectory.txt',
+    'keyframes.txt',
+    'camera_trajectory.txt',
+    'labelled_cloud.ply',
+    'settings.yaml',
+)
 
 
 @pytest.fixture(scope='module')
@@ -58,6 +67,10 @@ def node_processes(replay: subprocess.Popen[str]) -> dict[str, int]:
 
 
 def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
+    """Also where an image is damaged: it is skipped with a warning and counted."""
+    drive = Path(shutil.copytree(drive, tmp_path / 'drive'))
+    image = drive / 'image_1' / f'{DAMAGED:06d}.png'
+    image.write_bytes(image.read_bytes()[:1000])
     status, _, errors = segfloor('run', drive, '--out', tmp_path / 'run')
     assert status == 0, errors
     status, out, errors = segfloor('replay', drive, '--out', tmp_path / 'replay', '--rate', 0)
@@ -70,7 +83,8 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     ]
     for key in ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'map_updates'):
         assert summaries[0][key] == summaries[1][key], key
-    assert summaries[1]['frames'] == FRAMES
+    assert (summaries[1]['frames'], summaries[1]['skipped_frames']) == (FRAMES - 1, 1)
+    assert f'frame {DAMAGED} is skipped' in errors
     masks = [
         sorted(p.name for p in (tmp_path / k / 'floor_masks').iterdir()) for k in ('run', 'replay')
     ]
