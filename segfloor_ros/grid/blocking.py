@@ -1,52 +1,32 @@
-"""How far one can look from the base before the first occupied cell, by bearing."""
+"""How far a view reaches before the first occupied cell, by bearing."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
+from segfloor_ros.grid.fan import Fan
 
 TURN = 2 * np.pi
 
 
-class Horizon:
-    """Distances of the nearest occupied cells around a base, in cells.
+def nearest_cells(
+    column: NDArray[np.integer], row: NDArray[np.integer], fan: Fan
+) -> NDArray[np.float64]:
+    """Return the distance (S,) in cells to the nearest of some cells along a fan's bearings.
 
-    Bearing i of the full turn is first_rad + i * step_rad. occupied: (rows, columns) uint8, base:
-    (x, y) in its cells.
+    column, row: (N,). A cell covers the bearings within half a cell of its centre; bearings that
+    no cell covers are infinite.
     """
-
-    def __init__(
-        self, occupied: NDArray[np.uint8], base: Array, first_rad: float, step_rad: float
-    ) -> None:
-        self._first_rad, self._step_rad = first_rad, step_rad
-        self._nearest = np.full(int(np.ceil(TURN / step_rad)), np.inf)
-        at = cv2.findNonZero(occupied)
-        if at is None:
-            return
-        column, row = at.reshape(-1, 2).T
-        x, y = column + (0.5 - base[0]), row + (0.5 - base[1])
-        distance = np.sqrt(x * x + y * y)
-        bearing = self._bearing(x, y)
-        half_width = (0.5 / step_rad) / np.maximum(distance, 0.5)
-        first = np.ceil(bearing - half_width).astype(np.intp)
-        count = np.floor(bearing + half_width).astype(np.intp) - first + 1
-        start = np.cumsum(count) - count
-        index = np.arange(count.sum()) + np.repeat(first - start, count)
-        index %= len(self._nearest)
-        np.minimum.at(self._nearest, index, np.repeat(distance, count))
-
-    def along_fan(self, count: int) -> Array:
-        """Return the distances (count,) along the first bearings."""
-        return self._nearest[:count]
-
-    def towards(self, offset: Array) -> Array:
-        """Return the distances (N,) in the directions of points (2, N) relative to the base."""
-        index = np.rint(self._bearing(offset[0], offset[1])).astype(np.intp)
-        return self._nearest[index % len(self._nearest)]
-
-    def _bearing(self, x: Array, y: Array) -> Array:
-        turned = np.arctan2(y, x) - self._first_rad
-        return np.remainder(turned, TURN) * (1 / self._step_rad)
+    x, y = column + (0.5 - fan.centre[0]), row + (0.5 - fan.centre[1])
+    distance: Array = np.sqrt(x * x + y * y)
+    bearing = np.remainder(np.arctan2(y, x) - fan.first_rad, TURN) * (1 / fan.step_rad)
+    half_width = (0.5 / fan.step_rad) / np.maximum(distance, 0.5)
+    first = np.ceil(bearing - half_width).astype(np.intp)
+    count = np.floor(bearing + half_width).astype(np.intp) - first + 1
+    start = np.cumsum(count) - count
+    index = np.arange(count.sum()) + np.repeat(first - start, count)
+    nearest = np.full(int(np.ceil(TURN / fan.step_rad)), np.inf)
+    np.minimum.at(nearest, index % len(nearest), np.repeat(distance, count))
+    return nearest[: len(fan.lengths)]

@@ -31,17 +31,20 @@ class Fan:
     lengths: Array
     jumps: NDArray[np.bool_]
 
-    def draw(self, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-        """Return a raster (rows, columns) that is 1 where a cell's centre lies in the fan."""
+    def draw(self, shape: tuple[int, ...]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return two rasters (rows, columns): the first is 1 where a cell's centre lies in the
+        fan, the second where any part of the cell does.
+        """
         area = np.zeros(shape, np.uint8)
         if len(self.lengths) < 2:
-            return area
+            return area, area.copy()
         left, right = self._ends()
         outline = np.zeros((2, 2 * left.shape[1] + 1))
         outline[:, 1::2], outline[:, 2::2] = left, right
         pixels = fixed_point(self.centre[:, None] + outline)
-        cv2.fillPoly(area, [pixels], 1, shift=SUBPIXEL_BITS)
         # Filled shapes include every cell their border passes through: decide those by centre.
+        cv2.fillPoly(area, [pixels], 1, shift=SUBPIXEL_BITS)
+        touched = area.copy()
         border = np.zeros(shape, np.uint8)
         cv2.polylines(border, [pixels], True, 1, shift=SUBPIXEL_BITS)
         at = cv2.findNonZero(border)
@@ -49,7 +52,7 @@ class Fan:
             column, row = at.reshape(-1, 2).T
             x, y = column + (0.5 - self.centre[0]), row + (0.5 - self.centre[1])
             area[row, column] = self._contains(x, y, left, right)
-        return area
+        return area, touched
 
     def shadow(self, shape: tuple[int, ...], start: Array) -> NDArray[np.uint8] | None:
         """Return a raster that is 1 in all cells farther than `start` (S,) along a bearing, or on

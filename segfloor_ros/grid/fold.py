@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.grid.blocking import Horizon
+from segfloor_ros.grid.blocking import nearest_cells
 from segfloor_ros.grid.evidence import KeyframeEvidence, hit_range_m
-from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
+from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
 from segfloor_ros.grid.hits import draw_hits, draw_rays
 from segfloor_ros.grid.log_odds import ZERO, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
@@ -54,10 +54,14 @@ class EvidenceFolder:
 
     def fold(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
         """Add evidence to the cells from `placed.low` up to, not including, `placed.high`."""
-        free = self._draw_free(cells.shape, placed)
+        free, touched = placed.fan.draw(cells.shape)
+        if placed.rays.size:
+            base = placed.fan.centre
+            draw_rays(free, base, placed.rays - base[:, None], 0.5)
+            touched |= free
         hits = draw_hits(free, placed)
         partly = self._draw_partly_free(free, placed)
-        hidden = self._draw_hidden(cells, placed)
+        hidden = self._draw_hidden(cells, touched, placed.fan)
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible
         partly &= visible
@@ -66,13 +70,6 @@ class EvidenceFolder:
         _replace(cells, partly - near, self._lowered_tentatively)
         _replace(cells, hits, self._raised)
         self._drive(cells, placed)
-
-    def _draw_free(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
-        """Return the cells (rows, columns) that this keyframe sees to be free, 1."""
-        free = placed.fan.draw(shape)
-        if placed.rays.size:
-            draw_rays(free, placed.fan.centre, placed.rays - placed.fan.centre[:, None], 0.5)
-        return free
 
     def _draw_partly_free(
         self, free: NDArray[np.uint8], placed: PlacedEvidence
@@ -85,17 +82,20 @@ class EvidenceFolder:
         return partly
 
     def _draw_hidden(
-        self, cells: NDArray[np.uint8], placed: PlacedEvidence
+        self, cells: NDArray[np.uint8], touched: NDArray[np.uint8], fan: Fan
     ) -> NDArray[np.uint8] | None:
-        """Return the cells behind what is occupied so far, 1.
+        """Return the cells behind what is occupied so far, 1; None when nothing is in the way.
 
         What stands there itself still gets its share, so that it is cleared once it has left.
+        touched: the cells that this keyframe's view passes.
         """
         occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
-        fan = placed.fan
-        horizon = Horizon(occupied, placed.fan.centre, fan.first_rad, fan.step_rad)
-        body = max(2.0, _BODY_M / self._resolution_m)
-        return fan.shadow(cells.shape, horizon.along_fan(len(fan.lengths)) + body)
+        in_the_way = cv2.findNonZero(occupied & touched)
+        if in_the_way is None:
+            return None
+        column, row = in_the_way.reshape(-1, 2).T
+        horizon = nearest_cells(column, row, fan)
+        return fan.shadow(cells.shape, horizon + max(2.0, _BODY_M / self._resolution_m))
 
     def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the free cells that are near enough for an obstacle there to be placed, 1."""
@@ -119,4 +119,4 @@ class EvidenceFolder:
 
 def _replace(cells: NDArray[np.uint8], where: NDArray[np.uint8], table: NDArray[np.uint8]) -> None:
     """Replace the values of some cells by those of a table (256,)."""
-    np.copyto(cells, cv2.LUT(cells, table), where=where.view(np.bool_))
+    cv2.copyTo(cv2.LUT(cells, table), where, cells)
