@@ -6,8 +6,11 @@ import resource
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+MAX_SAMPLES = 200
 
 _PROC = Path('/proc')
 
@@ -38,14 +41,17 @@ class MemoryLog:
         """Note the memory at a map update."""
         self._samples_mb.append(self._measure())
 
-    def summary(self) -> dict[str, float]:
+    def summary(self) -> dict[str, Any]:
         """Return start, peak and growth per map update (slope of a line over the second half,
-        when caches are warm).
+        when caches are warm), and at most 200 samples evenly over the updates.
         """
+        every = max(1, -(-len(self._samples_mb) // MAX_SAMPLES))
         half = self._samples_mb[len(self._samples_mb) // 2 :]
         slope = float(np.polyfit(np.arange(len(half)), half, 1)[0]) if len(half) > 2 else 0.0
         return {
             'start': round(self.start_mb, 2),
             'peak': round(max([self.start_mb, *self._samples_mb]), 2),
             'slope_per_update': round(slope, 4),
+            'samples': [round(sample, 1) for sample in self._samples_mb[::every]],
+            'updates_per_sample': every,
         }

@@ -46,8 +46,9 @@ OUTPUT_NAMES = (
 class RunSummary:
     """The figures of a run, as written to summary.json.
 
-    lost_intervals: first and last frame number of every stretch without a pose. stages: by name
-    count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update in MB.
+    lost_intervals: first and last frame number of every stretch without a pose. stages: by
+    name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update in
+    MB, and samples over the updates.
     """
 
     frames: int
@@ -63,7 +64,7 @@ class RunSummary:
     camera_pitch_rad: float
     camera_roll_rad: float
     stages: dict[str, dict[str, float]]
-    rss_mb: dict[str, float]
+    rss_mb: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,3 +19,7 @@ SetOption = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option('--set', help='One parameter, e.g. occupancy_grid.resolution_m=0.02; repeatable.'),
 ]
+ReportOption = Annotated[
+    bool,
+    typer.Option('--report', help='Write report.html: everything about the run on one page.'),
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import (
@@ -57,3 +58,17 @@ def print_summary(title: str, summary: RunSummary) -> None:
 def print_error(message: str) -> None:
     """Print one line on standard error."""
     error_console.print(f'segfloor: {message}', markup=False, highlight=False)
+
+
+def finish_run(input_name: str, out: Path, report: bool) -> None:
+    """Write the report if asked for, with the truth where the recording has one, and say where the
+    results are.
+    """
+    console.print(f'map: {out / "map.yaml"}', highlight=False, soft_wrap=True)
+    if report:
+        # Imported here: Matplotlib takes a second that other commands should not wait for.
+        from segfloor_ros.evaluation.report import write_report
+
+        recording = Path(input_name)
+        truth = recording if (recording / 'map.yaml').is_file() else None
+        console.print(f'report: {write_report(out, truth)}', highlight=False, soft_wrap=True)

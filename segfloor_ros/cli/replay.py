@@ -9,8 +9,14 @@ import typer
 from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
-from segfloor_ros.cli.output import console, print_error, print_summary, progress_bar
+from segfloor_ros.cli.options import (
+    InputArgument,
+    OutOption,
+    ParamsOption,
+    ReportOption,
+    SetOption,
+)
+from segfloor_ros.cli.output import console, finish_run, print_error, print_summary, progress_bar
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import SaveMasks
@@ -32,6 +38,7 @@ def replay(
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
+    report: ReportOption = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
     try:
@@ -53,7 +60,7 @@ def replay(
     with OutputFolder(out) as folder:
         on_mask = folder.add_mask if save_masks is SaveMasks.keyframes else None
         with progress_bar('replaying', frame_count) as progress:
-            result, report = ReplaySession(
+            result, session = ReplaySession(
                 configuration,
                 params,
                 rate,
@@ -61,12 +68,12 @@ def replay(
                 lambda done, state: progress.update(TaskID(0), completed=done, note=state),
             ).execute()
         folder.write(result)
-    for notice in report.notices:
+    for notice in session.notices:
         print_error(notice)
     print_summary(input, result.summary)
     console.print(
-        f'nodes connected in {report.discovery_s:.1f} s, stopped in {report.shutdown_s:.1f} s; '
-        f'keyframes that failed: {report.failed_keyframes}',
+        f'nodes connected in {session.discovery_s:.1f} s, stopped in {session.shutdown_s:.1f} s; '
+        f'keyframes that failed: {session.failed_keyframes}',
         highlight=False,
     )
-    console.print(f'map: {out / "map.yaml"}', highlight=False)
+    finish_run(input, out, report)

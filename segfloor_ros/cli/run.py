@@ -8,8 +8,14 @@ import typer
 from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.options import InputArgument, OutOption, ParamsOption, SetOption
-from segfloor_ros.cli.output import console, print_summary, progress_bar
+from segfloor_ros.cli.options import (
+    InputArgument,
+    OutOption,
+    ParamsOption,
+    ReportOption,
+    SetOption,
+)
+from segfloor_ros.cli.output import finish_run, print_summary, progress_bar
 from segfloor_ros.configuration import resolve
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.recording import OutputFolder
@@ -23,6 +29,7 @@ def run(
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save.')
     ] = SaveMasks.keyframes,
+    report: ReportOption = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})
@@ -34,4 +41,4 @@ def run(
             )
         folder.write(result)
     print_summary(input, result.summary)
-    console.print(f'map: {out / "map.yaml"}', highlight=False)
+    finish_run(input, out, report)

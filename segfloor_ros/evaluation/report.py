@@ -16,6 +16,7 @@ from segfloor_ros.evaluation.report_data import ReportData, read_run
 from segfloor_ros.evaluation.report_pictures import (
     cloud_picture,
     map_picture,
+    memory_picture,
     strip_pictures,
     v_disparity_picture,
 )
@@ -173,7 +174,11 @@ def _memory(summary: dict[str, Any]) -> str:
         ('slope_per_update', 'MB more per map update'),
     )
     facts = [_fact(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
-    return f'<div class="facts">{"".join(facts)}</div>' if facts else ''
+    if not facts:
+        return ''
+    picture = memory_picture(memory)
+    drawn = _figure(picture, 'Memory over the map updates') if picture else ''
+    return f'<div class="facts">{"".join(facts)}</div>{drawn}'
 
 
 def _section(title: str, content: str) -> str:

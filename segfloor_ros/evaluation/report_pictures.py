@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,6 +83,23 @@ def v_disparity_picture(data: ReportData) -> bytes | None:
         _show_v_disparity(axes, data, floor.disparity_px, pixels)
         axes.set_title(f'{title} (frame {frame.index})', fontsize=10)
     axes.plot(floor.profile_px, np.arange(data.camera.height), color='#00e5ff', linewidth=0.7)
+    return _png(figure)
+
+
+def memory_picture(memory: dict[str, Any]) -> bytes | None:
+    """Return a PNG of the memory over the map updates, or None where it was not noted."""
+    samples = memory.get('samples', [])
+    if len(samples) < 2:
+        return None
+    figure = Figure(figsize=(10, 2.4), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    updates = np.arange(len(samples)) * memory.get('updates_per_sample', 1)
+    axes.plot(updates, samples)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel('map update')
+    axes.set_ylabel('MB')
+    axes.grid(alpha=0.3)
     return _png(figure)
 
 
