@@ -12,7 +12,7 @@ from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.log_odds import LogOddsRaster
 from segfloor_ros.grid.placing import Pose2d
 
-UNDO_BYTES = 6_000_000
+UNDO_BYTES = 4_000_000
 _MAX_STRIDE_M = 2.0
 """Between keyframes farther apart than this the base's way is not known."""
 
