@@ -60,16 +60,16 @@ def place(
     """Lay evidence on the raster with the base at `pose`, and `margin_m` around its way there."""
     yaw, scale = pose[2], 1 / resolution_m
     way = np.array([pose[:2], (previous or pose)[:2]]).T * scale
-    lengths = evidence.fan_m * np.float64(scale)
+    lengths = evidence.fan_m.astype(np.float64) * scale
     first_rad = evidence.first_rad + yaw
     directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
     cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
-    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m
+    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m.astype(np.float64)
     rays, faces = evidence.num_rays, evidence.num_rays + evidence.num_contacts
     x, y = positions[:, faces:]
     outward = positions[:, faces:] / np.maximum(np.sqrt(x * x + y * y), 1.0)
     positions += way[:, :1]
-    thickness = np.maximum(evidence.thickness_m * scale, 1.0)
+    thickness = np.maximum(evidence.thickness_m.astype(np.float64) * scale, 1.0)
     margin = margin_m * scale + 2
     body = int(np.ceil(thickness.max(initial=1.0))) + 1
     ends = directions * lengths + way[:, :1]
