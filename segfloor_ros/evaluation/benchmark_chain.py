@@ -57,7 +57,7 @@ class Workload:
     stages: dict[str, dict[str, float]]
     update_s: dict[str, float]
     items_per_s: float
-    memory_mb: dict[str, float]
+    memory_mb: dict[str, Any]
     reference_ms: float
 
 
