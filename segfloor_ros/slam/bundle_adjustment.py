@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, se3_exp
+from segfloor_ros.slam.disparity_offset import NO_OFFSET, OffsetEstimate
 from segfloor_ros.slam.residuals import (
     MIN_DEPTH_M,
     Observations,
@@ -31,7 +32,7 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once.
+    most once. offset: what was known before of the error that all disparities share.
     """
 
     T_camera_world: Array
@@ -40,6 +41,7 @@ class BundleProblem:
     keyframe: NDArray[np.intp]
     point: NDArray[np.intp]
     observations: Observations
+    offset: OffsetEstimate = NO_OFFSET
 
 
 @dataclass(frozen=True)
@@ -53,20 +55,22 @@ class BundleResult:
     inliers: NDArray[np.bool_]
     cost_before: float
     cost_after: float
+    offset: OffsetEstimate
 
 
 def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> BundleResult:
     """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
     al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16).
     """
-    state = _evaluate(camera, problem)
+    prior = problem.offset
+    state = _evaluate(camera, problem, prior)
     cost_before = state.cost
     damping, growth = 1e-4, 2.0
     for _ in range(iterations):
-        system = _linearise(camera, problem, state)
+        system = _linearise(camera, problem, state, prior)
         step = system.solve(damping)
         candidate = _apply(problem, step)
-        trial = _evaluate(camera, candidate)
+        trial = _evaluate(camera, candidate, prior)
         predicted = system.predicted_decrease(step, damping)
         gain = (state.cost - trial.cost) / max(predicted, 1e-12)
         if gain > 0:
@@ -81,7 +85,12 @@ def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> Bun
             growth *= 2.0
     inliers = state.front & (state.chi2 <= problem.observations.chi2_limit)
     return BundleResult(
-        problem.T_camera_world, problem.points_world, inliers, cost_before, state.cost
+        problem.T_camera_world,
+        problem.points_world,
+        inliers,
+        cost_before,
+        state.cost,
+        problem.offset,
     )
 
 
@@ -94,15 +103,17 @@ class _State:
     cost: float
 
 
-def _evaluate(camera: StereoCamera, problem: BundleProblem) -> _State:
+def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimate) -> _State:
     poses = problem.T_camera_world[problem.keyframe]
     points = np.einsum('nij,nj->ni', poses[:, :3, :3], problem.points_world[problem.point])
     points += poses[:, :3, 3]
     front = points[:, 2] > MIN_DEPTH_M
     points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
     residual = residuals(camera, points, problem.observations)
+    residual[:, 2] += problem.offset.value_px * problem.observations.has_disparity
     chi2 = squared_norms(residual, problem.observations.information)
     cost = huber_cost(chi2, problem.observations.chi2_limit)
+    cost += prior.information * (problem.offset.value_px - prior.value_px) ** 2
     return _State(points, residual, chi2, front, cost)
 
 
@@ -110,12 +121,15 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem) -> _State:
 class _Step:
     twists: Array
     shifts: Array
+    offset_px: float
+    offset_information: float
 
 
 @dataclass(frozen=True)
 class _System:
     """The normal equations by blocks: cameras U (K, 6, 6), points V (P, 3, 3), and W (M, 6, 3) of
-    each pair (keyframe[m], point[m]) that an observation ties together; right-hand sides.
+    each pair (keyframe[m], point[m]) that an observation ties together; right-hand sides. The
+    disparity offset is one more unknown: its products with cameras (K, 6), points (P, 3), itself.
     """
 
     U: Array
@@ -125,28 +139,43 @@ class _System:
     point: NDArray[np.intp]
     camera_rhs: Array
     point_rhs: Array
+    offset_camera: Array
+    offset_point: Array
+    offset_offset: float
+    offset_rhs: float
 
     def solve(self, damping: float) -> _Step:
         """Solve the damped system by the Schur complement on the cameras."""
         free, points = len(self.U), len(self.V)
         V_inverse = _inverse_symmetric(_damped(self.V, damping))
         W = self._dense(self.W, free, points)
+        W[:, -1] = self.offset_point.ravel()
         WV = self._dense(self.W @ V_inverse[self.point], free, points)
+        WV[:, -1] = (V_inverse @ self.offset_point[..., None]).ravel()
         S = -WV.T @ W
         diagonal = _damped(self.U, damping)
         for k in range(free):
             S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += diagonal[k]
-        rhs = self.camera_rhs.ravel() - self.point_rhs.ravel() @ WV
-        twists = np.linalg.solve(S, rhs)
-        back = self.point_rhs - (W @ twists).reshape(points, 3)
+        S[-1, :-1] += self.offset_camera.ravel()
+        S[:-1, -1] += self.offset_camera.ravel()
+        S[-1, -1] += self.offset_offset
+        rhs = np.append(self.camera_rhs.ravel(), self.offset_rhs) - self.point_rhs.ravel() @ WV
+        unit = np.append(np.zeros(6 * free), 1.0)
+        solution, variances = np.linalg.solve(S, np.stack([rhs, unit], axis=1)).T
+        back = self.point_rhs - (W @ solution).reshape(points, 3)
         shifts = (V_inverse @ back[..., None])[..., 0]
-        return _Step(twists.reshape(free, 6), shifts)
+        twists = solution[:-1].reshape(free, 6)
+        return _Step(twists, shifts, float(solution[-1]), 1.0 / float(variances[-1]))
 
     def _dense(self, blocks: Array, free: int, points: int) -> Array:
-        """Return the transpose (3 P, 6 K) of the matrix that the blocks (M, 6, 3) are part of."""
-        dense = np.zeros((points, 3, free, 6))
-        dense[self.point, :, self.keyframe] = blocks.transpose(0, 2, 1)
-        return dense.reshape(3 * points, 6 * free)
+        """Return the transpose (3 P, 6 K + 1) of the matrix that the blocks (M, 6, 3) are part of,
+        its last column free for the offset.
+        """
+        dense = np.zeros((3 * points, 6 * free + 1))
+        rows = 3 * self.point[:, None, None] + np.arange(3)[:, None]
+        columns = 6 * self.keyframe[:, None, None] + np.arange(6)
+        dense[rows, columns] = blocks.transpose(0, 2, 1)
+        return dense
 
     def predicted_decrease(self, step: _Step, damping: float) -> float:
         """Return how much the cost falls by the quadratic model."""
@@ -155,6 +184,7 @@ class _System:
         return float(
             (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
             + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs)).sum()
+            + step.offset_px * self.offset_rhs
         )
 
 
@@ -180,7 +210,9 @@ def _damped(blocks: Array, damping: float) -> Array:
     return blocks + np.eye(size) * (damping * diagonal + 1e-9)[:, None, :]
 
 
-def _linearise(camera: StereoCamera, problem: BundleProblem, state: _State) -> _System:
+def _linearise(
+    camera: StereoCamera, problem: BundleProblem, state: _State, prior: OffsetEstimate
+) -> _System:
     observations = problem.observations
     weight = observations.information * huber_weights(state.chi2, observations.chi2_limit)[:, None]
     weight = weight * state.front[:, None]
@@ -202,7 +234,24 @@ def _linearise(camera: StereoCamera, problem: BundleProblem, state: _State) -> _
         k, _products(WJ_pose, state.residual[free][..., None])[..., 0], problem.num_free
     )
     W = _products(WJ_pose, J_point[free])
-    return _System(U, V, W, k, p, camera_rhs, point_rhs)
+    weight_d = weight[:, 2] * observations.has_disparity
+    offset_point = _sum_by(problem.point, weight_d[:, None] * J_point[:, 2], num_points)
+    offset_camera = _sum_by(k, weight_d[free][:, None] * J_pose[:, 2], problem.num_free)
+    offset_rhs = -float(weight_d @ state.residual[:, 2])
+    offset_rhs -= prior.information * (problem.offset.value_px - prior.value_px)
+    return _System(
+        U,
+        V,
+        W,
+        k,
+        p,
+        camera_rhs,
+        point_rhs,
+        offset_camera,
+        offset_point,
+        float(weight_d.sum()) + prior.information,
+        offset_rhs,
+    )
 
 
 def _products(A: Array, B: Array) -> Array:
@@ -220,4 +269,9 @@ def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:
 def _apply(problem: BundleProblem, step: _Step) -> BundleProblem:
     poses = problem.T_camera_world.copy()
     poses[: problem.num_free] = se3_exp(step.twists) @ poses[: problem.num_free]
-    return replace(problem, T_camera_world=poses, points_world=problem.points_world + step.shifts)
+    return replace(
+        problem,
+        T_camera_world=poses,
+        points_world=problem.points_world + step.shifts,
+        offset=OffsetEstimate(problem.offset.value_px + step.offset_px, step.offset_information),
+    )

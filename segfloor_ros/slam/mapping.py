@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
+from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.disparity_refinement import refine_disparity
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.matching import match_rows
@@ -30,6 +31,9 @@ class LocalMapper:
     def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
         self._camera = camera
         self._settings = settings
+        self.offset = DisparityOffset(
+            settings.disparity_offset_sigma_px, 1.0 / settings.local_keyframes
+        )
 
     def measure_stereo(
         self,
@@ -76,9 +80,9 @@ class LocalMapper:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
         uvd = keyframe.observations.uvd_px
         with np.errstate(invalid='ignore'):
-            measured = uvd[:, 2] >= MIN_DISPARITY_PX
+            measured = uvd[:, 2] - self.offset.value_px >= MIN_DISPARITY_PX
         rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
-        depth = self._camera.disparity_times_depth / uvd[rows, 2]
+        depth = self._camera.disparity_times_depth / (uvd[rows, 2] - self.offset.value_px)
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
@@ -100,8 +104,10 @@ class LocalMapper:
             slot[edge_keyframe],
             np.searchsorted(ids, edge_point),
             _gather(sparse_map, edge_keyframe, edge_row),
+            self.offset.estimate,
         )
         result = adjust(self._camera, problem, self._settings.bundle_iterations)
+        self.offset.learn(result.offset)
         self._write_back(sparse_map, free, ids, result)
         self._drop_outliers(sparse_map, edge_keyframe, edge_row, result.inliers)
 

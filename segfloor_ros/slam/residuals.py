@@ -42,6 +42,15 @@ class Observations:
         return Observations(self.uvd_px[rows], self.sigma_px[rows])
 
     @property
+    def has_disparity(self) -> NDArray[np.bool_]:
+        """Whether each feature (N,) has a disparity."""
+        return np.isfinite(self.uvd_px[:, 2])
+
+    def without_offset(self, offset_px: float) -> Observations:
+        """Return the same measurements with disparities freed of an error they all share."""
+        return Observations(self.uvd_px - (0.0, 0.0, offset_px), self.sigma_px)
+
+    @property
     def information(self) -> Array:
         """Inverse variances (N, 3) in 1/px²; 0 where there is no measurement."""
         return np.where(np.isfinite(self.uvd_px), 1.0 / self.sigma_px**2, 0.0)

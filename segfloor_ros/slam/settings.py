@@ -131,6 +131,14 @@ class StereoSlamSettings(StageSettings):
         minimum=0.005,
         maximum=1.0,
     )
+    disparity_offset_sigma_px: float = setting(
+        0.1,
+        'Error that all disparities may share where the rectification is imperfect; it is '
+        'estimated while driving. 0: disparities are taken as they are.',
+        unit='px',
+        minimum=0.0,
+        maximum=1.0,
+    )
     local_keyframes: int = setting(
         10, 'Keyframes that move in a local bundle adjustment.', minimum=2, maximum=50
     )

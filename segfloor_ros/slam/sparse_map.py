@@ -25,7 +25,8 @@ MAX_PATCH_ZOOM = 1.3
 class KeyframeRecord:
     """One keyframe of the map.
 
-    The pose moves in bundle adjustment. point_id: (N,) int32, the map point of each feature.
+    The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
+    not taken off. point_id: (N,) int32, the map point of each feature.
     patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature.
     """
 

@@ -121,6 +121,11 @@ class StereoSlam:
         self._frames_since_keyframe = 0
         self._local_ids: NDArray[np.int32] = np.zeros(0, np.int32)
 
+    @property
+    def disparity_offset_px(self) -> float:
+        """The error that all disparities share, measured minus true, as estimated so far."""
+        return self._mapper.offset.value_px
+
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
@@ -150,7 +155,9 @@ class StereoSlam:
         steady: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
         turned = self._rotation.turn_since_last(left) @ self._T_camera_world
         ids = self._local_ids
-        track = self._tracker.track(left, right, features, self.map, ids, [steady, turned])
+        track = self._tracker.track(
+            left, right, features, self.map, ids, [steady, turned], self.disparity_offset_px
+        )
         if track is None and self._lost:
             track = self._recover(left, right, features)
         if track is None or not (self._lost or self._plausible(track, dt_s)):
@@ -181,7 +188,15 @@ class StereoSlam:
         if estimate is None:
             return None
         ids = self._choose_local_points(ids)
-        return self._tracker.track(left, right, features, self.map, ids, [estimate.T_camera_world])
+        return self._tracker.track(
+            left,
+            right,
+            features,
+            self.map,
+            ids,
+            [estimate.T_camera_world],
+            self.disparity_offset_px,
+        )
 
     def _plausible(self, track: Track, dt_s: float) -> bool:
         motion = track.T_camera_world @ invert(self._T_camera_world)

@@ -95,9 +95,12 @@ class Tracker:
         sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         predictions: Sequence[Array],
+        offset_px: float = 0.0,
     ) -> Track | None:
         """Find the pose of a frame near one of the predicted ones, tried in order.
 
+        offset_px: the known error of all disparities, measured minus true; the returned
+        observations still have it.
         None when too few points are found again.
         """
         if len(features) == 0 or len(local_ids) == 0:
@@ -115,12 +118,13 @@ class Tracker:
             return None
         ids = seen.ids[points]
         self._align_pixels(left, observations, rows, sparse_map, ids, estimate.T_camera_world)
-        self._measure_disparity(left, right, observations, rows, seen.uvd_px[points, 2])
+        guess_px = seen.uvd_px[points, 2] + offset_px
+        self._measure_disparity(left, right, observations, rows, guess_px)
         estimate = refine_pose(
             self._camera,
             estimate.T_camera_world,
             sparse_map.xyz_world[ids],
-            observations.take(rows),
+            observations.take(rows).without_offset(offset_px),
         )
         if not self._agree(estimate):
             return None
