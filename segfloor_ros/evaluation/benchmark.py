@@ -14,8 +14,9 @@ from segfloor_ros import __version__
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.benchmark_apart import Progress, run_apart
-from segfloor_ros.evaluation.benchmark_chain import ImageChain, MapChain, Workload
+from segfloor_ros.evaluation.benchmark_chain import ImageChain, MapChain
 from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT, Corridor
+from segfloor_ros.evaluation.benchmark_figures import Workload
 from segfloor_ros.evaluation.benchmark_images import CorridorImages
 from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
 

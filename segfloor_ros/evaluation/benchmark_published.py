@@ -1,39 +1,16 @@
-"""The scenes of the published evaluation, mapped and scored here, beside the published figures."""
+"""The published evaluation in figures, by the names of the scenes shipped here that follow it."""
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import shutil
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
-import cv2
-
-from segfloor_ros import __version__
-from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.evaluation.benchmark import JSON_VERSION, Announce, machine
-from segfloor_ros.evaluation.benchmark_apart import Progress, run_apart
-from segfloor_ros.evaluation.benchmark_chain import ImageChain, Workload
-from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
-from segfloor_ros.evaluation.map_score import MapScore, compare, score_map
-from segfloor_ros.evaluation.overlay import save_overlay
-from segfloor_ros.evaluation.prm import RoadMapPlan
-from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.errors import SettingsError
 from segfloor_ros.settings import suggestion
-from segfloor_ros.simulation.recording import RecordingOptions, record
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.simulation import Simulation
 
 SOURCE = 'Segfloor dissertation (2022, in Portuguese), evaluation chapter'
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PublishedFigures:
     """A row of the published table. Times and memory are its means over all scenes."""
 
@@ -44,7 +21,7 @@ class PublishedFigures:
     update_mb: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class PublishedScene:
     """A scene of the published evaluation. nodes: of a road map, 0 for one per 1.5 m² where nobody
     said. area_m2: of the original.
@@ -92,16 +69,6 @@ published.
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class SceneResult:
-    """A scene mapped here: what it cost, how good the map is, and what was published."""
-
-    scene: str
-    workload: Workload
-    score: MapScore
-    published: PublishedScene
-
-
 def parse_scenes(text: str) -> list[str]:
     """Return the names in `corridor1,corridor2`. Raises SettingsError for an unknown one."""
     names = [part.strip() for part in text.split(',')]
@@ -111,75 +78,3 @@ def parse_scenes(text: str) -> list[str]:
                 f'--scenes: no published scene {name}{suggestion(name, [*PUBLISHED])}'
             )
     return names
-
-
-def run_scene(
-    name: str,
-    scene: Scene,
-    folder: Path,
-    configuration: Configuration,
-    threads: int,
-    announce: Announce,
-) -> SceneResult:
-    """Render a scene into `folder` unless it is there, map it in a process of its own, score the
-    map, and leave map.yaml and overlay.png in the folder.
-
-    Raises RenderingError where nothing can be rendered and MapError when no map came of it.
-    """
-    recording = folder / 'recording'
-    _render(name, scene, recording, folder / 'rendered_from.txt', announce)
-    source = open_source(StereoCameraSettings(input=str(recording)))
-    report = announce(f'mapping {name}', source.frame_count or 0)
-    workload, grid = run_apart(
-        map_recording, name, recording, configuration, threads, on_progress=report
-    )
-    truth, published = load_truth(recording), PUBLISHED[name]
-    pose = truth.start_pose or (0.0, 0.0, 0.0)
-    save_map(grid, folder / 'map.yaml')
-    save_overlay(compare(grid, truth, pose), folder / 'overlay.png')
-    score = score_map(grid, truth, pose, RoadMapPlan(nodes=published.nodes))
-    return SceneResult(name, workload, score, published)
-
-
-def map_recording(
-    name: str, recording: Path, configuration: Configuration, threads: int, on_progress: Progress
-) -> tuple[Workload, OccupancyGrid]:
-    """Run all stages over a recording and return what it cost and the map."""
-    cv2.setNumThreads(threads)
-    reference = ReferenceWorkload()
-    reference.time()
-    settings = dataclasses.replace(configuration.stereo_camera, input=str(recording))
-    source = open_source(settings)
-    chain = ImageChain(source.camera, configuration)
-    for frame in source.frames():
-        chain.process(frame)
-        on_progress(chain.frames)
-    reference.time()
-    if chain.grid is None:
-        raise MapError(f'{name}: no map came of {chain.frames} frames')
-    return chain.workload(name, chain.frames, chain.tracked, reference.median_ms), chain.grid
-
-
-def as_document(results: list[SceneResult]) -> dict[str, Any]:
-    """Return the figures of all scenes as plain numbers for a JSON file."""
-    return {
-        'version': JSON_VERSION,
-        'segfloor_ros': __version__,
-        'machine': machine(),
-        'published_source': SOURCE,
-        'scenes': [dataclasses.asdict(result) for result in results],
-    }
-
-
-def _render(name: str, scene: Scene, recording: Path, stamp: Path, announce: Announce) -> None:
-    """Render a drive unless the folder holds this very scene already."""
-    wanted = hashlib.sha256(repr(scene).encode()).hexdigest() + '\n'
-    if recording.is_dir() and stamp.is_file() and stamp.read_text() == wanted:
-        return
-    with Simulation(scene) as simulation:
-        stamp.unlink(missing_ok=True)
-        if recording.is_dir():
-            shutil.rmtree(recording)
-        report = announce(f'rendering {name}', simulation.frame_count)
-        record(simulation, recording, RecordingOptions(floor_every=0), report)
-    stamp.write_text(wanted)

@@ -11,16 +11,19 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from segfloor_ros.cli.benchmark import benchmark, published_table
+from segfloor_ros.cli.benchmark import benchmark
+from segfloor_ros.cli.benchmark_tables import published_table
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError
 from segfloor_ros.evaluation.benchmark import BenchmarkPlan, measure_map
 from segfloor_ros.evaluation.benchmark_apart import run_apart
-from segfloor_ros.evaluation.benchmark_chain import ImageChain, UpdateTimes
+from segfloor_ros.evaluation.benchmark_chain import ImageChain
 from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT, Corridor, floor_mask
+from segfloor_ros.evaluation.benchmark_figures import UpdateTimes
 from segfloor_ros.evaluation.benchmark_images import CorridorImages
-from segfloor_ros.evaluation.benchmark_published import PUBLISHED, as_document, run_scene
+from segfloor_ros.evaluation.benchmark_published import PUBLISHED
 from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
+from segfloor_ros.evaluation.benchmark_scenes import as_document, run_scene
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, sample_states, states
 from segfloor_ros.evaluation.truth import read_map
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
