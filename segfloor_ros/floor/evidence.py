@@ -15,6 +15,7 @@ from segfloor_ros.floor.disparity import SUBPIXEL
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.geometry import Array
 
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
@@ -40,6 +41,59 @@ class FloorView:
         shear = (line.shear * (np.arange(camera.width) - camera.cx)).astype(np.float32)
         rows = np.arange(first_row, camera.height, dtype=np.float32)
         return cls(camera, mount, line, first_row, rows[:, None] + shear)
+
+    def rays(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return the rays (3, N) of the view's pixels at depth 1, in the base's axes."""
+        x = ((columns - self.camera.cx) / self.camera.fx).astype(np.float32)
+        y = ((rows + (self.first_row - self.camera.cy)) / self.camera.fy).astype(np.float32)
+        R = self.mount.T_base_left[:3, :3].astype(np.float32)
+        return R[:, 0:1] * x + R[:, 1:2] * y + R[:, 2:3]
+
+    def positions(
+        self,
+        rows: NDArray[np.integer],
+        columns: NDArray[np.integer],
+        disparity_px: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Return where pixels of known disparity (N,) are in the base's x-y plane, (2, N)."""
+        depth = np.float32(self.camera.disparity_times_depth) / disparity_px
+        offset = self.mount.T_base_left[:2, 3:4].astype(np.float32)
+        return self.rays(rows, columns)[:2] * depth + offset
+
+    def floor_positions(
+        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
+    ) -> NDArray[np.float32]:
+        """Return where the rays of pixels meet the floor's plane, (2, N) in the base's plane;
+        very far where they do not.
+        """
+        rays = self.rays(rows, columns)
+        depth = np.float32(self.mount.height_m) / np.maximum(-rays[2], np.float32(1e-5))
+        return rays[:2] * depth + self.mount.T_base_left[:2, 3:4].astype(np.float32)
+
+    def pixels_of_floor(self, xy_base: Array) -> Array:
+        """Return the view's pixels (N, 2) of positions (N, 2) on the floor; negative where they
+        are behind the camera.
+        """
+        T_base_left = self.mount.T_base_left
+        points = np.concatenate([xy_base, np.zeros((len(xy_base), 1))], axis=1)
+        in_camera = (points - T_base_left[:3, 3]) @ T_base_left[:3, :3]
+        in_camera[in_camera[:, 2] < 0.05] = (-1e6, -1e6, 1.0)
+        return self.camera.project(in_camera)[:, :2] - (0.0, self.first_row)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the images say of each pixel of a view, (R, W) bool.
+
+    against: clearly more like the matched disparity than like floor. unlike: unlike floor,
+    whatever it is. distinct: like floor, and less so a little off the floor.
+    consistent: may be floor.
+    """
+
+    against: NDArray[np.bool_]
+    unlike: NDArray[np.bool_]
+    distinct: NDArray[np.bool_]
+    consistent: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -89,22 +143,24 @@ def judge(
     profile: FloorProfile,
     disparity: NDArray[np.float32],
     textured: NDArray[np.bool_],
-    against: NDArray[np.bool_],
+    compared: Comparison,
     table: HeightTable,
     settings: FloorSegmentationSettings,
 ) -> Evidence:
     """Return what the pixels (R, W) of the view say by themselves.
 
-    textured: where a disparity means something; against: where the images contradict the floor.
+    textured: where a disparity means something; compared: what the images say of the floor. A
+    disparity makes floor only where the images agree, and denies it only where they do.
     """
     index = (disparity * SUBPIXEL).astype(np.intp)
     height = table.offset[index] - table.scale[index] * view.derolled
     above = height > table.up[index]
     off = above | (height < -table.down[index])
-    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    sure = textured & compared.against
     near = disparity >= np.float32(settings.min_disparity_px)
-    mask[textured & near & ~off & ~against] = FLOOR
-    sure = textured & against
+    floor = textured & near & ~off & ~compared.against & ~compared.unlike
+    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    mask[floor | compared.distinct] = FLOOR
     mask[off & sure] = NOT_FLOOR
     low = above & sure & (height < table.up[index] + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, profile, disparity, low)] = NOT_FLOOR

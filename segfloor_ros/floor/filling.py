@@ -1,4 +1,4 @@
-"""Floor where the image alone cannot tell: gaps between floor, and what was seen before."""
+"""Floor where the image alone cannot tell: between floor, and where the picture goes on alike."""
 
 from __future__ import annotations
 
@@ -9,78 +9,83 @@ from numpy.typing import NDArray
 from segfloor_ros.floor.evidence import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorProfile
-from segfloor_ros.geometry import Array
 
-_MIN_REGION_PX = 40
+_STEP_PX = 2
+"""Regions are found at this part of the resolution."""
+_MIN_REGION_PX = 15
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
+_TEXTURE_MARGIN = 7
 _EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
-
-
-def fill_gaps(
-    view: FloorView, profile: FloorProfile, mask: NDArray[np.uint8], gap_m: float
-) -> NDArray[np.uint8]:
-    """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
-    are at most `gap_m` apart.
-    """
-    height, width = mask.shape
-    rows = np.arange(height) + view.first_row
-    disparity = np.nan_to_num(profile.at_rows(rows))
-    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity
-    known = mask != NO_EVIDENCE
-    columns = np.arange(width, dtype=np.int32)
-    left = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
-    right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], axis=1)[:, ::-1]
-    row_index = np.arange(height)[:, None]
-    between = (mask[row_index, left] == FLOOR) & (mask[row_index, right] == FLOOR)
-    filled = mask.copy()
-    filled[~known & between & (right - left <= longest[:, None])] = FLOOR
-    return filled
 
 
 def fill_regions(
     mask: NDArray[np.uint8],
     image: NDArray[np.uint8],
     consistent: NDArray[np.bool_],
+    textured: NDArray[np.bool_],
     min_share: float,
 ) -> NDArray[np.uint8]:
-    """Return the mask with NO_EVIDENCE turned to floor in regions that look alike, continue
-    floor, and that the images do not contradict (`consistent`).
+    """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
+    floor.
 
-    A region is bounded by edges of the image stronger than the floor's own; floor by evidence must
-    be in `min_share` of its columns. Within it a pixel becomes floor below floor, the next evidence up its
-    column, or between floor on its left and right. Half the resolution does.
+    consistent: (R, W), where the images do not contradict the floor. A region is bounded by edges
+    of the image stronger than most of the floor's own; floor by evidence must be in `min_share`
+    of its columns. In it a pixel becomes floor below floor, the next evidence up its column; or
+    between floor on its left and right; or, if it is not blank, nearer than any of its floor.
     """
-    step = 2
+    step = _STEP_PX
     small = mask[::step, ::step]
     floor = small == FLOOR
     if np.count_nonzero(floor) < _MIN_REGION_PX:
         return mask
-    smooth = cv2.blur(image, (5, 5))[::step, ::step]
-    slope = cv2.magnitude(
+    slope = _slope(image)
+    limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
+    alike = (small != NOT_FLOOR) & consistent[::step, ::step] & (slope < limit)
+    core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, region = cv2.connectedComponents(core, connectivity=4)
+    top = _top_of_supported(region, count, floor, min_share)
+    highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
+    not_blank = cv2.erode(
+        textured[::step, ::step].astype(np.uint8),
+        np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8),
+    )
+    rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
+    inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
+    nearer = (rows >= highest) & (not_blank > 0)
+    fill = inside & (nearer | _under_floor(small) | _between_floor(small))
+    return _with_floor(mask, fill)
+
+
+def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    smooth = cv2.blur(image, (5, 5))[::_STEP_PX, ::_STEP_PX]
+    return cv2.magnitude(
         cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
         cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
     )
-    limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
-    alike = (small != NOT_FLOOR) & consistent[::step, ::step] & (slope < limit)
-    count, region = cv2.connectedComponents(
-        cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8)), connectivity=4
-    )
-    supported = np.bincount(region[floor], minlength=count)
-    columns = np.broadcast_to(np.arange(small.shape[1]), small.shape)
-    spread = np.zeros((2, count, small.shape[1]), np.bool_)
-    spread[0, region, columns] = True
-    spread[1, region[floor], columns[floor]] = True
-    wide = spread[1].sum(axis=1) >= min_share * spread[0].sum(axis=1)
-    good = (supported >= _MIN_REGION_PX) & wide
+
+
+def _top_of_supported(
+    region: NDArray[np.int32], count: int, floor: NDArray[np.bool_], min_share: float
+) -> NDArray[np.intp]:
+    """Return the topmost row (count,) with floor of each region, the number of rows where it has
+    too little.
+    """
+    height, width = region.shape
+    rows, columns = np.nonzero(floor)
+    owner = region[rows, columns]
+    has_floor = np.zeros((count, width), np.bool_)
+    has_floor[owner, columns] = True
+    extent = np.zeros((count, width), np.bool_)
+    extent[region, np.arange(width)] = True
+    wide = has_floor.sum(axis=1) >= min_share * extent.sum(axis=1)
+    good = wide & (np.bincount(owner, minlength=count) >= _MIN_REGION_PX)
     good[0] = False
-    inside = cv2.dilate(good[region].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    fill = inside & alike & (small == NO_EVIDENCE) & (_under_floor(small) | _between_floor(small))
-    filled = mask.copy()
-    grown = cv2.resize(fill.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    filled[(grown > 0) & (mask == NO_EVIDENCE)] = FLOOR
-    return filled
+    top = np.full(count, height, np.intp)
+    np.minimum.at(top, owner, rows)
+    top[~good] = height
+    return top
 
 
 def _under_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -102,6 +107,55 @@ def _last_known(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.take_along_axis(mask, last, axis=0)
 
 
+def _with_floor(mask: NDArray[np.uint8], fill: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    size = (mask.shape[1], mask.shape[0])
+    grown = cv2.resize(fill.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    filled = mask.copy()
+    filled[(grown > 0) & (mask == NO_EVIDENCE)] = FLOOR
+    return filled
+
+
+def fill_gaps(
+    view: FloorView,
+    profile: FloorProfile,
+    mask: NDArray[np.uint8],
+    consistent: NDArray[np.bool_],
+    gap_m: float,
+) -> NDArray[np.uint8]:
+    """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
+    are at most `gap_m` apart, where the images do not contradict the floor (`consistent`).
+    """
+    height, width = mask.shape
+    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
+    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity
+    known = mask != NO_EVIDENCE
+    columns = np.arange(width, dtype=np.int32)
+    left = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
+    right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], axis=1)[:, ::-1]
+    between = (np.take_along_axis(mask, left, axis=1) == FLOOR) & (
+        np.take_along_axis(mask, right, axis=1) == FLOOR
+    )
+    filled = mask.copy()
+    filled[~known & consistent & between & (right - left <= longest[:, None])] = FLOOR
+    return filled
+
+
+def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]:
+    """Return the mask without patches of floor smaller than a share of the largest."""
+    step = _STEP_PX
+    small = (mask[::step, ::step] == FLOOR).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
+    if count < 3:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA]
+    lone = (area < min_share * area[1:].max())[label]
+    size = (mask.shape[1], mask.shape[0])
+    grown = cv2.resize(lone.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    kept = mask.copy()
+    kept[(grown > 0) & (mask == FLOOR)] = NO_EVIDENCE
+    return kept
+
+
 def trim_to_edges(
     mask: NDArray[np.uint8], image: NDArray[np.uint8], reach_px: int
 ) -> NDArray[np.uint8]:
@@ -118,9 +172,7 @@ def trim_to_edges(
     if not below_blank.any():
         return mask
     smooth = cv2.GaussianBlur(image, (3, 5), 0)
-    slope = cv2.absdiff(
-        cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE), np.array([0.0])
-    )
+    slope = np.abs(cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE))
     slope[below_blank == 0] = 0
     strongest = cv2.dilate(slope, np.ones((2 * reach_px + 1, 1), np.uint8))
     edge = ((slope == strongest) & (slope >= _EDGE_SLOPE)).astype(np.uint8)
@@ -128,22 +180,3 @@ def trim_to_edges(
     trimmed = mask.copy()
     trimmed[(below_blank > 0) & (under_edge == 0)] = NO_EVIDENCE
     return trimmed
-
-
-def floor_positions(view: FloorView, rows: Array, columns: Array) -> Array:
-    """Return where the rays of pixels meet the floor, (N, 2) in the base's plane, in metres."""
-    camera, mount = view.camera, view.mount
-    rays = camera.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
-    depth = -mount.height_m / np.minimum(rays @ mount.up_in_camera, -1e-6)
-    T_base_left = mount.T_base_left
-    return (rays * depth[:, None]) @ T_base_left[:2, :3].T + T_base_left[:2, 3]
-
-
-def floor_pixels(view: FloorView, xy_base: Array) -> Array:
-    """Return the pixels (N, 2) of positions (N, 2) on the floor; outside the image where behind."""
-    T_base_left = view.mount.T_base_left
-    points = np.concatenate([xy_base, np.zeros((len(xy_base), 1))], axis=1) - T_base_left[:3, 3]
-    in_camera = points @ T_base_left[:3, :3]
-    in_front = in_camera[:, 2] > 0.05
-    in_camera[~in_front] = (-1e6, -1e6, 1.0)
-    return view.camera.project(in_camera)[:, :2]

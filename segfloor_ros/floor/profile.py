@@ -6,6 +6,7 @@ Application to Free-Space Estimation (2009).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,15 +63,25 @@ class FloorProfile:
     disparity_px: Array
     support: float
 
-    def at_rows(self, rows: NDArray[np.floating] | NDArray[np.integer]) -> Array:
+    def at_rows(self, rows: Array | NDArray[np.integer]) -> Array:
         """Return the floor's disparity at de-rolled rows, NaN above the first row."""
         row = np.asarray(rows, np.float64)
         end = self.first_row + len(self.disparity_px) - 1
         grid = self.first_row + np.arange(len(self.disparity_px))
-        values = np.interp(row, grid, self.disparity_px)
+        values: Array = np.interp(row, grid, self.disparity_px)
         values += np.maximum(row - end, 0) * self.line.slope
         values[row < self.first_row] = np.nan
         return values
+
+    def at_pixels(self, derolled: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the floor's disparity (R, W) at many de-rolled rows, 0 above the first."""
+        first = math.floor(float(derolled.min()))
+        whole = np.arange(first, math.floor(float(derolled.max())) + 2)
+        by_row = np.nan_to_num(self.at_rows(whole)).astype(np.float32)
+        offset = derolled - np.float32(first)
+        index = offset.astype(np.intp)
+        share = offset - index.astype(np.float32)
+        return by_row[index] * (1 - share) + by_row[index + 1] * share
 
     def row_of_disparity(self, disparity_px: NDArray[np.floating]) -> Array:
         """Return the de-rolled row at which the floor has a disparity."""

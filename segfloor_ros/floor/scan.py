@@ -8,121 +8,134 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.geometry import Array
 
 RANGE_STEP_M = 0.025
+_GAP_ROWS = 4.0
+"""So many image rows of floor may be missing, however many metres they are."""
+_SPREAD = 0.06
+"""What stands upright is measured within this share of its range."""
+_UPRIGHT_M = 0.08
+"""So much of an upright surface must be seen to end the scan."""
 
 
-class ScanGeometry:
-    """Bearings of one camera on one mount, and what each can see of the floor."""
+class FloorScanner:
+    """Makes the scans of one camera on one mount."""
 
     def __init__(
         self, camera: StereoCamera, mount: Mount, settings: FloorSegmentationSettings
     ) -> None:
-        self._camera, self._mount, self._settings = camera, mount, settings
-        self.T_base_left = mount.T_base_left
-        bearings = np.concatenate(self._border_bearings())
+        self._camera, self._settings = camera, settings
+        self._height_m = mount.height_m
+        border = _floor_on_border(camera, mount)
+        bearing = np.arctan2(border[:, 1], border[:, 0])
         step = settings.scan_increment_rad
-        first = np.floor(np.nanmin(bearings) / step)
-        self.angle_min_rad = float(first * step)
-        self.count = int(np.ceil(np.nanmax(bearings) / step) - first) + 1
-        self.num_ranges = int(np.ceil(settings.scan_range_m / RANGE_STEP_M))
-        self.nearest_m = self._nearest_ranges()
+        first = np.floor(bearing.min() / step) if len(border) else 0.0
+        self._angle_min = float(first * step)
+        self._count = int(np.ceil(bearing.max() / step) - first) + 1 if len(border) else 1
+        self._middle = (np.arange(0, settings.scan_range_m, RANGE_STEP_M)) + RANGE_STEP_M / 2
+        nearest = np.full(self._count, np.inf)
+        np.minimum.at(nearest, self._bearing_index(border.T), np.hypot(*border.T))
+        self._nearest = nearest
 
-    def _floor_points(self, uv: Array) -> Array:
-        """Return where the rays of pixels (N, 2) meet the floor, NaN above the horizon."""
-        rays = self._camera.back_project(uv, np.ones(len(uv)))
-        down = rays @ self._mount.up_in_camera
-        depth = np.where(down < -1e-3, self._mount.height_m / np.minimum(-down, -1e-9) * -1, np.nan)
-        return transform_points(self.T_base_left, rays * depth[:, None])
+    def scan(
+        self,
+        floor_xy: NDArray[np.float32],
+        upright_xy: NDArray[np.float32],
+        columns_per_px: float,
+    ) -> FloorScan:
+        """Return the scan of floor and of what stands up, (2, N) in the base's x-y plane.
 
-    def _border_bearings(self) -> list[Array]:
-        camera = self._camera
-        rows = np.linspace(0, camera.height - 1, 64)
-        columns = np.linspace(0, camera.width - 1, 64)
-        borders = [
-            np.stack([np.zeros(64), rows], 1),
-            np.stack([np.full(64, camera.width - 1.0), rows], 1),
-            np.stack([columns, np.full(64, camera.height - 1.0)], 1),
-        ]
-        points = [self._floor_points(border) for border in borders]
-        return [np.arctan2(p[:, 1], p[:, 0]) for p in points]
-
-    def _nearest_ranges(self) -> Array:
-        """Return the range (N,) of the nearest floor that the image shows at each bearing."""
-        camera = self._camera
-        columns = np.arange(camera.width, dtype=np.float64)
-        rows = np.arange(0, camera.height, 2, dtype=np.float64)
-        uv = np.concatenate(
-            [
-                np.stack([columns, np.full(camera.width, camera.height - 1.0)], 1),
-                np.stack([np.zeros(len(rows)), rows], 1),
-                np.stack([np.full(len(rows), camera.width - 1.0), rows], 1),
-            ]
+        A ray ends at the first thing that stands up or at the first gap in the floor longer than
+        what is tolerated, and never beyond the last floor that was seen. columns_per_px: the
+        part of the image's columns that the points are from.
+        """
+        floor = self._polar_counts(floor_xy) > 0
+        upright_m = self._upright(self._polar_counts(upright_xy), columns_per_px)
+        middle = self._middle
+        limit = np.where(np.isnan(upright_m), np.inf, upright_m)
+        seen = floor & (middle < limit[:, None])
+        reached = self._reached(seen)
+        near = np.maximum(self._tolerance(upright_m), _SPREAD * upright_m)
+        with np.errstate(invalid='ignore'):
+            touches = reached >= upright_m - near
+            in_front = upright_m <= self._nearest + near
+        ranges = np.where(touches, upright_m, reached)
+        ranges[(reached == 0) & ~in_front] = np.nan
+        ranges[(reached == 0) & in_front] = 0.0
+        return FloorScan(
+            self._angle_min,
+            self._settings.scan_increment_rad,
+            ranges.astype(np.float32),
+            upright_m.astype(np.float32),
         )
-        points = self._floor_points(uv)
-        points = points[np.isfinite(points[:, 0])]
-        index = self.bearing_index(points)
-        nearest = np.full(self.count, np.inf)
-        np.minimum.at(nearest, index, np.hypot(points[:, 0], points[:, 1]))
-        return nearest
 
-    def bearing_index(self, points_base: Array) -> NDArray[np.intp]:
-        """Return the bearing bin of points (N, 2 or 3) in the base frame."""
-        bearing = np.arctan2(points_base[:, 1], points_base[:, 0])
-        offset = (bearing - self.angle_min_rad) / self._settings.scan_increment_rad
-        return np.clip(np.rint(offset), 0, self.count - 1).astype(np.intp)
+    def _tolerance(self, range_m: Array) -> Array:
+        """Return how long a gap in the floor may be at a range."""
+        row_m = range_m**2 / (self._height_m * self._camera.fy)
+        return np.maximum(self._settings.scan_gap_m, _GAP_ROWS * row_m)
+
+    def _reached(self, seen: NDArray[np.bool_]) -> Array:
+        """Return the end (N,) of the first uninterrupted stretch of floor, 0 where there is none.
+
+        Up to the nearest floor that the image can show it is presumed.
+        """
+        middle = self._middle
+        last = np.maximum.accumulate(np.where(seen, middle, 0.0), axis=1)
+        previous = np.concatenate([np.zeros((self._count, 1)), last[:, :-1]], axis=1)
+        previous = np.maximum(previous, self._nearest[:, None])
+        broken = seen & (middle - previous > self._tolerance(middle))
+        unbroken = np.cumsum(broken, axis=1) == 0
+        return np.where(seen & unbroken, middle, 0.0).max(axis=1)
+
+    def _upright(self, counts: NDArray[np.intp], columns_per_px: float) -> Array:
+        """Return the range (N,) of the nearest upright thing, NaN where there is none.
+
+        It must show as many pixels, within the spread of its disparities, as an upright surface
+        of a given height does at its range.
+        """
+        camera, middle = self._camera, self._middle
+        wide = camera.fx * self._settings.scan_increment_rad * columns_per_px
+        needed = np.maximum(2.0, 0.5 * wide * _UPRIGHT_M * camera.fy / middle)
+        total = np.concatenate([np.zeros((self._count, 1)), np.cumsum(counts, axis=1)], axis=1)
+        first = np.arange(len(middle))
+        end = np.minimum(np.ceil(middle * (1 + _SPREAD) / RANGE_STEP_M), len(middle)).astype(int)
+        within = total[:, end] - total[:, first]
+        enough = within >= needed
+        begin = np.where(enough.any(axis=1), enough.argmax(axis=1), 0)
+        rows = np.arange(self._count)
+        half = total[rows, begin] + 0.5 * within[rows, begin]
+        centre = (total[:, 1:] >= half[:, None]).argmax(axis=1)
+        return np.where(enough.any(axis=1), middle[centre], np.nan)
+
+    def _bearing_index(self, xy: NDArray[np.floating]) -> NDArray[np.intp]:
+        bearing = np.arctan2(xy[1], xy[0])
+        offset = (bearing - self._angle_min) / self._settings.scan_increment_rad
+        return np.clip(np.rint(offset), 0, self._count - 1).astype(np.intp)
+
+    def _polar_counts(self, xy: NDArray[np.float32]) -> NDArray[np.intp]:
+        n, m = self._count, len(self._middle)
+        ranges = np.hypot(xy[0], xy[1])
+        near = ranges < self._settings.scan_range_m
+        cell = self._bearing_index(xy[:, near]) * m
+        cell += np.minimum((ranges[near] / RANGE_STEP_M).astype(np.intp), m - 1)
+        return np.bincount(cell, minlength=n * m).reshape(n, m)
 
 
-def make_scan(
-    geometry: ScanGeometry,
-    floor_base: Array,
-    obstacle_base: Array,
-    settings: FloorSegmentationSettings,
-    camera: StereoCamera,
-    mount: Mount,
-) -> FloorScan:
-    """Return the scan of floor points and not-floor points (N, 2) in the base's x-y plane.
-
-    A ray ends at the first not-floor evidence or at the first gap in the floor longer than what
-    is tolerated, and never beyond the last floor that was measured.
+def _floor_on_border(camera: StereoCamera, mount: Mount) -> Array:
+    """Return where the rays along the image's left, right and lower border meet the floor, (N, 2)
+    in the base's x-y plane.
     """
-    n, m = geometry.count, geometry.num_ranges
-    floor = _polar_counts(geometry, floor_base)
-    obstacle = _polar_counts(geometry, obstacle_base)
-    middle = (np.arange(m) + 0.5) * RANGE_STEP_M
-    blocked = obstacle >= np.maximum(2, 0.5 * floor + 1)
-    first_block = np.where(blocked.any(1), blocked.argmax(1), m)
-    seen = floor > 0
-    seen &= np.arange(m) < first_block[:, None]
-    # The last bin that held floor, at every range; floor is presumed up to the nearest visible.
-    last = np.where(seen, middle, 0.0)
-    last = np.maximum.accumulate(last, axis=1)
-    previous = np.maximum(
-        np.concatenate([np.zeros((n, 1)), last[:, :-1]], axis=1), geometry.nearest_m[:, None]
+    columns = np.arange(camera.width, dtype=np.float64)
+    rows = np.arange(camera.height, dtype=np.float64)
+    uv = np.concatenate(
+        [
+            np.stack([columns, np.full(camera.width, camera.height - 1.0)], 1),
+            np.stack([np.zeros(camera.height), rows], 1),
+            np.stack([np.full(camera.height, camera.width - 1.0), rows], 1),
+        ]
     )
-    row_m = middle**2 / (mount.height_m * camera.fy)
-    tolerated = np.maximum(settings.scan_gap_m, 4 * row_m)
-    broken = seen & (middle - previous > tolerated)
-    first_break = np.where(broken.any(1), broken.argmax(1), m)
-    reached = np.where(seen & (np.arange(m) < first_break[:, None]), middle, 0.0).max(axis=1)
-    known = seen.any(1) | blocked.any(1)
-    near_block = (first_block + 0.5) * RANGE_STEP_M <= geometry.nearest_m + settings.scan_gap_m
-    ranges = np.where(reached > 0, reached, np.where(near_block, 0.0, np.nan))
-    ranges[~known] = np.nan
-    obstacle_m = np.where(blocked.any(1), (first_block + 0.5) * RANGE_STEP_M, np.nan)
-    return FloorScan(
-        geometry.angle_min_rad,
-        settings.scan_increment_rad,
-        ranges.astype(np.float32),
-        obstacle_m.astype(np.float32),
-    )
-
-
-def _polar_counts(geometry: ScanGeometry, points_base: Array) -> NDArray[np.intp]:
-    n, m = geometry.count, geometry.num_ranges
-    ranges = np.hypot(points_base[:, 0], points_base[:, 1])
-    near = ranges < m * RANGE_STEP_M
-    cell = geometry.bearing_index(points_base[near]) * m
-    cell += (ranges[near] / RANGE_STEP_M).astype(np.intp)
-    return np.bincount(cell, minlength=n * m).reshape(n, m)
+    T_base_left = mount.T_base_left
+    rays = camera.back_project(uv, np.ones(len(uv))) @ T_base_left[:3, :3].T
+    rays = rays[rays[:, 2] < -1e-3]
+    return T_base_left[:2, 3] + rays[:, :2] * (mount.height_m / -rays[:, 2:])

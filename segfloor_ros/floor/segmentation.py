@@ -12,28 +12,25 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
 from segfloor_ros.floor.evidence import Evidence, FloorView, HeightTable, judge
 from segfloor_ros.floor.filling import (
+    drop_islands,
     fill_gaps,
     fill_regions,
-    floor_pixels,
-    floor_positions,
     trim_to_edges,
 )
 from segfloor_ros.floor.histograms import filtered_v_disparity
-from segfloor_ros.floor.memory import REACH_M, FloorMemory, cells_around, floor_at
+from segfloor_ros.floor.memory import FloorMemory
 from segfloor_ros.floor.observation import (
     FLOOR,
-    NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
 )
-from segfloor_ros.floor.photometric import floor_costs
-from segfloor_ros.floor.plane import PlaneFit, Samples, refine, scores
+from segfloor_ros.floor.photometric import compare
+from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
-from segfloor_ros.floor.scan import ScanGeometry, make_scan
+from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.floor.texture import enough_texture_grey, noise_grey, texture_grey
-from segfloor_ros.floor.tracking import FloorTracker
+from segfloor_ros.floor.texture import NOISE_TEXTURE, noise_grey, texture_grey
 from segfloor_ros.geometry import Array
 
 _ROWS_ABOVE_HORIZON = 16
@@ -41,7 +38,9 @@ _ROWS_ABOVE_HORIZON = 16
 _TEXTURE_WINDOW_PX = 11
 _PLANE_SAMPLES = 4000
 _PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
-_FAITH = 1.3
+_SCAN_COLUMNS = 2
+"""Every so many columns go into the scan."""
+_FAITH = 2.0
 """So much more must speak for the second expectation than for the first."""
 
 
@@ -51,12 +50,10 @@ class FloorSegmentation:
     def __init__(self, camera: StereoCamera, settings: FloorSegmentationSettings) -> None:
         self._camera = camera
         self._settings = settings
-        self._tracker = FloorTracker(settings)
         self._memory = FloorMemory()
-        self._cells = cells_around()
         self._mount: Mount | None = None
         self._matcher: DisparityMatcher
-        self._scan_geometry: ScanGeometry
+        self._scanner: FloorScanner
 
     def process(
         self,
@@ -70,38 +67,41 @@ class FloorSegmentation:
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
         the map, where known; with it the floor found by earlier keyframes helps.
         """
+        settings = self._settings
         self._prepare(mount)
-        expected = self._tracker.predictions(mount, T_map_base)
+        expected = _expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         disparity = self._disparity(first_row, left, right)
         below = disparity[first_row:]
         texture = texture_grey(left[first_row:], _TEXTURE_WINDOW_PX)
-        enough = enough_texture_grey(left[first_row:], self._settings.min_texture_grey)
+        noise = noise_grey(left[first_row:])
+        enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
         fit = self._plane(first_row, below, texture, enough, expected)
-        self._tracker.update(mount, T_map_base, fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         textured = texture > enough
         profile = self._profile(view, below, texture > 2 * enough)
-        costs = floor_costs(view, profile, left[first_row:], right[first_row:], below)
-        noise = noise_grey(left[first_row:])
-        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, self._settings)
-        against = costs.floor > 1.3 * costs.matched + 1.0 + 0.5 * noise
-        distinct = costs.shifted - costs.floor > 0.4 + 0.1 * noise
-        self.dbg = (costs, textured, against, distinct, fit, profile)
-        evidence = judge(view, profile, below, textured, against, table, self._settings)
-        mask = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
-        evidence = Evidence(mask, evidence.height_m)
-        mask = self._recall(view, mask, T_map_base)
-        consistent = ~against & (costs.floor < 4 + 2 * noise)
-        mask = fill_regions(mask, left[first_row:], consistent, 0.3)
-        mask = fill_gaps(view, profile, mask, self._settings.fill_gap_m)
-        scan = self._scan(view, below, evidence, mask, T_map_base)
+        compared = compare(
+            view, profile, left[first_row:], right[first_row:], below, noise, settings
+        )
+        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
+        evidence = judge(view, profile, below, textured, compared, table, settings)
+        seen = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
+        evidence = Evidence(seen, evidence.height_m)
+        mask = seen if T_map_base is None else self._memory.fill(view, seen, T_map_base)
+        consistent = compared.consistent
+        mask = fill_regions(mask, left[first_row:], consistent, textured, settings.fill_support)
+        mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
+        mask = drop_islands(mask, settings.island_share)
+        upright = self._upright(view, below, evidence)
+        if T_map_base is not None:
+            self._memory.learn(view, seen, upright.T, T_map_base)
+        scan = self._scan(view, profile, below, upright, mask)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
         whole[first_row:] = mask
         return FloorObservation(
             disparity_px=disparity,
             mask=whole,
-            profile_px=profile.at_rows(np.arange(self._camera.height)),
+            profile_px=profile.at_rows(np.arange(self._camera.height, dtype=np.float64)),
             scan=scan,
             min_disparity_px=0.0,
             max_disparity_px=float(self._matcher.num_disparities),
@@ -112,8 +112,7 @@ class FloorSegmentation:
             return
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)
         self._matcher = DisparityMatcher(-(-searched // 16) * 16, self._settings)
-        self._scan_geometry = ScanGeometry(self._camera, mount, self._settings)
-        self._tracker = FloorTracker(self._settings)
+        self._scanner = FloorScanner(self._camera, mount, self._settings)
         self._memory = FloorMemory()
         self._mount = mount
 
@@ -148,7 +147,7 @@ class FloorSegmentation:
         rows, columns = np.nonzero(disparity[::step, ::step] > 0)
         grey = texture[::step, ::step][rows, columns].astype(np.float64) / (4 * enough)
         found = disparity[::step, ::step][rows, columns].astype(np.float64)
-        uv = np.stack([columns * step, rows * step + first_row], axis=1)
+        uv = np.stack([columns * step, rows * step + first_row], axis=1).astype(np.float64)
         samples = Samples(
             rays=camera.back_project(uv, np.ones(len(uv))),
             position_m=np.zeros(3),
@@ -159,10 +158,12 @@ class FloorSegmentation:
         likelihood = scores(samples, expected)
         likelihood[0] *= _FAITH
         start = expected[int(np.argmax(likelihood))]
-        assert self._mount is not None
-        sigma = self._tracker.sigma(self._mount)
+        settings = self._settings
+        tilt, height = settings.pitch_sigma_rad, settings.height_sigma * start[2]
         unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
-        return refine([samples], start, unknown, no_travel, sigma, _PLANE_SCALES_PX)
+        return refine(
+            [samples], start, unknown, no_travel, np.array([tilt, tilt, height]), _PLANE_SCALES_PX
+        )
 
     def _profile(
         self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
@@ -173,56 +174,47 @@ class FloorSegmentation:
         )
         return fit_profile(counts, first, 1 / BINS_PER_PX, view.line, self._camera, settings)
 
-    def _recall(
-        self, view: FloorView, mask: NDArray[np.uint8], T_map_base: Array | None
-    ) -> NDArray[np.uint8]:
-        """Return the mask with floor where nothing is seen now and floor was seen before."""
-        if T_map_base is None:
-            return mask
-        rows, columns = np.nonzero(mask == NO_EVIDENCE)
-        xy_base = floor_positions(view, rows + view.first_row, columns)
-        near = np.hypot(xy_base[:, 0], xy_base[:, 1]) < REACH_M
-        rows, columns, xy_base = rows[near], columns[near], xy_base[near]
-        known = self._memory.recall(_in_map(T_map_base, xy_base))
-        recalled = mask.copy()
-        recalled[rows[known], columns[known]] = FLOOR
-        return recalled
+    def _upright(
+        self, view: FloorView, disparity: NDArray[np.float32], evidence: Evidence
+    ) -> NDArray[np.float32]:
+        """Return what stands up, (2, N) in the base's x-y plane, from every other column."""
+        standing = (evidence.mask == NOT_FLOOR) & (evidence.height_m > 0)
+        rows, columns = np.nonzero(standing[:, ::_SCAN_COLUMNS])
+        columns *= _SCAN_COLUMNS
+        return view.positions(rows, columns, disparity[rows, columns])
 
     def _scan(
         self,
         view: FloorView,
+        profile: FloorProfile,
         disparity: NDArray[np.float32],
-        evidence: Evidence,
+        upright_xy: NDArray[np.float32],
         mask: NDArray[np.uint8],
-        T_map_base: Array | None,
     ) -> FloorScan:
-        camera = self._camera
-        T_base_left = view.mount.T_base_left
+        rows, columns = np.nonzero(mask[:, ::_SCAN_COLUMNS] == FLOOR)
+        columns *= _SCAN_COLUMNS
+        # The nearer of what is measured and of the floor: a pixel a little up the wall is not
+        # farther away than the wall.
+        floor_px = profile.at_pixels(view.derolled[:, ::_SCAN_COLUMNS])[
+            rows, columns // _SCAN_COLUMNS
+        ]
+        nearer = np.maximum(np.maximum(disparity[rows, columns], floor_px), np.float32(0.1))
+        floor_xy = view.positions(rows, columns, nearer)
+        return self._scanner.scan(floor_xy, upright_xy, 1 / _SCAN_COLUMNS)
 
-        def in_base(where: NDArray[np.bool_]) -> Array:
-            rows, columns = np.nonzero(where[:, ::2])
-            d = disparity[:, ::2][rows, columns]
-            uv = np.stack([2.0 * columns, rows + view.first_row], axis=1)
-            points = camera.back_project(uv, camera.disparity_times_depth / d)
-            return points @ T_base_left[:2, :3].T + T_base_left[:2, 3]
 
-        floor = in_base((evidence.mask == FLOOR) & (disparity > 0))
-        obstacle = in_base((evidence.mask == NOT_FLOOR) & (evidence.height_m > 0))
-        if T_map_base is not None:
-            pixels = floor_pixels(view, self._cells) - (0, view.first_row)
-            seen = floor_at(evidence.mask, pixels)
-            self._memory.learn(
-                _in_map(T_map_base, self._cells[seen]),
-                _in_map(T_map_base, obstacle[np.hypot(*obstacle.T) < REACH_M]),
-                T_map_base[:2, 3],
-            )
-        return make_scan(self._scan_geometry, floor, obstacle, self._settings, camera, view.mount)
+def _expectations(mount: Mount, T_map_base: Array | None) -> Array:
+    """Return what pitch, roll and height to expect, (P, 3), the likeliest first.
+
+    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map.
+    """
+    mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
+    if T_map_base is None:
+        return mounted[None]
+    R_map_left = T_map_base[:3, :3] @ mount.T_base_left[:3, :3]
+    return np.stack([mounted, angles_height_of(R_map_left[2] / mount.height_m)])
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:
     pitch, roll, height = (float(value) for value in angles_height)
     return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
-
-
-def _in_map(T_map_base: Array, xy_base: Array) -> Array:
-    return xy_base @ T_map_base[:2, :2].T + T_map_base[:2, 3]

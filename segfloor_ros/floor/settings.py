@@ -76,6 +76,22 @@ class FloorSegmentationSettings(StageSettings):
         maximum=20.0,
         live=True,
     )
+    against_grey: float = setting(
+        1.0,
+        'By how much the images must contradict the floor to deny it, beyond their noise.',
+        unit='grey levels',
+        minimum=0.0,
+        maximum=20.0,
+        live=True,
+    )
+    likeness_grey: float = setting(
+        3.0,
+        'How much left and right may differ on the floor, beyond their noise.',
+        unit='grey levels',
+        minimum=0.0,
+        maximum=50.0,
+        live=True,
+    )
     disparity_above_horizon: bool = setting(
         False, 'Match the rows above the horizon too; the floor does not need them.'
     )
@@ -96,7 +112,7 @@ class FloorSegmentationSettings(StageSettings):
         live=True,
     )
     pitch_sigma_rad: float = setting(
-        0.012,
+        0.006,
         'How far the pitch may swing about the mount, one sigma.',
         unit='rad',
         minimum=0.0001,
@@ -104,25 +120,39 @@ class FloorSegmentationSettings(StageSettings):
         live=True,
     )
     height_sigma: float = setting(
-        0.02,
+        0.01,
         'How far the camera height may swing about the mount, one sigma, as a share of it.',
         minimum=0.0001,
         maximum=0.2,
         live=True,
     )
     profile_stiffness: float = setting(
-        0.02,
+        10.0,
         'How strongly the spline resists bending.',
         minimum=0.0,
         maximum=100.0,
         live=True,
     )
     fill_gap_m: float = setting(
-        0.25,
+        0.5,
         'Gaps of this size between floor pixels are filled where nothing speaks against it.',
         unit='m',
         minimum=0.0,
         maximum=3.0,
+        live=True,
+    )
+    fill_support: float = setting(
+        0.3,
+        'Part of the columns of a weakly textured region that must show floor to fill it.',
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+    island_share: float = setting(
+        0.03,
+        'Patches of floor smaller than this share of the largest are dropped.',
+        minimum=0.0,
+        maximum=1.0,
         live=True,
     )
     scan_increment_rad: float = setting(

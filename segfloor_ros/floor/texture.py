@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SIGMA_PX = 2.0
-_NOISE_GAIN = 0.1
-"""What this measure gives on a surface without texture, per grey level of noise."""
+NOISE_TEXTURE = 0.1
+"""Texture per grey level of noise that is surely no noise: its own is 0.04."""
 _LAPLACIAN_GAIN = 6.0
 
 
@@ -39,8 +39,3 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     response = cv2.filter2D(part, cv2.CV_32F, kernel)
     return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / _LAPLACIAN_GAIN
-
-
-def enough_texture_grey(image: NDArray[np.uint8], minimum: float) -> float:
-    """Return the slope above which texture stands out from noise, at least `minimum`."""
-    return max(minimum, _NOISE_GAIN * noise_grey(image))
