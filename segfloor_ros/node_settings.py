@@ -57,6 +57,11 @@ class StereoSlamNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=60.0,
     )
+    background: bool = setting(
+        True,
+        'Adjust the map beside tracking, so that no frame waits for it; off: results do not '
+        'depend on timing.',
+    )
     rectified_input: bool = setting(
         False, 'Take left/image_rect and right/image_rect instead of the raw images.'
     )

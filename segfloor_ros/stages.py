@@ -18,10 +18,11 @@ def make_slam(
     settings: StereoSlamSettings,
     mount: Mount | None = None,
     times: StageTimes | None = None,
+    background: bool = False,
 ) -> StereoSlam:
     """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
     the settings, and whatever the settings leave open is measured from the floor the camera
-    sees.
+    sees. background: adjust the map beside tracking.
     """
     height_m, pitch_rad, roll_rad = (
         settings.camera_height_m,
@@ -42,4 +43,4 @@ def make_slam(
             forward_m=settings.camera_forward_m,
             left_m=settings.camera_left_m,
         )
-    return StereoSlam(camera, settings, mount, meter, times)
+    return StereoSlam(camera, settings, mount, meter, times, background)

@@ -24,7 +24,7 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.recording import RunResult, RunSummary, lost_intervals
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 
@@ -93,6 +93,7 @@ class ReplaySession:
         parameters = self._configuration.as_ros_parameters()
         playing = {'rate': float(self._rate), 'lossless': True, 'start_paused': True}
         parameters[CAMERA]['ros__parameters'].update(playing)
+        parameters[SLAM]['ros__parameters'].update(background=False)
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))

@@ -131,7 +131,14 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if all(math.isnan(value) for value in given):
             mount = self._transforms.find_mount(self._frames.left)
         self._mount_from_tf = mount is not None
-        self._slam = make_slam(self._rectifier.camera, settings, mount)
+        background = self.parameters.own.background
+        self._slam = make_slam(self._rectifier.camera, settings, mount, background=background)
+
+    def destroy_node(self) -> None:
+        """End the node and its background thread."""
+        if self._slam is not None:
+            self._slam.close()
+        super().destroy_node()
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self._mount = mount

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,22 @@ MIN_DISPARITY_PX = 1.0
 MIN_SHARED_POINTS = 15
 SETTLING_KEYFRAMES = 2
 MIN_FOUND_RATIO = 0.25
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A local bundle adjustment and where its unknowns belong.
+
+    newest: index of the keyframe that caused it. free: (K,) indices of the keyframes that move.
+    ids: (P,) of the points. edge_keyframe, edge_row: (N,) of the observations.
+    """
+
+    newest: int
+    problem: BundleProblem
+    free: NDArray[np.intp]
+    ids: NDArray[np.int32]
+    edge_keyframe: NDArray[np.int32]
+    edge_row: NDArray[np.int32]
 
 
 class LocalMapper:
@@ -66,15 +84,9 @@ class LocalMapper:
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
     ) -> None:
-        """Add a keyframe, new points from its stereo features, adjust its neighbourhood and
-        cull poor points.
-        """
+        """Add a keyframe and new points from its stereo features."""
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
-        if len(sparse_map.keyframes) > 1:
-            self._adjust_neighbourhood(sparse_map, keyframe)
-            poor = sparse_map.poor_points(keyframe.index - SETTLING_KEYFRAMES, MIN_FOUND_RATIO)
-            sparse_map.remove_points(poor)
 
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
@@ -86,7 +98,8 @@ class LocalMapper:
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
-    def _adjust_neighbourhood(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> None:
+    def plan_adjustment(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> Adjustment:
+        """Copy the neighbourhood of a keyframe, not the first one, out of the map."""
         free, fixed = self._choose_keyframes(sparse_map, keyframe)
         ids = sparse_map.points_of(free)
         edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
@@ -106,10 +119,23 @@ class LocalMapper:
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
         )
-        result = adjust(self._camera, problem, self._settings.bundle_iterations)
+        return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row)
+
+    def solve(self, adjustment: Adjustment) -> BundleResult:
+        """Adjust the copy; safe on another thread, since it shares nothing with the map."""
+        return adjust(self._camera, adjustment.problem, self._settings.bundle_iterations)
+
+    def apply(self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult) -> None:
+        """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
+        points.
+        """
         self.offset.learn(result.offset)
-        self._write_back(sparse_map, free, ids, result)
-        self._drop_outliers(sparse_map, edge_keyframe, edge_row, result.inliers)
+        self._write_back(sparse_map, adjustment.free, adjustment.ids, result)
+        self._drop_outliers(
+            sparse_map, adjustment.edge_keyframe, adjustment.edge_row, result.inliers
+        )
+        settled = adjustment.newest - SETTLING_KEYFRAMES
+        sparse_map.remove_points(sparse_map.poor_points(settled, MIN_FOUND_RATIO))
 
     def _choose_keyframes(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord

@@ -7,9 +7,19 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array, invert, rotation_angle, se3_exp, se3_log, transform_points
+from segfloor_ros.geometry import (
+    Array,
+    invert,
+    make_transform,
+    rotation_angle,
+    se3_exp,
+    se3_log,
+    transform_points,
+)
+from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.image_check import image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
@@ -88,6 +98,8 @@ class StereoSlam:
 
     One call of `process` per frame, in order. Results are held back until the camera's mount is
     known, since frame `map` lies on the floor; then all of them come at once, none is lost.
+    background: adjust the map on a thread beside tracking; a keyframe is then published before its
+    adjustment, and results depend on timing.
     """
 
     def __init__(
@@ -97,12 +109,14 @@ class StereoSlam:
         mount: Mount | None = None,
         mount_meter: MountMeter | None = None,
         times: StageTimes | None = None,
+        background: bool = False,
     ) -> None:
         self.map = SparseMap()
         self.mount = mount
         self._mount_meter = mount_meter
         self._camera = camera
         self._settings = settings
+        self._background = background
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
         self._right_extractor = FeatureExtractor(
@@ -111,6 +125,7 @@ class StereoSlam:
         self._rotation = ImageRotation(camera)
         self._tracker = Tracker(camera, settings)
         self._mapper = LocalMapper(camera, settings)
+        self._adjusting = AdjustmentRunner(self._mapper, background)
         self._held: list[_Outcome] = []
         self._T_camera_world: Array = np.eye(4)
         self._velocity: Array = np.zeros(6)
@@ -129,6 +144,7 @@ class StereoSlam:
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
+            self._take_adjustment(wait=False)
             fault = image_fault(frame.left, frame.right)
             left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
             features = None if fault else self._extractor.extract(frame.left)
@@ -143,6 +159,10 @@ class StereoSlam:
         outcome = self._outcome(frame, track, fault, snapshot)
         self._last_stamp_ns = frame.stamp_ns
         return self._release(outcome)
+
+    def close(self) -> None:
+        """End the background thread, if there is one."""
+        self._adjusting.close()
 
     def _track(
         self,
@@ -219,6 +239,7 @@ class StereoSlam:
             int(reliable.sum()),
             last.T_camera_world @ invert(track.T_camera_world),
             float(np.median(depth)),
+            self._adjusting.idle,
         )
         return is_keyframe(view, self._settings)
 
@@ -231,12 +252,14 @@ class StereoSlam:
         track: Track | None,
     ) -> _MapSnapshot:
         right_features = self._right_extractor.extract(frame.right)
+        self._take_adjustment(wait=True)
         point_id = np.full(len(features), NO_POINT, np.int32)
         if track is None:
             observations = self._tracker.pixel_observations(features)
         else:
             observations = track.observations
-            point_id[track.feature_rows] = track.point_ids
+            alive = self.map.alive[track.point_ids]
+            point_id[track.feature_rows[alive]] = track.point_ids[alive]
         self._mapper.measure_stereo(left, right, features, right_features, observations)
         keyframe = KeyframeRecord(
             len(self.map.keyframes),
@@ -247,11 +270,12 @@ class StereoSlam:
             observations,
             point_id,
         )
-        T_odom_camera = invert(self._T_world_odom) @ keyframe.T_world_camera
         patches = sample_patches(left, observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
-        self._T_camera_world = keyframe.T_camera_world
-        self._T_world_odom = keyframe.T_world_camera @ invert(T_odom_camera)
+        if keyframe.index > 0:
+            self._adjusting.submit(self._mapper.plan_adjustment(self.map, keyframe))
+            if not self._background:
+                self._take_adjustment(wait=True)
         self._frames_since_keyframe = 0
         known = keyframe.point_id[keyframe.point_id != NO_POINT]
         self._local_ids = self._choose_local_points(known)
@@ -259,6 +283,21 @@ class StereoSlam:
             self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera)
             self.mount = self._mount_meter.mount
         return self._snapshot(frame, keyframe)
+
+    def _take_adjustment(self, wait: bool) -> None:
+        """Bring a finished adjustment into the map. The camera, and with it `odom`, moves along
+        with the latest keyframe.
+        """
+        finished = self._adjusting.collect(wait)
+        if finished is None:
+            return
+        reference = self.map.keyframes[-1]
+        T_camera_reference = self._T_camera_world @ reference.T_world_camera
+        T_odom_camera = invert(self._T_world_odom) @ invert(self._T_camera_world)
+        self._mapper.apply(self.map, *finished)
+        self._T_camera_world = _without_drift(T_camera_reference @ reference.T_camera_world)
+        self._T_world_odom = _without_drift(invert(self._T_camera_world) @ invert(T_odom_camera))
+        self._local_ids = self._local_ids[self.map.alive[self._local_ids]]
 
     def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> _MapSnapshot:
         cloud_id = np.flatnonzero(self.map.alive).astype(np.int32)
@@ -308,6 +347,13 @@ class StereoSlam:
             return []
         ready, self._held = self._held, []
         return [_in_map(outcome, self.mount.T_base_left) for outcome in ready]
+
+
+def _without_drift(T: Array) -> Array:
+    """Return a product of poses (4, 4) with its rotation orthonormal again: `invert` transposes,
+    so the rounding errors of repeated products would grow threefold each time.
+    """
+    return make_transform(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
 
 
 def _in_map(outcome: _Outcome, T_map_world: Array) -> FrameResult:

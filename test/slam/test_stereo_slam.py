@@ -1,5 +1,7 @@
 """The whole SLAM stage on a rendered room with known motion."""
 
+import threading
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -92,6 +94,42 @@ def test_repeats_to_the_bit(frames, results):
     for a, b in zip(results, again, strict=True):
         np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
         np.testing.assert_array_equal(a.T_map_odom, b.T_map_odom)
+
+
+def test_the_background_thread_loses_nothing(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    results = [result for frame in frames for result in slam.process(frame)]
+    slam.close()
+    assert not [t for t in threading.enumerate() if t.name.startswith('adjustment')]
+    assert [r.index for r in results] == list(range(len(frames)))
+    assert sum(r.keyframe is not None for r in results) >= 4
+    for result, truth in zip(results, drive(), strict=True):
+        assert result.tracked
+        assert np.linalg.norm((invert(truth) @ pose_of(result))[:3, 3]) < 0.015
+    for a, b in pairwise(results):
+        assert np.linalg.norm((invert(a.T_odom_base) @ b.T_odom_base)[:3, 3]) < 0.05
+
+
+def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    for frame in frames[:12]:
+        before = slam.process(frame)[-1]
+    last = slam.map.keyframes[-1]
+    adjustment = slam._mapper.plan_adjustment(slam.map, last)
+    # Keyframes, those that hold them and points, all 10 cm to the side.
+    problem = adjustment.problem
+    poses = problem.T_camera_world.copy()
+    poses[:, :3, 3] -= poses[:, :3, :3] @ [0.1, 0.0, 0.0]
+    moved = replace(
+        problem, T_camera_world=poses, points_world=problem.points_world + np.array([0.1, 0.0, 0.0])
+    )
+    slam._adjusting.submit(replace(adjustment, problem=moved))
+    old = last.T_camera_world
+    after = slam.process(replace(frames[11], index=12, stamp_ns=12 * 100_000_000))[-1]
+    assert not np.allclose(old, last.T_camera_world, atol=0.05)
+    step = invert(before.T_odom_base) @ after.T_odom_base
+    assert np.linalg.norm(step[:3, 3]) < 0.01
+    assert np.linalg.norm((invert(before.T_map_odom) @ after.T_map_odom)[:3, 3]) > 0.05
 
 
 def test_covariance_is_a_covariance(results):
