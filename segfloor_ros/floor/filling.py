@@ -13,6 +13,7 @@ from segfloor_ros.floor.profile import FloorProfile
 _STEP_PX = 2
 """Regions are found at this part of the resolution."""
 _MIN_REGION_PX = 15
+_BORDER_PX = 12
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _TEXTURE_MARGIN = 7
@@ -132,9 +133,10 @@ def fill_gaps(
     columns = np.arange(width, dtype=np.int32)
     left = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
     right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], axis=1)[:, ::-1]
-    between = (np.take_along_axis(mask, left, axis=1) == FLOOR) & (
-        np.take_along_axis(mask, right, axis=1) == FLOOR
-    )
+    first, last = np.take_along_axis(mask, left, axis=1), np.take_along_axis(mask, right, axis=1)
+    # The matcher leaves out some columns at the right border.
+    at_border = (right == width - 1) & (width - 1 - left <= _BORDER_PX)
+    between = (first == FLOOR) & ((last == FLOOR) | (at_border & (last == NO_EVIDENCE)))
     filled = mask.copy()
     filled[~known & consistent & between & (right - left <= longest[:, None])] = FLOOR
     return filled

@@ -19,6 +19,12 @@ from segfloor_ros.geometry import Array
 SEGMENTS = 5
 _CONTROLS = SEGMENTS + 3
 BINS_PER_PX = 4
+_SCHEDULE = (
+    ((1.5, 1e4), (1.0, 1e4))  # a line, near the plane that is known
+    + 2 * ((1.5, 1.0),)  # a spline, which grows along the floor where that bends
+    + 4 * ((1.0, 1.0),)
+)
+"""Scale of the estimator and stiffness of the spline, relative to the settings, by iteration."""
 _CORRELATED_PIXELS = 200.0
 """Neighbouring disparities err together: so many of them count as one measurement."""
 
@@ -122,8 +128,7 @@ def fit_profile(
     """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
 
     counts: (R, B), row i is the de-rolled row first_row + i, bin j the disparity j * bin_px.
-    Tukey's biweight, its scale shrinking to `profile_scale_px`; first as a line, then as a
-    spline. The result rises strictly with the row and is never above the line's horizon.
+    Tukey's biweight; first as a line, then as a spline that grows along a floor that bends. The result rises strictly with the row and is never above the line's horizon.
     """
     rows, bins = np.nonzero(counts)
     disparity = bins * bin_px
@@ -142,7 +147,7 @@ def fit_profile(
     bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
     scale = settings.profile_scale_px
     support = 0.0
-    for factor, stiffness in ((4, 1e4), (2, 1e4), (1, 1e4), (1.5, 1), (1.5, 1), (1, 1), (1, 1)):
+    for factor, stiffness in _SCHEDULE:
         residual = disparity - basis @ controls
         ratio = np.clip(residual / (3 * factor * scale), -1, 1)
         robust = weight * (1 - ratio**2) ** 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import grey_closing
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.observation import FloorScan
@@ -13,6 +14,9 @@ from segfloor_ros.geometry import Array
 RANGE_STEP_M = 0.025
 _GAP_ROWS = 4.0
 """So many image rows of floor may be missing, however many metres they are."""
+_CONTACT_ROWS = 2.5
+"""So many rows may be missing where the floor meets what stands on it."""
+_DIP_BEARINGS = 5
 _SPREAD = 0.06
 """What stands upright is measured within this share of its range."""
 _UPRIGHT_M = 0.08
@@ -55,14 +59,17 @@ class FloorScanner:
         middle = self._middle
         limit = np.where(np.isnan(upright_m), np.inf, upright_m)
         seen = floor & (middle < limit[:, None])
-        reached = self._reached(seen)
-        near = np.maximum(self._tolerance(upright_m), _SPREAD * upright_m)
+        # A dip of a few bearings in which nothing stands up is a hole in the mask.
+        reached = np.minimum(grey_closing(self._reached(seen), _DIP_BEARINGS), limit)
+        near = np.maximum(self._settings.scan_gap_m, _SPREAD * upright_m)
+        near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
-            touches = reached >= upright_m - near
-            in_front = upright_m <= self._nearest + near
-        ranges = np.where(touches, upright_m, reached)
-        ranges[(reached == 0) & ~in_front] = np.nan
-        ranges[(reached == 0) & in_front] = 0.0
+            touches = (reached > 0) & (reached >= upright_m - near)
+            in_front = (reached == 0) & (upright_m <= self._nearest + near)
+        ranges = np.where(touches, upright_m, np.where(reached > 0, reached, np.nan))
+        ranges[in_front] = 0.0
+        # Where the floor ends before it, the match may be as wrong as it is far.
+        upright_m = np.where(touches | in_front, upright_m, np.nan)
         return FloorScan(
             self._angle_min,
             self._settings.scan_increment_rad,
@@ -72,8 +79,11 @@ class FloorScanner:
 
     def _tolerance(self, range_m: Array) -> Array:
         """Return how long a gap in the floor may be at a range."""
-        row_m = range_m**2 / (self._height_m * self._camera.fy)
-        return np.maximum(self._settings.scan_gap_m, _GAP_ROWS * row_m)
+        return np.maximum(self._settings.scan_gap_m, _GAP_ROWS * self._row_m(range_m))
+
+    def _row_m(self, range_m: Array) -> Array:
+        """Return how much floor one image row shows at a range."""
+        return range_m**2 / (self._height_m * self._camera.fy)
 
     def _reached(self, seen: NDArray[np.bool_]) -> Array:
         """Return the end (N,) of the first uninterrupted stretch of floor, 0 where there is none.

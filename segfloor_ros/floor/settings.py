@@ -104,7 +104,7 @@ class FloorSegmentationSettings(StageSettings):
         live=True,
     )
     profile_scale_px: float = setting(
-        1.0,
+        0.6,
         'Scale of the M-estimator of the profile.',
         unit='px',
         minimum=0.1,
