@@ -17,6 +17,8 @@ from segfloor_ros.floor.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
+_SURE_SHARE = 1.5
+"""Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
@@ -158,7 +160,10 @@ def judge(
     off = above | (height < -table.down[index])
     sure = textured & compared.against
     near = disparity >= np.float32(settings.min_disparity_px)
-    floor = textured & near & ~off & ~compared.against & ~compared.unlike
+    # On a sill the images contradict the floor, and show that it is a sill.
+    sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))
+    sill &= table.up[index] < np.float32(_SURE_SHARE * settings.step_height_m)
+    floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
     mask[floor | compared.distinct] = FLOOR
     mask[off & sure] = NOT_FLOOR

@@ -127,7 +127,7 @@ class FloorSegmentationSettings(StageSettings):
         live=True,
     )
     profile_stiffness: float = setting(
-        10.0,
+        0.02,
         'How strongly the spline resists bending.',
         minimum=0.0,
         maximum=100.0,
@@ -149,7 +149,7 @@ class FloorSegmentationSettings(StageSettings):
         live=True,
     )
     island_share: float = setting(
-        0.03,
+        0.05,
         'Patches of floor smaller than this share of the largest are dropped.',
         minimum=0.0,
         maximum=1.0,
