@@ -31,6 +31,10 @@ class Features:
     def __len__(self) -> int:
         return len(self.uv_px)
 
+    def take(self, rows: NDArray[np.intp]) -> Features:
+        """Return the chosen rows."""
+        return Features(self.uv_px[rows], self.octave[rows], self.descriptor[rows])
+
 
 class FeatureExtractor:
     """Detects oriented FAST corners on a pyramid and describes a spread selection of them."""

@@ -14,6 +14,7 @@ from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.disparity_refinement import refine_disparity
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.matching import match_rows
+from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -136,6 +137,8 @@ class LocalMapper:
         )
         settled = adjustment.newest - SETTLING_KEYFRAMES
         sparse_map.remove_points(sparse_map.poor_points(settled, MIN_FOUND_RATIO))
+        retire_redundant(sparse_map, adjustment.free)
+        sparse_map.follow()
 
     def _choose_keyframes(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord

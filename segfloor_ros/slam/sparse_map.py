@@ -21,12 +21,21 @@ MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
 
 
+@dataclass(frozen=True)
+class Retirement:
+    """Where a retired keyframe was seen from the keyframe (by index) that it follows."""
+
+    reference: int
+    T_camera_reference: Array
+
+
 @dataclass
 class KeyframeRecord:
     """One keyframe of the map.
 
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
-    not taken off. point_id: (N,) int32, the map point of each feature.
+    not taken off. retired: set when the keyframe has no features any more and only follows another
+    one. point_id: (N,) int32, the map point of each feature.
     patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature.
     """
 
@@ -37,6 +46,7 @@ class KeyframeRecord:
     features: Features
     observations: Observations
     point_id: NDArray[np.int32]
+    retired: Retirement | None = None
 
     @property
     def T_world_camera(self) -> Array:
@@ -80,6 +90,7 @@ class SparseMap:
 
     def __init__(self) -> None:
         self.keyframes: list[KeyframeRecord] = []
+        self._retired: list[KeyframeRecord] = []
         self._xyz = GrowingArray((3,), np.float64)
         self._descriptor = GrowingArray((32,), np.uint8)
         self._patch = GrowingArray((SIDE_PX, SIDE_PX), np.uint8)
@@ -209,6 +220,28 @@ class SparseMap:
         self._drop_edges(edges)
         self.observer_count[ids] -= 1
         self.alive[ids[self.observer_count[ids] <= 0]] = False
+
+    def retire(self, keyframe: KeyframeRecord, reference: KeyframeRecord) -> None:
+        """Take a keyframe's observations out of the map and let its pose follow `reference`; its
+        index and stamp stay.
+        """
+        self.unlink(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT))
+        none = np.zeros(0, np.intp)
+        keyframe.features = keyframe.features.take(none)
+        keyframe.observations = keyframe.observations.take(none)
+        keyframe.point_id = keyframe.point_id[none]
+        keyframe.retired = Retirement(
+            reference.index, keyframe.T_camera_world @ reference.T_world_camera
+        )
+        self._retired.append(keyframe)
+
+    def follow(self) -> None:
+        """Move the retired keyframes with those that they follow."""
+        # The latest retired first: an older one may follow it.
+        for keyframe in reversed(self._retired):
+            assert keyframe.retired is not None
+            reference = self.keyframes[keyframe.retired.reference]
+            keyframe.T_camera_world = keyframe.retired.T_camera_reference @ reference.T_camera_world
 
     def remove_points(self, ids: NDArray[np.integer]) -> None:
         """Take points out of the map; their ids are not used again."""

@@ -198,11 +198,12 @@ class StereoSlam:
         self, left: NDArray[np.float32], right: NDArray[np.float32], features: Features
     ) -> Track | None:
         """Look for the view among the keyframes, a few per frame, the latest ones first."""
-        count = len(self.map.keyframes)
+        views = [k.index for k in self.map.keyframes if k.retired is None]
+        count = len(views)
         first = self._recovery_turn * RECOVERY_KEYFRAMES % count
         self._recovery_turn += 1
         turn = count - 1 - (first + np.arange(min(RECOVERY_KEYFRAMES, count))) % count
-        ids = self.map.points_of(turn)
+        ids = self.map.points_of(np.array(views)[turn])
         observations = self._tracker.pixel_observations(features)
         estimate = self._tracker.locate(features, observations, self.map, ids)
         if estimate is None:
