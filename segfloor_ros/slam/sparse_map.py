@@ -1,6 +1,8 @@
-"""The sparse map: points and keyframes as arrays, linked by point ids.
- The id of a point is its row and is never given twice. Frame `world` is the left optical frame
-of the first frame.
+"""The sparse map: points and keyframes as arrays, linked by the points' rows.
+
+The row of a point that is gone is given to a new one, so that memory follows the space covered;
+its stable id, which the next stages know it by, is never given twice. Frame `world` is the left
+optical frame of the first frame.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ class KeyframeRecord:
 
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
-    one. point_id: (N,) int32, the map point of each feature.
+    one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
     patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature.
     """
 
@@ -78,6 +80,10 @@ class GrowingArray:
         self._buffer[self._length : needed] = rows
         self._length = needed
 
+    def lengthen(self, count: int) -> None:
+        """Append rows of zeros."""
+        self.extend(np.zeros((count, *self._buffer.shape[1:]), self._buffer.dtype))
+
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the rows that are not chosen (N,)."""
         kept = self.rows[chosen]
@@ -98,6 +104,8 @@ class SparseMap:
         self._viewing_distance = GrowingArray((), np.float64)
         self._viewing_octave = GrowingArray((), np.float64)
         self._viewing_direction = GrowingArray((3,), np.float64)
+        self._num_ever = 0
+        self._stable_id = GrowingArray((), np.int32)
         self._alive = GrowingArray((), np.bool_)
         self._visible_count = GrowingArray((), np.int32)
         self._found_count = GrowingArray((), np.int32)
@@ -109,8 +117,13 @@ class SparseMap:
 
     @property
     def xyz_world(self) -> Array:
-        """Positions (P, 3) of all points ever made, a writable view indexed by id."""
+        """Positions (P, 3) of all points, a writable view indexed by row."""
         return self._xyz.rows
+
+    @property
+    def stable_id(self) -> NDArray[np.int32]:
+        """The id (P,) of each point, ascending with its age and never used again."""
+        return self._stable_id.rows
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -175,20 +188,28 @@ class SparseMap:
 
     def _add_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
         count = len(xyz_world)
-        first_id = len(self.alive)
-        self._xyz.extend(xyz_world)
-        self._descriptor.extend(np.zeros((count, 32), np.uint8))
-        self._patch.extend(np.zeros((count, SIDE_PX, SIDE_PX), np.uint8))
-        self._patch_distance.extend(np.zeros(count))
-        self._viewing_distance.extend(np.zeros(count))
-        self._viewing_octave.extend(np.zeros(count))
-        self._viewing_direction.extend(np.zeros((count, 3)))
-        self._alive.extend(np.ones(count, bool))
-        self._visible_count.extend(np.ones(count, np.int32))
-        self._found_count.extend(np.ones(count, np.int32))
-        self._observer_count.extend(np.zeros(count, np.int32))
-        self._born.extend(np.full(count, born, np.int32))
-        return np.arange(first_id, first_id + count, dtype=np.int32)
+        rows_free = np.flatnonzero(~self.alive)[:count]
+        fresh = count - len(rows_free)
+        new_rows = len(self.alive) + np.arange(fresh)
+        rows: NDArray[np.int32] = np.concatenate([rows_free, new_rows], dtype=np.int32)
+        initial: list[tuple[GrowingArray, Any]] = [
+            (self._xyz, xyz_world),
+            (self._stable_id, self._num_ever + np.arange(count)),
+            (self._patch_distance, 0.0),
+            (self._alive, True),
+            (self._visible_count, 1),
+            (self._found_count, 1),
+            (self._observer_count, 0),
+            (self._born, born),
+        ]
+        seen = [self._descriptor, self._patch, self._viewing_distance]
+        seen += [self._viewing_octave, self._viewing_direction]
+        for array in [*seen, *(array for array, _ in initial)]:
+            array.lengthen(fresh)
+        for array, value in initial:
+            array.rows[rows] = value
+        self._num_ever += count
+        return rows
 
     def _link(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
@@ -244,7 +265,7 @@ class SparseMap:
             keyframe.T_camera_world = keyframe.retired.T_camera_reference @ reference.T_camera_world
 
     def remove_points(self, ids: NDArray[np.integer]) -> None:
-        """Take points out of the map; their ids are not used again."""
+        """Take points out of the map; their rows are free for new ones."""
         self.alive[ids] = False
         gone = ~self.alive
         self._drop_edges(gone[self._edge_point.rows])
@@ -285,7 +306,7 @@ class SparseMap:
         return order, shared[order]
 
     def points_of(self, keyframe_indices: NDArray[np.integer]) -> NDArray[np.int32]:
-        """Return the ascending ids of all points that the keyframes observe."""
+        """Return the ascending rows of all points that the keyframes observe."""
         ids = [self.keyframes[k].point_id for k in keyframe_indices]
         merged = np.unique(np.concatenate(ids)) if ids else np.zeros(0, np.int32)
         return merged[merged != NO_POINT]

@@ -227,7 +227,9 @@ class StereoSlam:
 
     def _choose_local_points(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
         order, _ = self.map.covisible(ids)
-        return self.map.points_of(order[:LOCAL_MAP_KEYFRAMES])
+        local = self.map.points_of(order[:LOCAL_MAP_KEYFRAMES])
+        # The oldest first: of two points that fit a feature equally well it is the one to keep.
+        return local[np.argsort(self.map.stable_id[local])]
 
     def _wants_keyframe(self, track: Track) -> bool:
         last = self.map.keyframes[-1]
@@ -301,11 +303,13 @@ class StereoSlam:
         self._local_ids = self._local_ids[self.map.alive[self._local_ids]]
 
     def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> _MapSnapshot:
-        cloud_id = np.flatnonzero(self.map.alive).astype(np.int32)
+        in_cloud = np.flatnonzero(self.map.alive)
+        in_cloud = in_cloud[np.argsort(self.map.stable_id[in_cloud])]
         point_id = keyframe.point_id.copy()
         xyz = np.full((len(point_id), 3), np.nan)
         known = point_id != NO_POINT
         xyz[known] = self.map.xyz_world[point_id[known]]
+        point_id[known] = self.map.stable_id[point_id[known]]
         return _MapSnapshot(
             keyframe.T_world_camera,
             frame.left,
@@ -315,8 +319,8 @@ class StereoSlam:
             xyz,
             np.array([k.stamp_ns for k in self.map.keyframes], np.int64),
             np.stack([k.T_world_camera for k in self.map.keyframes]),
-            cloud_id,
-            self.map.xyz_world[cloud_id],
+            self.map.stable_id[in_cloud],
+            self.map.xyz_world[in_cloud],
         )
 
     def _outcome(

@@ -68,7 +68,7 @@ def test_a_point_takes_on_the_latest_view_but_keeps_its_patch_while_its_size_sta
     assert sparse_map.patch[2, 0, 0] == 2
 
 
-def test_removed_points_vanish_everywhere_and_their_ids_stay_unused():
+def test_removed_points_vanish_everywhere_and_leave_their_rows_but_not_their_ids():
     sparse_map, first, second = two_keyframes()
     sparse_map.remove_points(np.array([1]))
     np.testing.assert_array_equal(first.point_id, [0, NO_POINT, NO_POINT, 2])
@@ -76,7 +76,22 @@ def test_removed_points_vanish_everywhere_and_their_ids_stay_unused():
     np.testing.assert_array_equal(sparse_map.alive, [True, False, True])
     third = keyframe(2, [NO_POINT])
     add(sparse_map, third, [0], [[0, 0, 5]])
-    np.testing.assert_array_equal(third.point_id, [3])
+    np.testing.assert_array_equal(third.point_id, [1])
+    np.testing.assert_array_equal(sparse_map.stable_id, [0, 3, 2])
+    np.testing.assert_array_equal(sparse_map.xyz_world[1], [0, 0, 5])
+    np.testing.assert_array_equal(sparse_map.observer_count, [1, 1, 2])
+    np.testing.assert_array_equal(sparse_map.patch[1, 0, 0], 2)
+
+
+def test_rows_are_reused_before_new_ones_are_made():
+    sparse_map, _, _ = two_keyframes()
+    sparse_map.remove_points(np.array([0, 2]))
+    third = keyframe(2, [NO_POINT] * 3)
+    add(sparse_map, third, [0, 1, 2], [[0, 0, 5], [0, 0, 6], [0, 0, 7]])
+    np.testing.assert_array_equal(third.point_id, [0, 2, 3])
+    np.testing.assert_array_equal(sparse_map.stable_id, [3, 1, 4, 5])
+    np.testing.assert_array_equal(sparse_map.xyz_world[:, 2], [5, 2, 6, 7])
+    assert sparse_map.alive.all()
 
 
 def test_unlinking_the_last_observer_removes_the_point():
