@@ -10,77 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import SUBPIXEL
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.geometry import Array
+from segfloor_ros.floor.view import FloorView
 
 _SURE_SHARE = 1.5
 """Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
-
-
-@dataclass(frozen=True)
-class FloorView:
-    """The image rows that can show floor, as seen with the mount of this very frame.
-
-    first_row: image row of the first one. derolled: (R, W) float32, their de-rolled rows.
-    """
-
-    camera: StereoCamera
-    mount: Mount
-    line: FloorLine
-    first_row: int
-    derolled: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, camera: StereoCamera, mount: Mount, first_row: int) -> FloorView:
-        """Return the view from `mount` of the rows from `first_row` on."""
-        line = FloorLine.of(camera, mount)
-        shear = (line.shear * (np.arange(camera.width) - camera.cx)).astype(np.float32)
-        rows = np.arange(first_row, camera.height, dtype=np.float32)
-        return cls(camera, mount, line, first_row, rows[:, None] + shear)
-
-    def rays(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return the rays (3, N) of the view's pixels at depth 1, in the base's axes."""
-        x = ((columns - self.camera.cx) / self.camera.fx).astype(np.float32)
-        y = ((rows + (self.first_row - self.camera.cy)) / self.camera.fy).astype(np.float32)
-        R = self.mount.T_base_left[:3, :3].astype(np.float32)
-        return R[:, 0:1] * x + R[:, 1:2] * y + R[:, 2:3]
-
-    def positions(
-        self,
-        rows: NDArray[np.integer],
-        columns: NDArray[np.integer],
-        disparity_px: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Return where pixels of known disparity (N,) are in the base's x-y plane, (2, N)."""
-        depth = np.float32(self.camera.disparity_times_depth) / disparity_px
-        offset = self.mount.T_base_left[:2, 3:4].astype(np.float32)
-        return self.rays(rows, columns)[:2] * depth + offset
-
-    def floor_positions(
-        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
-    ) -> NDArray[np.float32]:
-        """Return where the rays of pixels meet the floor's plane, (2, N) in the base's plane;
-        very far where they do not.
-        """
-        rays = self.rays(rows, columns)
-        depth = np.float32(self.mount.height_m) / np.maximum(-rays[2], np.float32(1e-5))
-        return rays[:2] * depth + self.mount.T_base_left[:2, 3:4].astype(np.float32)
-
-    def pixels_of_floor(self, xy_base: Array) -> Array:
-        """Return the view's pixels (N, 2) of positions (N, 2) on the floor; negative where they
-        are behind the camera.
-        """
-        T_base_left = self.mount.T_base_left
-        points = np.concatenate([xy_base, np.zeros((len(xy_base), 1))], axis=1)
-        in_camera = (points - T_base_left[:3, 3]) @ T_base_left[:3, :3]
-        in_camera[in_camera[:, 2] < 0.05] = (-1e6, -1e6, 1.0)
-        return self.camera.project(in_camera)[:, :2] - (0.0, self.first_row)
 
 
 @dataclass(frozen=True)
@@ -185,8 +124,8 @@ def _below_contact(
     the floor is.
     """
     rows, columns = np.nonzero(low)
-    shear = view.line.shear * (columns - view.camera.cx)
-    foot = profile.row_of_disparity(disparity[rows, columns]) - shear - view.first_row
+    foot = profile.row_of_disparity(disparity[rows, columns])
+    foot -= view.shear_px[columns] + view.first_row
     height, width = low.shape
     end = np.clip(np.floor(foot), rows, height - 1).astype(np.intp) + 1
     size = (height + 1) * width

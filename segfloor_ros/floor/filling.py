@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.evidence import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorProfile
+from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
 """Regions are found at this part of the resolution."""
@@ -22,6 +22,7 @@ _EDGE_SLOPE = 24
 
 
 def fill_regions(
+    view: FloorView,
     mask: NDArray[np.uint8],
     image: NDArray[np.uint8],
     consistent: NDArray[np.bool_],
@@ -31,25 +32,26 @@ def fill_regions(
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    consistent: (R, W), where the images do not contradict the floor. A region is bounded by edges
-    of the image stronger than most of the floor's own; floor by evidence must be in `min_share`
-    of its columns. In it a pixel becomes floor below floor, the next evidence up its column; or
-    between floor on its left and right; or, if it is not blank, nearer than any of its floor.
+    image: whole image rows (R, image width). consistent: (R, W), where the images do not
+    contradict the floor. A region is bounded by edges of the image stronger than most of the
+    floor's own; floor by evidence must be in `min_share` of its columns. In it a pixel becomes
+    floor below floor, the next evidence up its column; or between floor on its left and right;
+    or, if it is not blank, nearer than any of its floor.
     """
-    step = _STEP_PX
-    small = mask[::step, ::step]
+    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    small = mask[part]
     floor = small == FLOOR
     if np.count_nonzero(floor) < _MIN_REGION_PX:
         return mask
     slope = _slope(image)
     limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
-    alike = (small != NOT_FLOOR) & consistent[::step, ::step] & (slope < limit)
+    alike = (small != NOT_FLOOR) & consistent[part] & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
     top = _top_of_supported(region, count, floor, min_share)
     highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
     not_blank = cv2.erode(
-        textured[::step, ::step].astype(np.uint8),
+        textured[part].astype(np.uint8),
         np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8),
     )
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
@@ -128,14 +130,14 @@ def fill_gaps(
     """
     height, width = mask.shape
     disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
-    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity
+    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
     known = mask != NO_EVIDENCE
     columns = np.arange(width, dtype=np.int32)
     left = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
     right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], axis=1)[:, ::-1]
     first, last = np.take_along_axis(mask, left, axis=1), np.take_along_axis(mask, right, axis=1)
     # The matcher leaves out some columns at the right border.
-    at_border = (right == width - 1) & (width - 1 - left <= _BORDER_PX)
+    at_border = (right == width - 1) & (width - 1 - left <= _BORDER_PX // view.step)
     between = (first == FLOOR) & ((last == FLOOR) | (at_border & (last == NO_EVIDENCE)))
     filled = mask.copy()
     filled[~known & consistent & between & (right - left <= longest[:, None])] = FLOOR
@@ -161,7 +163,7 @@ def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]
 def trim_to_edges(
     mask: NDArray[np.uint8], image: NDArray[np.uint8], reach_px: int
 ) -> NDArray[np.uint8]:
-    """Return the mask without floor that only borrowed its texture from the floor below it.
+    """Return the mask (R, W) without floor that only borrowed its texture from the floor below it.
 
     Texture is measured over a window, so below a blank wall floor reaches up to `reach_px` rows
     too high. There it is cut off at the strongest edge between the two, and where there is none,

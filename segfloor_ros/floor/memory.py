@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.evidence import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.view import FloorView
 from segfloor_ros.geometry import Array
 
 CELL_M = 0.03
@@ -26,18 +26,18 @@ class FloorMemory:
 
     def __init__(self) -> None:
         self._votes = np.zeros((_SIZE, _SIZE), np.int8)
-        self._corner = np.full(2, -_SIZE // 2, np.int64)
+        self._corner = np.full(2, -_SIZE // 2, np.int32)
         self._around = _cells_around()
 
     def fill(
         self, view: FloorView, mask: NDArray[np.uint8], T_map_base: Array
     ) -> NDArray[np.uint8]:
         """Return the mask (R, W) with floor where nothing is seen now and floor was before."""
-        rows, columns = np.nonzero(mask == NO_EVIDENCE)
-        x, y = view.floor_positions(rows, columns)
-        near = np.hypot(x, y) < _REACH_M
-        rows, columns = rows[near], columns[near]
-        index, inside = self._index(_in_map(T_map_base, np.stack([x[near], y[near]], axis=1)))
+        nearest_row = _first_row_within_reach(view)
+        rows, columns = np.nonzero(mask[nearest_row:] == NO_EVIDENCE)
+        rows += nearest_row
+        xy = view.floor_positions(rows, columns)
+        index, inside = self._index(_in_map(T_map_base, xy))
         known = inside & (self._votes.reshape(-1)[index] >= _ENOUGH_VOTES)
         filled = mask.copy()
         filled[rows[known], columns[known]] = FLOOR
@@ -47,28 +47,28 @@ class FloorMemory:
         self,
         view: FloorView,
         mask: NDArray[np.uint8],
-        obstacle_base: Array,
+        upright_base: NDArray[np.float32],
         T_map_base: Array,
     ) -> None:
-        """Note the cells that are floor in the mask (R, W), and points (N, 2) that stand up."""
+        """Note the cells that are floor in the mask (R, W), and points (2, N) that stand up."""
         self._follow(T_map_base[:2, 3])
         votes = self._votes.reshape(-1)
         seen = _floor_at(mask, view.pixels_of_floor(self._around))
-        index, inside = self._index(_in_map(T_map_base, self._around[seen]))
+        index, inside = self._index(_in_map(T_map_base, self._around[:, seen]))
         index = index[inside]
         votes[index] = np.minimum(votes[index] + 1, _MOST_VOTES)
-        near = np.hypot(obstacle_base[:, 0], obstacle_base[:, 1]) < _REACH_M
-        index, inside = self._index(_in_map(T_map_base, obstacle_base[near]))
+        index, inside = self._index(_in_map(T_map_base, upright_base))
         votes[index[inside]] = _BLOCKED
 
-    def _index(self, xy_map: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        cell = np.floor(xy_map / CELL_M).astype(np.int64) - self._corner
-        inside = ((cell >= 0) & (cell < _SIZE)).all(axis=1)
-        return np.where(inside, cell[:, 1] * _SIZE + cell[:, 0], 0), inside
+    def _index(self, xy_map: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+        cell = np.floor(xy_map * np.float32(1 / CELL_M)).astype(np.int32)
+        column, row = cell[0] - self._corner[0], cell[1] - self._corner[1]
+        inside = (column >= 0) & (column < _SIZE) & (row >= 0) & (row < _SIZE)
+        return np.where(inside, row * _SIZE + column, 0), inside
 
     def _follow(self, centre_map: Array) -> None:
         """Move the raster along when the robot comes near its border."""
-        wanted = np.floor(centre_map / CELL_M).astype(np.int64) - _SIZE // 2
+        wanted = np.floor(centre_map / CELL_M).astype(np.int32) - _SIZE // 2
         dx, dy = (int(value) for value in wanted - self._corner)
         if max(abs(dx), abs(dy)) < _SIZE // 4:
             return
@@ -80,20 +80,28 @@ class FloorMemory:
         self._votes, self._corner = moved, wanted
 
 
-def _cells_around() -> Array:
-    """Return the centres (N, 2) of the cells within reach, relative to the robot."""
-    steps = np.arange(-_REACH_M, _REACH_M, CELL_M) + CELL_M / 2
+def _cells_around() -> NDArray[np.float32]:
+    """Return the centres (2, N) of the cells within reach ahead, relative to the robot."""
+    steps = np.arange(-_REACH_M, _REACH_M, CELL_M, dtype=np.float32) + np.float32(CELL_M / 2)
     x, y = np.meshgrid(steps, steps, indexing='ij')
     near = np.hypot(x, y) < _REACH_M
-    return np.stack([x[near], y[near]], axis=1)
+    return np.stack([x[near], y[near]])
 
 
-def _floor_at(mask: NDArray[np.uint8], pixels: Array) -> NDArray[np.bool_]:
-    """Tell which of the pixels (N, 2) are floor in a mask (H, W)."""
-    u, v = np.rint(pixels).astype(np.int64).T
-    inside = (u >= 0) & (u < mask.shape[1]) & (v >= 0) & (v < mask.shape[0])
-    return inside & (mask[np.where(inside, v, 0), np.where(inside, u, 0)] == FLOOR)
+def _first_row_within_reach(view: FloorView) -> int:
+    """Return the view's first row whose middle shows floor within reach."""
+    rows = np.arange(len(view.derolled))
+    distance = np.hypot(*view.floor_positions(rows, np.full(len(rows), len(view.columns) // 2)))
+    return int(np.argmax(distance < _REACH_M)) if (distance < _REACH_M).any() else len(rows)
 
 
-def _in_map(T_map_base: Array, xy_base: Array) -> Array:
-    return xy_base @ T_map_base[:2, :2].T + T_map_base[:2, 3]
+def _floor_at(mask: NDArray[np.uint8], pixels: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell which of the pixels (2, N), row and column, are floor in a mask (R, W)."""
+    row, column = np.rint(pixels).astype(np.int32)
+    inside = (row >= 0) & (row < mask.shape[0]) & (column >= 0) & (column < mask.shape[1])
+    return inside & (mask[np.where(inside, row, 0), np.where(inside, column, 0)] == FLOOR)
+
+
+def _in_map(T_map_base: Array, xy_base: NDArray[np.float32]) -> NDArray[np.float32]:
+    R = T_map_base[:2, :2].astype(np.float32)
+    return R @ xy_base + T_map_base[:2, 3:4].astype(np.float32)

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.evidence import Comparison, FloorView
+from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
-"""Every so many pixels are compared, in rows and in columns."""
+"""Every so many pixels of the image are compared, in rows and in columns."""
 _WINDOW = 5
 _SHIFT_PX = 2.0
 _NOISE_SHARE = 2.0
@@ -33,15 +34,17 @@ def compare(
     noise_grey: float,
     settings: FloorSegmentationSettings,
 ) -> Comparison:
-    """Compare the view's rows (R, W) of a rectified pair under floor and under the disparities.
+    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
 
-    Where the right image does not reach, nothing speaks against the floor nor for it.
+    left, right: whole image rows (R, image width). Where the right image does not reach,
+    nothing speaks against the floor nor for it.
     """
-    step = _STEP_PX
-    rows, columns = np.mgrid[0 : left.shape[0] : step, 0 : left.shape[1] : step].astype(np.float32)
-    sampled = left[::step, ::step]
-    floor_px = profile.at_pixels(view.derolled[::step, ::step])
-    matched_px = disparity[::step, ::step]
+    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    sampled = left[::_STEP_PX, ::_STEP_PX]
+    rows, columns = np.mgrid[0 : left.shape[0] : _STEP_PX, 0 : left.shape[1] : _STEP_PX]
+    rows, columns = rows.astype(np.float32), columns.astype(np.float32)
+    floor_px = profile.at_pixels(view.derolled[part])
+    matched_px = disparity[part]
 
     def difference(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
         at = columns - disparity_px
@@ -60,7 +63,7 @@ def compare(
     reached = columns >= floor_px + 2 * _SHIFT_PX
     distinct = closer & reached & ~against & ~unlike
     masks = (against & reached, unlike & reached, distinct, ~(contrary & reached))
-    return Comparison(*(_enlarged(mask, left.shape) for mask in masks))
+    return Comparison(*(_enlarged(mask, disparity.shape) for mask in masks))
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from segfloor_ros.geometry import Array
 
 SEGMENTS = 5
 _CONTROLS = SEGMENTS + 3
-BINS_PER_PX = 4
+BINS_PER_PX = 2
 _SCHEDULE = (
     ((1.5, 1e4), (1.0, 1e4))  # a line, near the plane that is known
     + 2 * ((1.5, 1.0),)  # a spline, which grows along the floor where that bends
@@ -74,10 +74,10 @@ class FloorProfile:
         row = np.asarray(rows, np.float64)
         end = self.first_row + len(self.disparity_px) - 1
         grid = self.first_row + np.arange(len(self.disparity_px))
-        values: Array = np.interp(row, grid, self.disparity_px)
+        values = np.interp(row, grid, self.disparity_px)
         values += np.maximum(row - end, 0) * self.line.slope
-        values[row < self.first_row] = np.nan
-        return values
+        profile: Array = np.where(row < self.first_row, np.nan, values).astype(np.float64)
+        return profile
 
     def at_pixels(self, derolled: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the floor's disparity (R, W) at many de-rolled rows, 0 above the first."""
@@ -128,7 +128,8 @@ def fit_profile(
     """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
 
     counts: (R, B), row i is the de-rolled row first_row + i, bin j the disparity j * bin_px.
-    Tukey's biweight; first as a line, then as a spline that grows along a floor that bends. The result rises strictly with the row and is never above the line's horizon.
+    Tukey's biweight; first as a line, then as a spline that grows along a floor that bends.
+    The result rises strictly with the row and is never above the line's horizon.
     """
     rows, bins = np.nonzero(counts)
     disparity = bins * bin_px

@@ -46,21 +46,21 @@ class FloorScanner:
         self,
         floor_xy: NDArray[np.float32],
         upright_xy: NDArray[np.float32],
-        columns_per_px: float,
+        density: float,
     ) -> FloorScan:
         """Return the scan of floor and of what stands up, (2, N) in the base's x-y plane.
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
-        what is tolerated, and never beyond the last floor that was seen. columns_per_px: the
-        part of the image's columns that the points are from.
+        what is tolerated, and never beyond the last floor that was seen. density:
+        the part of the image's pixels that the points are from.
         """
         floor = self._polar_counts(floor_xy) > 0
-        upright_m = self._upright(self._polar_counts(upright_xy), columns_per_px)
+        upright_m = self._upright(self._polar_counts(upright_xy), density)
         middle = self._middle
         limit = np.where(np.isnan(upright_m), np.inf, upright_m)
         seen = floor & (middle < limit[:, None])
         # A dip of a few bearings in which nothing stands up is a hole in the mask.
-        reached = np.minimum(grey_closing(self._reached(seen), _DIP_BEARINGS), limit)
+        reached = np.minimum(grey_closing(self._reached(seen), size=(_DIP_BEARINGS,)), limit)
         near = np.maximum(self._settings.scan_gap_m, _SPREAD * upright_m)
         near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
@@ -98,14 +98,14 @@ class FloorScanner:
         unbroken = np.cumsum(broken, axis=1) == 0
         return np.where(seen & unbroken, middle, 0.0).max(axis=1)
 
-    def _upright(self, counts: NDArray[np.intp], columns_per_px: float) -> Array:
+    def _upright(self, counts: NDArray[np.intp], density: float) -> Array:
         """Return the range (N,) of the nearest upright thing, NaN where there is none.
 
         It must show as many pixels, within the spread of its disparities, as an upright surface
         of a given height does at its range.
         """
         camera, middle = self._camera, self._middle
-        wide = camera.fx * self._settings.scan_increment_rad * columns_per_px
+        wide = camera.fx * self._settings.scan_increment_rad * density
         needed = np.maximum(2.0, 0.5 * wide * _UPRIGHT_M * camera.fy / middle)
         total = np.concatenate([np.zeros((self._count, 1)), np.cumsum(counts, axis=1)], axis=1)
         first = np.arange(len(middle))

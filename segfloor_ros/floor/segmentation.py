@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
-from segfloor_ros.floor.evidence import Evidence, FloorView, HeightTable, judge
+from segfloor_ros.floor.evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.filling import (
     drop_islands,
     fill_gaps,
@@ -31,6 +31,7 @@ from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit
 from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.texture import NOISE_TEXTURE, noise_grey, texture_grey
+from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
 
 _ROWS_ABOVE_HORIZON = 16
@@ -38,8 +39,6 @@ _ROWS_ABOVE_HORIZON = 16
 _TEXTURE_WINDOW_PX = 11
 _PLANE_SAMPLES = 4000
 _PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
-_SCAN_COLUMNS = 2
-"""Every so many columns go into the scan."""
 _FAITH = 2.0
 """So much more must speak for the second expectation than for the first."""
 
@@ -71,37 +70,31 @@ class FloorSegmentation:
         self._prepare(mount)
         expected = _expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
+        columns = np.s_[first_row:, :: column_step(self._camera)]
         disparity = self._disparity(first_row, left, right)
-        below = disparity[first_row:]
-        texture = texture_grey(left[first_row:], _TEXTURE_WINDOW_PX)
-        noise = noise_grey(left[first_row:])
+        below = disparity[columns]
+        left_rows, right_rows = left[first_row:], right[first_row:]
+        noise = noise_grey(left_rows)
         enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
+        texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
         fit = self._plane(first_row, below, texture, enough, expected)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
-        textured = texture > enough
         profile = self._profile(view, below, texture > 2 * enough)
-        compared = compare(
-            view, profile, left[first_row:], right[first_row:], below, noise, settings
-        )
+        compared = compare(view, profile, left_rows, right_rows, below, noise, settings)
         table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
+        textured = texture > enough
         evidence = judge(view, profile, below, textured, compared, table, settings)
-        seen = trim_to_edges(evidence.mask, left[first_row:], _TEXTURE_WINDOW_PX // 2 + 3)
+        seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
         evidence = Evidence(seen, evidence.height_m)
-        mask = seen if T_map_base is None else self._memory.fill(view, seen, T_map_base)
-        consistent = compared.consistent
-        mask = fill_regions(mask, left[first_row:], consistent, textured, settings.fill_support)
-        mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
-        mask = drop_islands(mask, settings.island_share)
-        upright = self._upright(view, below, evidence)
-        if T_map_base is not None:
-            self._memory.learn(view, seen, upright.T, T_map_base)
-        scan = self._scan(view, profile, below, upright, mask)
+        mask = self._fill(view, profile, seen, left_rows, textured, compared, T_map_base)
+        scan = self._scan(view, profile, below, evidence, mask, T_map_base)
+        rows = np.arange(self._camera.height, dtype=np.float64)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
-        whole[first_row:] = mask
+        whole[first_row:] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
         return FloorObservation(
             disparity_px=disparity,
             mask=whole,
-            profile_px=profile.at_rows(np.arange(self._camera.height, dtype=np.float64)),
+            profile_px=profile.at_rows(rows),
             scan=scan,
             min_disparity_px=0.0,
             max_disparity_px=float(self._matcher.num_disparities),
@@ -145,9 +138,10 @@ class FloorSegmentation:
         camera = self._camera
         step = max(2, round(math.sqrt(disparity.size / _PLANE_SAMPLES)))
         rows, columns = np.nonzero(disparity[::step, ::step] > 0)
+        across = step * column_step(camera)
         grey = texture[::step, ::step][rows, columns].astype(np.float64) / (4 * enough)
         found = disparity[::step, ::step][rows, columns].astype(np.float64)
-        uv = np.stack([columns * step, rows * step + first_row], axis=1).astype(np.float64)
+        uv = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
         samples = Samples(
             rays=camera.back_project(uv, np.ones(len(uv))),
             position_m=np.zeros(3),
@@ -174,33 +168,51 @@ class FloorSegmentation:
         )
         return fit_profile(counts, first, 1 / BINS_PER_PX, view.line, self._camera, settings)
 
-    def _upright(
-        self, view: FloorView, disparity: NDArray[np.float32], evidence: Evidence
-    ) -> NDArray[np.float32]:
-        """Return what stands up, (2, N) in the base's x-y plane, from every other column."""
-        standing = (evidence.mask == NOT_FLOOR) & (evidence.height_m > 0)
-        rows, columns = np.nonzero(standing[:, ::_SCAN_COLUMNS])
-        columns *= _SCAN_COLUMNS
-        return view.positions(rows, columns, disparity[rows, columns])
+    def _fill(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        mask: NDArray[np.uint8],
+        left_rows: NDArray[np.uint8],
+        textured: NDArray[np.bool_],
+        compared: Comparison,
+        T_map_base: Array | None,
+    ) -> NDArray[np.uint8]:
+        """Return the mask with floor where this pair of images alone cannot tell."""
+        settings = self._settings
+        if T_map_base is not None:
+            mask = self._memory.fill(view, mask, T_map_base)
+        consistent = compared.consistent
+        mask = fill_regions(view, mask, left_rows, consistent, textured, settings.fill_support)
+        mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
+        return drop_islands(mask, settings.island_share)
 
     def _scan(
         self,
         view: FloorView,
         profile: FloorProfile,
         disparity: NDArray[np.float32],
-        upright_xy: NDArray[np.float32],
+        evidence: Evidence,
         mask: NDArray[np.uint8],
+        T_map_base: Array | None,
     ) -> FloorScan:
-        rows, columns = np.nonzero(mask[:, ::_SCAN_COLUMNS] == FLOOR)
-        columns *= _SCAN_COLUMNS
+        """Return the scan, and let the memory learn what was seen."""
+        standing = (evidence.mask[::2] == NOT_FLOOR) & (evidence.height_m[::2] > 0)
+        rows, columns = np.nonzero(standing)
+        rows *= 2
+        upright_xy = view.positions(rows, columns, disparity[rows, columns])
+        if T_map_base is not None:
+            self._memory.learn(view, evidence.mask, upright_xy, T_map_base)
+        floor = mask == FLOOR
+        # Near floor fills the scan's bins many times over.
+        floor[len(floor) // 2 :: 2] = False
+        rows, columns = np.nonzero(floor)
         # The nearer of what is measured and of the floor: a pixel a little up the wall is not
         # farther away than the wall.
-        floor_px = profile.at_pixels(view.derolled[:, ::_SCAN_COLUMNS])[
-            rows, columns // _SCAN_COLUMNS
-        ]
+        floor_px = profile.at_pixels(view.derolled[rows, columns])
         nearer = np.maximum(np.maximum(disparity[rows, columns], floor_px), np.float32(0.1))
         floor_xy = view.positions(rows, columns, nearer)
-        return self._scanner.scan(floor_xy, upright_xy, 1 / _SCAN_COLUMNS)
+        return self._scanner.scan(floor_xy, upright_xy, 1 / (2 * view.step))
 
 
 def _expectations(mount: Mount, T_map_base: Array | None) -> Array:
