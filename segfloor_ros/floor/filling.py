@@ -13,6 +13,7 @@ from segfloor_ros.floor.view import FloorView
 _STEP_PX = 2
 """Regions are found at this part of the resolution."""
 _MIN_REGION_PX = 15
+_THREAD_PX = 3
 _BORDER_PX = 12
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
@@ -169,7 +170,10 @@ def trim_to_edges(
     too high. There it is cut off at the strongest edge between the two, and where there is none,
     where the texture is its own.
     """
-    floor = (mask == FLOOR).astype(np.uint8)
+    # Threads of floor, where the matcher loses hold, are none.
+    whole = (mask == FLOOR).astype(np.uint8)
+    floor = cv2.morphologyEx(whole, cv2.MORPH_OPEN, np.ones((_THREAD_PX, _THREAD_PX), np.uint8))
+    mask = np.where((whole > 0) & (floor == 0), np.uint8(NO_EVIDENCE), mask)
     nothing = (mask == NO_EVIDENCE).astype(np.uint8)
     upward = np.ones((reach_px + 1, 1), np.uint8)
     below_blank = cv2.dilate(nothing, upward, anchor=(0, reach_px)) & floor

@@ -31,8 +31,25 @@ _WEAK_SUPPORT = 0.08
 _MAX_VIOLATIONS = 0.05
 _REST = 5
 """So many keyframes in a row must agree where the floor is not plain to see."""
+_HEIGHT_TOLERANCE = 0.05
+_TILT_TOLERANCE_DEG = 1.0
 _TEXTURE_GREY = 1.2
 """Horizontal grey gradient per pixel below which a disparity is mostly invented."""
+
+
+def disagreement(used: Mount, seen: Mount) -> str | None:
+    """Return in words how the mount in use differs from the one that the floor shows, or None
+    where they agree.
+    """
+    parts = []
+    if abs(used.height_m - seen.height_m) > _HEIGHT_TOLERANCE * seen.height_m:
+        parts.append(f'height {used.height_m:.3f} m, the floor shows {seen.height_m:.3f} m')
+    for name in ('pitch', 'roll'):
+        given = math.degrees(getattr(used, f'{name}_rad'))
+        measured = math.degrees(getattr(seen, f'{name}_rad'))
+        if abs(given - measured) > _TILT_TOLERANCE_DEG:
+            parts.append(f'{name} {given:.1f} deg, the floor shows {measured:.1f} deg')
+    return 'camera mount: ' + '; '.join(parts) if parts else None
 
 
 class MountEstimator:

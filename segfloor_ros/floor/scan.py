@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import grey_closing
+from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.observation import FloorScan
@@ -16,6 +16,8 @@ _GAP_ROWS = 4.0
 """So many image rows of floor may be missing, however many metres they are."""
 _CONTACT_ROWS = 2.5
 """So many rows may be missing where the floor meets what stands on it."""
+_FADING_ROWS = 1.5
+"""So many rows are taken off where nothing shows why the floor ends."""
 _DIP_BEARINGS = 5
 _SPREAD = 0.06
 """What stands upright is measured within this share of its range."""
@@ -45,28 +47,35 @@ class FloorScanner:
     def scan(
         self,
         floor_xy: NDArray[np.float32],
+        shared: NDArray[np.bool_],
         upright_xy: NDArray[np.float32],
         density: float,
     ) -> FloorScan:
         """Return the scan of floor and of what stands up, (2, N) in the base's x-y plane.
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
-        what is tolerated, and never beyond the last floor that was seen. density:
-        the part of the image's pixels that the points are from.
+        what is tolerated, and never beyond the last floor that both cameras saw: at the image's
+        edge, floor that only looks alike may continue a ray but not end it. shared: (N,) which
+        floor points both cameras can see. density: the part of the image's pixels that the
+        points are from.
         """
         floor = self._polar_counts(floor_xy) > 0
+        seen_by_both = self._polar_counts(floor_xy[:, shared]) > 0
         upright_m = self._upright(self._polar_counts(upright_xy), density)
         middle = self._middle
         limit = np.where(np.isnan(upright_m), np.inf, upright_m)
         seen = floor & (middle < limit[:, None])
-        # A dip of a few bearings in which nothing stands up is a hole in the mask.
-        reached = np.minimum(grey_closing(self._reached(seen), size=(_DIP_BEARINGS,)), limit)
+        # A dip of a few bearings in which nothing stands up is a hole in the mask, a spike is floor
+        # that has crept up a blank wall.
+        reached = grey_closing(self._reached(seen, seen_by_both), size=(_DIP_BEARINGS,))
+        reached = np.minimum(grey_opening(reached, size=(_DIP_BEARINGS,)), limit)
         near = np.maximum(self._settings.scan_gap_m, _SPREAD * upright_m)
         near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
             touches = (reached > 0) & (reached >= upright_m - near)
             in_front = (reached == 0) & (upright_m <= self._nearest + near)
-        ranges = np.where(touches, upright_m, np.where(reached > 0, reached, np.nan))
+        faded = reached - _FADING_ROWS * self._row_m(reached)
+        ranges = np.where(touches, upright_m, np.where(reached > 0, faded, np.nan))
         ranges[in_front] = 0.0
         # Where the floor ends before it, the match may be as wrong as it is far.
         upright_m = np.where(touches | in_front, upright_m, np.nan)
@@ -85,7 +94,7 @@ class FloorScanner:
         """Return how much floor one image row shows at a range."""
         return range_m**2 / (self._height_m * self._camera.fy)
 
-    def _reached(self, seen: NDArray[np.bool_]) -> Array:
+    def _reached(self, seen: NDArray[np.bool_], may_end: NDArray[np.bool_]) -> Array:
         """Return the end (N,) of the first uninterrupted stretch of floor, 0 where there is none.
 
         Up to the nearest floor that the image can show it is presumed.
@@ -96,7 +105,7 @@ class FloorScanner:
         previous = np.maximum(previous, self._nearest[:, None])
         broken = seen & (middle - previous > self._tolerance(middle))
         unbroken = np.cumsum(broken, axis=1) == 0
-        return np.where(seen & unbroken, middle, 0.0).max(axis=1)
+        return np.where(seen & unbroken & may_end, middle, 0.0).max(axis=1)
 
     def _upright(self, counts: NDArray[np.intp], density: float) -> Array:
         """Return the range (N,) of the nearest upright thing, NaN where there is none.

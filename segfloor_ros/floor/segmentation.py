@@ -94,7 +94,7 @@ class FloorSegmentation:
         return FloorObservation(
             disparity_px=disparity,
             mask=whole,
-            profile_px=profile.at_rows(rows),
+            profile_px=profile.at_rows(rows).astype(np.float64),
             scan=scan,
             min_disparity_px=0.0,
             max_disparity_px=float(self._matcher.num_disparities),
@@ -212,7 +212,8 @@ class FloorSegmentation:
         floor_px = profile.at_pixels(view.derolled[rows, columns])
         nearer = np.maximum(np.maximum(disparity[rows, columns], floor_px), np.float32(0.1))
         floor_xy = view.positions(rows, columns, nearer)
-        return self._scanner.scan(floor_xy, upright_xy, 1 / (2 * view.step))
+        shared = view.columns[columns] >= floor_px
+        return self._scanner.scan(floor_xy, shared, upright_xy, 1 / (2 * view.step))
 
 
 def _expectations(mount: Mount, T_map_base: Array | None) -> Array:
