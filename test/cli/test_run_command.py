@@ -82,7 +82,7 @@ def test_summary_has_the_promised_figures(result):
     assert summary['camera_height_m'] == pytest.approx(MOUNT.height_m)
     assert summary['camera_pitch_rad'] == pytest.approx(MOUNT.pitch_rad)
     assert summary['frames_per_s'] == pytest.approx(FRAMES / summary['wall_s'], rel=0.01)
-    assert set(summary['rss_mb']) == {'start', 'peak', 'slope_per_update'}
+    assert {'start', 'peak', 'slope_per_update'} <= set(summary['rss_mb'])
     for name in ('tracking', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'):
         stage = summary['stages'][name]
         assert set(stage) == {'count', 'mean_ms', 'p50_ms', 'p95_ms', 'max_ms'}

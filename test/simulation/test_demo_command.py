@@ -56,7 +56,7 @@ def test_demo_maps_and_scores(tmp_path):
     # Map, overlay, cloud, v-disparity and six keyframes, each a whole picture.
     pictures = re.findall(r'src="data:image/\w+;base64,([^"]+)"', page)
     sizes = [cv2.imdecode(np.frombuffer(base64.b64decode(p), np.uint8), 1).shape for p in pictures]
-    assert len(sizes) == 10
+    assert len(sizes) == 11
     assert min(min(height, width) for height, width, _ in sizes) > 200
     path = next(line for line in output if line.startswith('path: '))
     assert '7.8 m, 100.0 % of the frames tracked' in path
