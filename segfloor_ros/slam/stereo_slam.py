@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -42,6 +42,9 @@ from segfloor_ros.timing import StageTimes
 LOCAL_MAP_KEYFRAMES = 20
 RECOVERY_KEYFRAMES = 3
 UNKNOWN_COVARIANCE = 1e6
+MAX_HELD_KEYFRAMES = 50
+"""Keyframes that wait with their images for the mount to be known."""
+
 RIGHT_FEATURES = 2
 """Right features per left feature: what the left image has must be found among them."""
 
@@ -349,9 +352,18 @@ class StereoSlam:
     def _release(self, outcome: _Outcome) -> list[FrameResult]:
         self._held.append(outcome)
         if self.mount is None:
+            self._let_go_of_old_snapshots()
             return []
         ready, self._held = self._held, []
         return [_in_map(outcome, self.mount.T_base_left) for outcome in ready]
+
+    def _let_go_of_old_snapshots(self) -> None:
+        """Keep the images of the latest keyframes only: a camera that never sees the floor must not
+        fill the memory. The poses of all frames are kept.
+        """
+        holders = [i for i, held in enumerate(self._held) if held.snapshot is not None]
+        for i in holders[:-MAX_HELD_KEYFRAMES]:
+            self._held[i] = replace(self._held[i], snapshot=None)
 
 
 def _without_drift(T: Array) -> Array:

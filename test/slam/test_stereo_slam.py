@@ -195,3 +195,19 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
     assert sizes[first] == first + 1
     assert sizes[first + 1 :] == [1] * (len(frames) - first - 1)
     assert [r.index for batch in batches for r in batch] == list(range(len(frames)))
+
+
+def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
+    monkeypatch.setattr('segfloor_ros.slam.stereo_slam.MAX_HELD_KEYFRAMES', 3)
+    slam = StereoSlam(CAMERA, SETTINGS)
+    for frame in frames:
+        assert slam.process(frame) == []
+    keyframes = len(slam.map.keyframes)
+    assert keyframes > 4
+    slam.mount = MOUNT
+    results = slam.process(StereoFrame(99, 10**10, frames[-1].left, frames[-1].right))
+    assert len(results) == len(frames) + 1
+    assert all(result.tracked for result in results)
+    with_images = [result.index for result in results if result.keyframe]
+    assert len(with_images) == 3
+    assert with_images[-1] == slam.map.keyframes[-1].frame_index
