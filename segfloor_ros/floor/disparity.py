@@ -19,6 +19,9 @@ SUBPIXEL = 16
 """Steps per pixel of the matcher's fixed-point disparities."""
 
 _STEP = 16
+_SAME_GAIN = 0.08
+_SAME_MEAN_GREY = 8.0
+"""Within this the two cameras are exposed alike; what they see differs anyway."""
 
 
 def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.15) -> int:
@@ -37,6 +40,17 @@ def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.
         wanted = float(inverse_depth.max()) * camera.disparity_times_depth * share
     most = camera.width // 2 // _STEP * _STEP
     return int(np.clip(math.ceil(wanted / _STEP) * _STEP, 2 * _STEP, max(2 * _STEP, most)))
+
+
+def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the right image with the left one's mean and contrast, where they clearly differ."""
+    (mean_l, spread_l), (mean_r, spread_r) = cv2.meanStdDev(left), cv2.meanStdDev(right)
+    gain = float(np.clip(spread_l[0, 0] / max(float(spread_r[0, 0]), 1.0), 0.5, 2.0))
+    offset = float(mean_l[0, 0]) - gain * float(mean_r[0, 0])
+    if abs(gain - 1) < _SAME_GAIN and abs(float(mean_l[0, 0] - mean_r[0, 0])) < _SAME_MEAN_GREY:
+        return right
+    adapted = right.astype(np.float32) * np.float32(gain) + np.float32(offset)
+    return np.clip(np.rint(adapted), 0, 255).astype(np.uint8)
 
 
 class DisparityMatcher:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
+from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
 from segfloor_ros.floor.plane import (
     PlaneFit,
     Samples,
@@ -137,7 +137,7 @@ class MountEstimator:
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
     ) -> Samples:
         camera = self._camera
-        disparity = self._matcher.compute(left, right)
+        disparity = self._matcher.compute(left, equal_exposure(left, right))
         smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
         gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
         texture = cv2.blur(gradient, (9, 9))

@@ -43,24 +43,36 @@ class FloorScanner:
         nearest = np.full(self._count, np.inf)
         np.minimum.at(nearest, self._bearing_index(border.T), np.hypot(*border.T))
         self._nearest = nearest
+        bearings = self._angle_min + step * np.arange(self._count)
+        directions = np.stack([np.cos(bearings), np.sin(bearings)])
+        cells = directions[:, :, None] * self._middle
+        self._cells_xy = cells.reshape(2, -1).astype(np.float32)
+
+    @property
+    def cells_xy(self) -> NDArray[np.float32]:
+        """Where the scan looks for floor, (2, N) in the base's x-y plane: at every bearing in
+        turn all ranges.
+        """
+        return self._cells_xy
 
     def scan(
         self,
-        floor_xy: NDArray[np.float32],
+        floor: NDArray[np.bool_],
         shared: NDArray[np.bool_],
         upright_xy: NDArray[np.float32],
         density: float,
     ) -> FloorScan:
-        """Return the scan of floor and of what stands up, (2, N) in the base's x-y plane.
+        """Return the scan of floor, (N,) at `cells_xy`, and of points that stand up, (2, M) in the
+        base's x-y plane.
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
         what is tolerated, and never beyond the last floor that both cameras saw: at the image's
         edge, floor that only looks alike may continue a ray but not end it. shared: (N,) which
-        floor points both cameras can see. density: the part of the image's pixels that the
-        points are from.
+        cells both cameras can see. density: the part of the image's pixels that the points are
+        from.
         """
-        floor = self._polar_counts(floor_xy) > 0
-        seen_by_both = self._polar_counts(floor_xy[:, shared]) > 0
+        shape = (self._count, len(self._middle))
+        floor, seen_by_both = floor.reshape(shape), (floor & shared).reshape(shape)
         upright_m = self._upright(self._polar_counts(upright_xy), density)
         middle = self._middle
         limit = np.where(np.isnan(upright_m), np.inf, upright_m)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range
+from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
 from segfloor_ros.floor.evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.filling import (
     drop_islands,
@@ -70,6 +70,7 @@ class FloorSegmentation:
         self._prepare(mount)
         expected = _expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
+        right = equal_exposure(left, right)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         disparity = self._disparity(first_row, left, right)
         below = disparity[columns]
@@ -203,17 +204,11 @@ class FloorSegmentation:
         upright_xy = view.positions(rows, columns, disparity[rows, columns])
         if T_map_base is not None:
             self._memory.learn(view, evidence.mask, upright_xy, T_map_base)
-        floor = mask == FLOOR
-        # Near floor fills the scan's bins many times over.
-        floor[len(floor) // 2 :: 2] = False
-        rows, columns = np.nonzero(floor)
-        # The nearer of what is measured and of the floor: a pixel a little up the wall is not
-        # farther away than the wall.
-        floor_px = profile.at_pixels(view.derolled[rows, columns])
-        nearer = np.maximum(np.maximum(disparity[rows, columns], floor_px), np.float32(0.1))
-        floor_xy = view.positions(rows, columns, nearer)
-        shared = view.columns[columns] >= floor_px
-        return self._scanner.scan(floor_xy, shared, upright_xy, 1 / (2 * view.step))
+        v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
+        floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
+        floor[floor] = mask[v[floor], u[floor]] == FLOOR
+        shared = u * view.step >= floor_px
+        return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
 
 
 def _expectations(mount: Mount, T_map_base: Array | None) -> Array:

@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.profile import FloorLine
+from segfloor_ros.floor.profile import FloorLine, FloorProfile
 
 _WIDE_PX = 480
 """Of wider images every other column is used: neighbours say the same."""
+
+_NEAR_M = 0.05
+_FAR_M = 1000.0
+_ROWS_PER_PX = 16
+"""Steps per pixel of disparity at which the profile is tabulated."""
 
 
 @dataclass(frozen=True)
@@ -72,23 +77,49 @@ class FloorView:
         return rays[:2] * depth + self.mount.T_base_left[:2, 3:4].astype(np.float32)
 
     def pixels_of_floor(self, xy_base: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the view's pixels, (2, N) of row and column, of positions (2, N) on the floor;
-        negative where they are behind the camera.
+        """Return the view's pixels, (2, N) of row and column, of positions (2, N) on the floor's
+        plane; negative where they are behind the camera.
         """
+        x, y, depth = self._in_camera(xy_base)
         camera = self.camera
+        v = y / depth * np.float32(camera.fy) + np.float32(camera.cy - self.first_row)
+        u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
+        pixels: NDArray[np.float32] = np.stack([v, u / np.float32(self.step)])
+        pixels[:, depth > _FAR_M] = -1
+        return pixels
+
+    def pixels_of_profile(
+        self, xy_base: NDArray[np.float32], profile: FloorProfile
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+        """Return the view's rows and columns (N,) of positions (2, N) on the floor as it bends,
+        and its disparity there (N,); negative columns where they are behind the camera.
+        """
+        x, _, depth = self._in_camera(xy_base)
+        camera = self.camera
+        disparity = np.float32(camera.disparity_times_depth) / depth
+        u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
+        steps = np.arange(0, int(disparity.max() * _ROWS_PER_PX) + 2)
+        row_of = profile.row_of_disparity(steps / _ROWS_PER_PX).astype(np.float32)
+        derolled = row_of[(disparity * np.float32(_ROWS_PER_PX) + np.float32(0.5)).astype(np.int32)]
+        v = derolled - np.float32(self.line.shear) * (u - np.float32(camera.cx)) - self.first_row
+        columns = np.rint(u / np.float32(self.step))
+        columns[depth > _FAR_M] = -1
+        return np.rint(v).astype(np.int32), columns.astype(np.int32), disparity
+
+    def _in_camera(
+        self, xy_base: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return positions (2, N) on the floor's plane in the camera's axes, very far ahead where
+        they are behind it.
+        """
         R_base_left = self.mount.T_base_left[:3, :3].astype(np.float32)
         t = self.mount.T_base_left[:3, 3].astype(np.float32)
-        x, y = xy_base[0] - t[0], xy_base[1] - t[1]
-        in_camera = R_base_left[0][:, None] * x + R_base_left[1][:, None] * y
-        in_camera -= (R_base_left[2] * t[2])[:, None]
-        depth = in_camera[2]
-        behind = depth < 0.05
-        depth = np.where(behind, np.float32(1), depth)
-        v = in_camera[1] / depth * np.float32(camera.fy) + np.float32(camera.cy - self.first_row)
-        u = in_camera[0] / depth * np.float32(camera.fx) + np.float32(camera.cx)
-        pixels: NDArray[np.float32] = np.stack([v, u / np.float32(self.step)])
-        pixels[:, behind] = -1
-        return pixels
+        dx, dy = xy_base[0] - t[0], xy_base[1] - t[1]
+        x, y, depth = (
+            R_base_left[0, i] * dx + R_base_left[1, i] * dy - R_base_left[2, i] * t[2]
+            for i in range(3)
+        )
+        return x, y, np.where(depth < _NEAR_M, np.float32(2 * _FAR_M), depth)
 
 
 def column_step(camera: StereoCamera) -> int:

@@ -1,0 +1,22 @@
+"""u- and v-disparity counted by hand."""
+
+import numpy as np
+
+from segfloor_ros.floor.histograms import obstacle_rows, u_disparity, v_disparity
+
+
+def test_u_disparity_counts_per_column_and_ignores_no_match():
+    bins = np.array([[0, 2, 3], [1, 2, 3], [1, 2, 0], [1, 0, 1]])
+    assert u_disparity(bins, 4).tolist() == [[0, 0, 0], [3, 0, 1], [0, 3, 0], [0, 0, 2]]
+
+
+def test_v_disparity_counts_per_row():
+    counts = v_disparity(np.array([0, 0, 2, 2, 2]), np.array([1, 1, 3, 0, 3]), (3, 4))
+    assert counts.tolist() == [[0, 2, 0, 0], [0, 0, 0, 0], [1, 0, 0, 2]]
+
+
+def test_an_obstacle_must_cover_the_rows_its_height_covers():
+    # 0.2 m at 6 px, fx = fy, baseline 0.12 m: depth is 0.12 f / 6, so it covers
+    # 0.2 f / (0.02 f) = 10 rows. The floor puts 2 rows in a bin: below 2 * 2 + 2 nothing counts.
+    rows = obstacle_rows(np.array([1.0, 6.0, 12.0]), 0.2, 1 / 0.12, 2.0)
+    assert np.allclose(rows, [6.0, 10.0, 20.0])

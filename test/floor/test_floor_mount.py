@@ -1,0 +1,97 @@
+"""The mount measured from the floor of rendered scenes and of recordings."""
+
+import cv2
+import numpy as np
+import pytest
+from floor_scenes import Patch, Scene, box, floor_patch, wall
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.mount import MountEstimator, disagreement
+
+
+def estimate(scene: Scene, **known) -> Mount | None:
+    left, right, _, _ = scene.render()
+    estimator = MountEstimator(scene.camera, **known)
+    estimator.add(left, right, np.eye(4))
+    return estimator.mount
+
+
+@pytest.mark.parametrize(
+    ('height_m', 'pitch_deg', 'roll_deg'), [(0.3, 7.0, 0.0), (0.5, 15.0, 4.0), (0.25, 0.0, -3.0)]
+)
+def test_one_frame_of_plain_floor_is_enough(height_m, pitch_deg, roll_deg):
+    true = Mount(height_m, np.radians(pitch_deg), np.radians(roll_deg))
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)], mount=true)
+    mount = estimate(scene)
+    assert mount is not None
+    assert mount.height_m == pytest.approx(height_m, rel=0.02)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.2)
+    assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.2)
+
+
+def test_what_is_known_is_kept():
+    scene = Scene([floor_patch(), wall()])
+    mount = estimate(scene, height_m=0.3, roll_rad=0.0, forward_m=0.2, left_m=-0.1)
+    assert mount is not None
+    assert (mount.height_m, mount.roll_rad) == (0.3, 0.0)
+    assert (mount.forward_m, mount.left_m) == (0.2, -0.1)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_table_is_not_the_floor():
+    table = Patch((0.8, -0.8, 0.45), (1.2, 0, 0), (0, 1.6, 0), False, seed=8)
+    scene = Scene([floor_patch(), wall(), table], mount=Mount(0.9, np.radians(15.0)))
+    mount = estimate(scene)
+    assert mount is None or mount.height_m == pytest.approx(0.9, rel=0.03)
+
+
+def test_a_wall_is_not_the_floor():
+    assert estimate(Scene([wall(1.0)], mount=Mount(0.3))) is None
+
+
+def test_nothing_is_seen_of_a_blank_scene():
+    assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
+
+
+def test_disagreement_names_both_numbers():
+    used, seen = Mount(0.35, np.radians(7.0)), Mount(0.30, np.radians(10.0))
+    words = disagreement(used, seen)
+    assert words is not None
+    for number in ('0.350 m', '0.300 m', '7.0 deg', '10.0 deg'):
+        assert number in words
+    assert disagreement(used, used) is None
+
+
+def kitti_folder(folder, pose_name='poses.txt'):
+    rows = [line.split() for line in (folder / 'calib.txt').read_text().splitlines()]
+    P0, P1 = (np.array(row[1:], float).reshape(3, 4) for row in rows[:2])
+    image = cv2.imread(str(folder / 'image_0' / '000000.png'), 0)
+    camera = StereoCamera(
+        image.shape[1], image.shape[0], P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P1[0, 0]
+    )
+    poses = np.tile(np.eye(4), (len(np.loadtxt(folder / pose_name)), 1, 1))
+    poses[:, :3] = np.loadtxt(folder / pose_name).reshape(-1, 3, 4)
+    return camera, poses
+
+
+def measured(folder, frames) -> Mount | None:
+    camera, poses = kitti_folder(folder)
+    estimator = MountEstimator(camera)
+    for i in frames:
+        pair = [cv2.imread(str(folder / f'image_{k}' / f'{i:06d}.png'), 0) for k in (0, 1)]
+        estimator.add(*pair, poses[i])
+    return estimator.mount
+
+
+def test_corridor(shared_data):
+    mount = measured(shared_data / 'corridor', [0])
+    assert mount is not None
+    assert mount.height_m == pytest.approx(0.30, abs=0.005)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(7.0, abs=0.2)
+    assert np.degrees(mount.roll_rad) == pytest.approx(0.0, abs=0.2)
+
+
+def test_car_on_a_road(shared_data):
+    mount = measured(shared_data / 'kitti06', range(0, 30, 3))
+    assert mount is not None
+    assert mount.height_m == pytest.approx(1.65, abs=0.05)

@@ -1,0 +1,98 @@
+"""Masks on recordings: one with exact truth, one with outlines drawn by hand."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.floor.profile import FloorLine
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+OUTLINES = Path(__file__).with_name('library_floor_outlines.yaml')
+LIBRARY_MOUNT = Mount(1.28, np.radians(5.4), np.radians(4.0))
+UNSURE_PX = 3
+
+
+def test_corridor(shared_data):
+    folder = shared_data / 'corridor'
+    camera = StereoCamera(640, 480, 320.0, 320.0, 320.0, 240.0, 0.12)
+    mount = Mount(0.30, 0.1222)
+    line = FloorLine.of(camera, mount)
+    disparity = np.maximum(line.slope * (np.arange(480) - line.horizon), 1e-6)
+    depth = (camera.disparity_times_depth / disparity)[:, None]
+    stage = FloorSegmentation(camera, FloorSegmentationSettings())
+    hit = called = wanted = found = 0
+    for i in range(0, 255, 30):
+        pair = [cv2.imread(str(folder / f'image_{k}' / f'{i:06d}.png'), 0) for k in (0, 1)]
+        floor = cv2.imread(str(folder / 'floor' / f'{i:06d}.png'), 0) > 0
+        mask = stage.process(*pair, mount).mask == FLOOR
+        near = floor & (depth > 0.5) & (depth < 6.0)
+        hit, called = hit + (mask & floor).sum(), called + mask.sum()
+        found, wanted = found + (mask & near).sum(), wanted + near.sum()
+    assert hit / called > 0.99
+    # Every frame on its own: what the right camera does not see stays partly unknown.
+    assert found / wanted > 0.96
+
+
+def rectified_reader(folder: Path):
+    maps, projection = {}, np.zeros((3, 4))
+    for side in ('left', 'right'):
+        text = yaml.safe_load((folder / f'{side}.yaml').read_text())
+        values = {
+            key: np.array(text[key]['data'], float).reshape(shape)
+            for key, shape in (
+                ('camera_matrix', (3, 3)),
+                ('distortion_coefficients', (-1,)),
+                ('rectification_matrix', (3, 3)),
+                ('projection_matrix', (3, 4)),
+            )
+        }
+        projection = values['projection_matrix']
+        maps[side] = cv2.initUndistortRectifyMap(
+            values['camera_matrix'],
+            values['distortion_coefficients'],
+            values['rectification_matrix'],
+            projection[:, :3],
+            (320, 240),
+            cv2.CV_32FC1,
+        )
+    P = projection
+    camera = StereoCamera(320, 240, P[0, 0], P[1, 1], P[0, 2], P[1, 2], -P[0, 3] / P[0, 0])
+
+    def read(i: int):
+        return [
+            cv2.remap(
+                cv2.imread(str(folder / side / f'{side}{i}.jpg'), 0), *maps[side], cv2.INTER_LINEAR
+            )
+            for side in ('left', 'right')
+        ]
+
+    return camera, read
+
+
+def drawn(polygons, shape):
+    picture = np.zeros(shape, np.uint8)
+    for polygon in polygons:
+        cv2.fillPoly(picture, [np.array(polygon, np.int32).reshape(-1, 2)], 1)
+    return picture
+
+
+def test_library(shared_data):
+    camera, read = rectified_reader(shared_data / 'library')
+    stage = FloorSegmentation(camera, FloorSegmentationSettings())
+    hit = false = missed = 0
+    kernel = np.ones((2 * UNSURE_PX + 1, 2 * UNSURE_PX + 1), np.uint8)
+    for i, outline in yaml.safe_load(OUTLINES.read_text())['frames'].items():
+        floor = drawn(outline['floor'], (240, 320))
+        counted = drawn(outline.get('unsure', []), (240, 320)) == 0
+        counted &= (cv2.dilate(floor, kernel) == 0) | (cv2.erode(floor, kernel) > 0)
+        called = stage.process(*read(i), LIBRARY_MOUNT).mask == FLOOR
+        hit += (called & (floor > 0) & counted).sum()
+        false += (called & (floor == 0) & counted).sum()
+        missed += (~called & (floor > 0) & counted).sum()
+    assert hit / (hit + false) > 0.93
+    assert hit / (hit + missed) > 0.5

@@ -1,0 +1,165 @@
+"""Floor masks of rendered scenes whose floor is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from floor_scenes import CAMERA, MOUNT, Scene, box, floor_patch, ramp, wall
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+SETTINGS = FloorSegmentationSettings()
+
+
+def segment(scene: Scene, poses=(None,)):
+    left, right, floor, depth = scene.render()
+    stage = FloorSegmentation(scene.camera, SETTINGS)
+    for pose in poses:
+        observation = stage.process(left, right, scene.mount, pose)
+    return observation, floor, depth
+
+
+def shares(observation, floor, depth):
+    """Precision over the image; recall over floor from 0.5 to 6 m."""
+    called = observation.mask == FLOOR
+    wanted = floor & (depth > 0.5) & (depth < 6.0)
+    return (called & floor).sum() / called.sum(), (called & wanted).sum() / wanted.sum()
+
+
+def points_of(scene: Scene, depth):
+    """Positions (H, W, 3) in the base frame of what the left image shows."""
+    v, u = np.mgrid[0 : scene.camera.height, 0 : scene.camera.width]
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    z = np.where(np.isfinite(depth), depth, 100.0)
+    T = scene.mount.T_base_left
+    points = scene.camera.back_project(uv, z.ravel()) @ T[:3, :3].T + T[:3, 3]
+    return points.reshape(*depth.shape, 3)
+
+
+@pytest.mark.parametrize('roll_deg', [0.0, 5.0, -5.0])
+def test_flat_floor_up_to_a_wall(roll_deg):
+    mount = Mount(0.3, np.radians(7.0), np.radians(roll_deg))
+    scene = Scene([floor_patch(), wall()], mount=mount)
+    observation, floor, depth = segment(scene)
+    precision, recall = shares(observation, floor, depth)
+    assert precision > 0.99
+    assert recall > 0.97
+    assert observation.mask.dtype == np.uint8
+    assert set(np.unique(observation.mask)) <= {FLOOR, NO_EVIDENCE, NOT_FLOOR}
+
+
+def test_scan_ends_at_the_wall_and_not_behind_it():
+    observation, _, _ = segment(Scene([floor_patch(), wall(3.0)]))
+    scan = observation.scan
+    distance = 3.0 / np.cos(scan.bearings_rad)
+    ahead = np.abs(scan.bearings_rad) < np.radians(30)
+    assert np.nanmax((scan.ranges_m - distance)[ahead]) < 0.10
+    assert np.median((scan.ranges_m - distance)[ahead]) > -0.12
+
+
+def test_a_blank_wall_is_not_floor():
+    scene = Scene([floor_patch(), wall(contrast=0.0, grey=130.0)])
+    precision, recall = shares(*segment(scene))
+    assert precision > 0.99
+    assert recall > 0.97
+
+
+def test_a_blank_wall_right_ahead_is_no_floor():
+    observation, floor, _ = segment(Scene([wall(0.4, contrast=0.0), floor_patch(far_m=0.4)]))
+    assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
+
+
+def test_a_blank_strip_between_floor_is_filled():
+    scene = Scene(
+        [
+            floor_patch(far_m=1.2),
+            floor_patch(near_m=1.2, far_m=1.8, contrast=0.0, grey=140.0),
+            floor_patch(near_m=1.8),
+            wall(),
+        ]
+    )
+    observation, _, depth = segment(scene)
+    x = points_of(scene, depth)[..., 0]
+    strip = (x > 1.25) & (x < 1.75)
+    assert np.mean(observation.mask[strip] == FLOOR) > 0.9
+
+
+def test_a_low_box_is_not_floor():
+    scene = Scene([floor_patch(), wall(), *box(1.5, 0.0, 0.3, 0.05)])
+    observation, floor, depth = segment(scene)
+    points = points_of(scene, depth)
+    raised = ~floor & (points[..., 0] < 2.0)
+    assert np.mean(observation.mask[raised] == FLOOR) < 0.2
+    ahead = np.abs(observation.scan.bearings_rad) < np.radians(3)
+    assert np.allclose(observation.scan.ranges_m[ahead], 1.5, atol=0.06)
+
+
+def test_a_door_sill_is_floor():
+    scene = Scene([floor_patch(), wall(), *box(1.5, 0.0, 0.3, 0.02, is_floor=True)])
+    observation, _, depth = segment(scene)
+    points = points_of(scene, depth)
+    sill = (points[..., 2] > 0.01) & (points[..., 0] < 1.9)
+    assert np.mean(observation.mask[sill] == FLOOR) > 0.9
+    ahead = np.abs(observation.scan.bearings_rad) < np.radians(3)
+    assert np.all(observation.scan.ranges_m[ahead] > 3.5)
+
+
+@pytest.mark.parametrize(('slope_deg', 'least_recall'), [(10.0, 0.85), (15.0, 0.7)])
+def test_a_ramp_is_floor(slope_deg, least_recall):
+    scene = Scene([floor_patch(far_m=1.5), ramp(1.5, np.radians(slope_deg))])
+    observation, floor, depth = segment(scene)
+    precision, _ = shares(observation, floor, depth)
+    below_horizon = points_of(scene, depth)[..., 2] < 0.25
+    _, recall = shares(observation, floor & below_horizon, depth)
+    assert precision > 0.99
+    assert recall > least_recall
+
+
+@pytest.mark.parametrize('drop_m', [0.10, 0.15])
+def test_the_floor_below_a_kerb_is_not_floor(drop_m):
+    lower = dataclasses.replace(floor_patch(near_m=1.5, height_m=-drop_m), is_floor=False)
+    scene = Scene([floor_patch(far_m=1.5), lower, wall(3.0)])
+    observation, floor, depth = segment(scene)
+    fallen = ~floor & (depth < 3.0) & (points_of(scene, depth)[..., 2] < 0)
+    assert np.mean(observation.mask[fallen] == FLOOR) < 0.03
+    ahead = np.abs(observation.scan.bearings_rad) < np.radians(20)
+    assert (
+        np.nanmax((observation.scan.ranges_m * np.cos(observation.scan.bearings_rad))[ahead]) < 1.6
+    )
+
+
+def test_unequal_exposure_does_no_harm():
+    left, right, floor, depth = Scene([floor_patch(), wall()]).render()
+    dark = (right * 0.75).astype(np.uint8)
+    observation = FloorSegmentation(CAMERA, SETTINGS).process(left, dark, MOUNT)
+    precision, recall = shares(observation, floor, depth)
+    assert precision > 0.98
+    assert recall > 0.95
+
+
+def test_same_input_same_output():
+    scene = Scene([floor_patch(), wall(), *box(1.5, 0.3, 0.3, 0.2)])
+    first, _, _ = segment(scene, (np.eye(4), np.eye(4)))
+    second, _, _ = segment(scene, (np.eye(4), np.eye(4)))
+    assert first.mask.tobytes() == second.mask.tobytes()
+    assert first.scan.ranges_m.tobytes() == second.scan.ranges_m.tobytes()
+
+
+def test_the_left_border_is_known_from_before():
+    """Driving ahead, the corner that the right camera cannot see was seen from farther away."""
+    patches = [floor_patch(seed=4), wall(6.0)]
+    stage = FloorSegmentation(CAMERA, FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0))
+    corner = np.s_[440:, 5:40]
+    shares_of_corner = []
+    for x_m in (0.0, 0.1, 0.2, 0.3, 0.4):
+        moved = [dataclasses.replace(p, corner=(p.corner[0] - x_m, *p.corner[1:])) for p in patches]
+        left, right, _, _ = Scene(moved).render()
+        T_map_base = np.eye(4)
+        T_map_base[0, 3] = x_m
+        mask = stage.process(left, right, MOUNT, T_map_base).mask
+        shares_of_corner.append(np.mean(mask[corner] == FLOOR))
+    assert shares_of_corner[0] < 0.3
+    assert shares_of_corner[-1] > 0.7
