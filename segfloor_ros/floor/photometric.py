@@ -70,7 +70,7 @@ def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDAr
     """Return the local mean absolute difference, free of differences in brightness."""
     difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
     difference -= cv2.blur(difference, (_WINDOW, _WINDOW))
-    return cv2.blur(cv2.absdiff(difference, 0.0), (_WINDOW, _WINDOW))
+    return cv2.blur(np.abs(difference), (_WINDOW, _WINDOW))
 
 
 def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

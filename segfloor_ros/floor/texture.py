@@ -26,7 +26,7 @@ def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32
     slope /= (x * slope).sum()
     # sepFilter2D correlates: a positive slope gives a positive response.
     response = cv2.sepFilter2D(image, cv2.CV_32F, slope, smooth)
-    return cv2.blur(cv2.absdiff(response, 0.0), (window_px, window_px))
+    return cv2.blur(np.abs(response), (window_px, window_px))
 
 
 def noise_grey(image: NDArray[np.uint8]) -> float:
