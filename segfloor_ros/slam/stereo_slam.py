@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -25,14 +25,11 @@ from segfloor_ros.slam.image_check import image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
 from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import (
     NO_POINT,
     FrameResult,
-    Keyframe,
-    KeyframeFeatures,
-    KeyframePath,
-    SparseCloud,
 )
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
@@ -60,40 +57,6 @@ class MountMeter(Protocol):
     @property
     def mount(self) -> Mount | None:
         """The mount at the first frame, once it is known."""
-
-
-@dataclass(frozen=True)
-class _MapSnapshot:
-    """The map at a keyframe, in world coordinates, before the mount turns it into frame `map`."""
-
-    T_world_camera: Array
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
-    uv_px: NDArray[np.float32]
-    point_id: NDArray[np.int32]
-    xyz_world: Array
-    path_stamp_ns: NDArray[np.int64]
-    path_T_world_camera: Array
-    cloud_id: NDArray[np.int32]
-    cloud_xyz_world: Array
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    """The outcome of a frame in optical coordinates: `odom` and `world` coincide at the first
-    frame.
-    """
-
-    index: int
-    stamp_ns: int
-    tracked: bool
-    T_odom_camera: Array
-    T_world_odom: Array
-    covariance: Array
-    num_matches: int
-    state: str
-    reference_ns: int
-    snapshot: _MapSnapshot | None
 
 
 class StereoSlam:
@@ -129,7 +92,7 @@ class StereoSlam:
         self._tracker = Tracker(camera, settings)
         self._mapper = LocalMapper(camera, settings)
         self._adjusting = AdjustmentRunner(self._mapper, background)
-        self._held: list[_Outcome] = []
+        self._held: list[Outcome] = []
         self._T_camera_world: Array = np.eye(4)
         self._velocity: Array = np.zeros(6)
         self._last_stamp_ns = 0
@@ -256,7 +219,7 @@ class StereoSlam:
         right: NDArray[np.float32],
         features: Features,
         track: Track | None,
-    ) -> _MapSnapshot:
+    ) -> MapSnapshot:
         right_features = self._right_extractor.extract(frame.right)
         self._take_adjustment(wait=True)
         point_id = np.full(len(features), NO_POINT, np.int32)
@@ -305,7 +268,7 @@ class StereoSlam:
         self._T_world_odom = _without_drift(invert(self._T_camera_world) @ invert(T_odom_camera))
         self._local_ids = self._local_ids[self.map.alive[self._local_ids]]
 
-    def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> _MapSnapshot:
+    def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> MapSnapshot:
         in_cloud = np.flatnonzero(self.map.alive)
         in_cloud = in_cloud[np.argsort(self.map.stable_id[in_cloud])]
         point_id = keyframe.point_id.copy()
@@ -313,7 +276,7 @@ class StereoSlam:
         known = point_id != NO_POINT
         xyz[known] = self.map.xyz_world[point_id[known]]
         point_id[known] = self.map.stable_id[point_id[known]]
-        return _MapSnapshot(
+        return MapSnapshot(
             keyframe.T_world_camera,
             frame.left,
             frame.right,
@@ -327,8 +290,8 @@ class StereoSlam:
         )
 
     def _outcome(
-        self, frame: StereoFrame, track: Track | None, fault: str, snapshot: _MapSnapshot | None
-    ) -> _Outcome:
+        self, frame: StereoFrame, track: Track | None, fault: str, snapshot: MapSnapshot | None
+    ) -> Outcome:
         tracked = track is not None or snapshot is not None
         covariance: Array = np.eye(6) * UNKNOWN_COVARIANCE
         if track is not None:
@@ -336,7 +299,7 @@ class StereoSlam:
         elif tracked:
             covariance = np.zeros((6, 6))
         state = 'tracking' if tracked else f'lost: {fault or "too few known points in view"}'
-        return _Outcome(
+        return Outcome(
             frame.index,
             frame.stamp_ns,
             tracked,
@@ -349,13 +312,13 @@ class StereoSlam:
             snapshot,
         )
 
-    def _release(self, outcome: _Outcome) -> list[FrameResult]:
+    def _release(self, outcome: Outcome) -> list[FrameResult]:
         self._held.append(outcome)
         if self.mount is None:
             self._let_go_of_old_snapshots()
             return []
         ready, self._held = self._held, []
-        return [_in_map(outcome, self.mount.T_base_left) for outcome in ready]
+        return [in_map(outcome, self.mount.T_base_left) for outcome in ready]
 
     def _let_go_of_old_snapshots(self) -> None:
         """Keep the images of the latest keyframes only: a camera that never sees the floor must not
@@ -371,66 +334,3 @@ def _without_drift(T: Array) -> Array:
     so the rounding errors of repeated products would grow threefold each time.
     """
     return make_transform(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
-
-
-def _in_map(outcome: _Outcome, T_map_world: Array) -> FrameResult:
-    """Turn optical coordinates into ROS frames; `map` is the base at the first pose, so
-    T_map_world = T_base_left.
-    """
-    T_left_base = invert(T_map_world)
-    return FrameResult(
-        outcome.index,
-        outcome.stamp_ns,
-        outcome.tracked,
-        T_map_world @ outcome.T_odom_camera @ T_left_base,
-        T_map_world @ outcome.T_world_odom @ T_left_base,
-        _covariance_of_base(outcome, T_map_world),
-        outcome.num_matches,
-        outcome.state,
-        outcome.reference_ns,
-        _keyframe_in_map(outcome, T_map_world) if outcome.snapshot else None,
-    )
-
-
-def _covariance_of_base(outcome: _Outcome, T_base_left: Array) -> Array:
-    """Carry the covariance of the camera twist to the base, in odom axes (Barfoot 2017, eq.
-    7.49: adjoint).
-    """
-    R, t = T_base_left[:3, :3], T_base_left[:3, 3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    adjoint[:3, 3:] = cross @ R
-    T_odom_base = T_base_left @ outcome.T_odom_camera @ invert(T_base_left)
-    axes = np.zeros((6, 6))
-    axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
-    A = axes @ adjoint
-    return A @ outcome.covariance @ A.T
-
-
-def _keyframe_in_map(outcome: _Outcome, T_map_world: Array) -> Keyframe:
-    snapshot = outcome.snapshot
-    assert snapshot is not None
-    T_left_base = invert(T_map_world)
-    features = KeyframeFeatures(
-        snapshot.uv_px,
-        snapshot.point_id,
-        transform_points(T_map_world, snapshot.xyz_world).astype(np.float32),
-    )
-    path = KeyframePath(
-        snapshot.path_stamp_ns, T_map_world @ snapshot.path_T_world_camera @ T_left_base
-    )
-    cloud = SparseCloud(
-        snapshot.cloud_id,
-        transform_points(T_map_world, snapshot.cloud_xyz_world).astype(np.float32),
-    )
-    return Keyframe(
-        outcome.stamp_ns,
-        outcome.index,
-        T_map_world @ snapshot.T_world_camera @ T_left_base,
-        snapshot.left,
-        snapshot.right,
-        features,
-        path,
-        cloud,
-    )

@@ -93,6 +93,8 @@ def test_the_camera_waits_for_somebody_who_listens(make_graph, tmp_path) -> None
     for name in ('right/image_raw', 'left/camera_info', 'right/camera_info'):
         graph.collect(name)
     graph.until(lambda: len(received) == 2, 'both images')
+    # The first frame was not sent before somebody listened.
+    assert [to_ns(m.header.stamp) for m in received] == [f.stamp_ns for f in frames]
 
 
 class TestStereoSlam:
