@@ -7,10 +7,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 
+from segfloor_ros.cli.interrupts import interrupts_deferred
 from segfloor_ros.errors import MapError
 from segfloor_ros.memory import rss_mb
 
@@ -40,7 +41,7 @@ class NodeProcesses:
 
     def __enter__(self) -> NodeProcesses:
         try:
-            with _interrupts_deferred():
+            with interrupts_deferred():
                 self._start()
         except BaseException:
             # `__exit__` is not called for what happens in here.
@@ -113,26 +114,6 @@ class NodeProcesses:
     def _last_words(self, node: str) -> str:
         lines = self._lines(node)
         return f': {_without_clock(lines[-1])}' if lines else ''
-
-
-@contextlib.contextmanager
-def _interrupts_deferred() -> Iterator[None]:
-    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
-    process and the note that it runs. A started program gets the default handlers again.
-    """
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    if received:
-        signal.raise_signal(received[0])
 
 
 def _cause(status: int) -> str:

@@ -83,6 +83,10 @@ class ReplayRecorder(Node):
         """Whether the recording has ended and all that was sent has come to its end."""
         if self.finished is None or len(self.frame_index) < int(self.finished.values['frames']):
             return False
+        return self.has_caught_up()
+
+    def has_caught_up(self) -> bool:
+        """Whether all that was sent so far has come to its end."""
         if self.unanswered() or self.unmapped() or self._masks:
             return False
         tracked = {t for t, s in self.answers.items() if s.values.get('tracked') == '1'}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
+from segfloor_ros.cli.interrupts import first_interrupt_noted
 from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
@@ -31,6 +33,7 @@ from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 DISCOVERY_S = 30.0
 STALL_S = 60.0
 DRAIN_S = 10.0
+CATCH_UP_S = 3.0
 SERVICE_S = 10.0
 SPIN_S = 0.1
 
@@ -68,8 +71,10 @@ class ReplaySession:
         self._on_progress = on_progress
 
     def execute(self) -> tuple[RunResult, ReplayReport]:
-        """Run the replay. Raises ReplayError naming the node that died or what is stuck, MapError
-        when no map came of it, InputError when the recording breaks off.
+        """Run the replay; an interrupt (Ctrl-C) ends it early and keeps the map.
+
+        Raises ReplayError naming the node that died or what is stuck, MapError when no map came of
+        it, InputError when the recording breaks off.
         """
         environment = isolated_environment()
         # This process takes part in the same graph.
@@ -105,7 +110,10 @@ class ReplaySession:
         discovery_s = graph.connect()
         start_s = time.perf_counter()
         graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
-        graph.play(self._on_progress)
+        with first_interrupt_noted() as interrupted:
+            if not graph.play(self._on_progress, interrupted):
+                graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=True))
+                graph.catch_up()
         wall_s = time.perf_counter() - start_s
         self._check_result(graph.recorder)
         graph.call(Trigger, 'save_map', Trigger.Request())
@@ -152,11 +160,11 @@ class ReplaySession:
         answers = [recorder.answers.get(stamp) for stamp in stamps]
         tracked = np.array([bool(s and s.values.get('tracked') == '1') for s in answers], bool)
         mount, finished, path = recorder.mount, recorder.finished, recorder.path
-        assert mount is not None and finished is not None and path is not None
+        assert mount is not None and path is not None
         return RunSummary(
             frames=len(stamps),
             tracked_frames=int(tracked.sum()),
-            skipped_frames=int(finished.values['skipped']),
+            skipped_frames=int(finished.values['skipped']) if finished is not None else 0,
             lost_intervals=lost_intervals([recorder.frame_index[s] for s in stamps], tracked),
             keyframes=len(path.stamp_ns),
             loops=0,
@@ -207,11 +215,15 @@ class _Graph:
         if not response.success:
             raise ReplayError(f'{name}: {response.message}')
 
-    def play(self, on_progress: ProgressListener) -> None:
-        """Follow the nodes until the recording has ended and everything sent has arrived."""
+    def play(self, on_progress: ProgressListener, interrupted: threading.Event) -> bool:
+        """Follow the nodes until the recording has ended and everything sent has arrived; False
+        when an interrupt came before.
+        """
         recorder = self.recorder
         recorder.last_sign_s = time.monotonic()
         while not recorder.is_drained():
+            if interrupted.is_set():
+                return False
             self._spin()
             last = recorder.answers.get(max(recorder.answers, default=0))
             on_progress(len(recorder.answers), last.message if last else '')
@@ -221,6 +233,16 @@ class _Graph:
                     f'nothing has happened for {quiet_s:.0f} s; {len(recorder.unanswered())} '
                     f'frames are not tracked and {len(recorder.unmapped())} keyframes not mapped'
                 )
+        return True
+
+    def catch_up(self) -> None:
+        """Wait until what was sent has arrived, or nothing more comes."""
+        recorder = self.recorder
+        recorder.last_sign_s = time.monotonic()
+        while not recorder.has_caught_up():
+            self._spin()
+            if time.monotonic() - recorder.last_sign_s > CATCH_UP_S:
+                return
 
     def _spin(self) -> None:
         """Handle what arrives within a moment, then see that all nodes live."""

@@ -15,6 +15,9 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli.replay_graph import unconnected
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.occupancy import FREE
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
 
 FRAMES, DAMAGED = 20, 7
@@ -122,6 +125,23 @@ def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
     assert time.monotonic() - stop_s < 5
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None:
+    out = tmp_path / 'out'
+    replay = start('replay', drive, '--out', out, '--rate', 0.2)
+    while not list(tmp_path.rglob('floor_masks/*.png')) and replay.poll() is None:
+        time.sleep(0.05)
+    nodes = node_processes(replay)
+    replay.send_signal(stop)
+    _, errors = replay.communicate(timeout=60)
+    assert replay.returncode == 0, errors
+    summary = json.loads((out / 'summary.json').read_text())
+    assert 0 < summary['frames'] == summary['tracked_frames'] < FRAMES
+    assert len(read_trajectory(out / 'trajectory.txt')[0]) == summary['frames']
+    assert (load_map(out / 'map.yaml').cells == FREE).any()
+    assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
 
 
 @pytest.mark.parametrize(
