@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
@@ -22,10 +22,7 @@ from segfloor_ros.errors import InputError
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
-ENCODER_OPTIONS = {
-    'png': ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
-    'jpeg': ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, 90]),
-}
+JPEG_QUALITY = 90
 
 
 class ImageCoding(str, Enum):
@@ -60,20 +57,28 @@ def convert(
 class BagWriter:
     """A new bag of stereo pairs: one file where its name ends in `.mcap`, else a rosbag2 folder.
 
-    It appears when it is complete; after an error nothing is left. Raises InputError when `out`
-    exists or cannot be written.
+    It appears when it is complete; after an error nothing is left. jpeg_quality: 1 to 100. Raises
+    InputError when `out` exists or cannot be written.
     """
 
     def __init__(
-        self, out: Path, calibration: StereoCalibration, coding: ImageCoding = ImageCoding.raw
+        self,
+        out: Path,
+        calibration: StereoCalibration,
+        coding: ImageCoding = ImageCoding.raw,
+        jpeg_quality: int = JPEG_QUALITY,
     ) -> None:
         self._out = out
         self._calibration = calibration
         self._coding = coding
+        self._encoders: dict[ImageCoding, tuple[str, list[int]]] = {
+            ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
+            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]),
+        }
         self._staging = Path()
         self._writer: Any = None
         self._typestore: Any = None
-        self._connections: dict[tuple[str, str], Any] = {}
+        self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> BagWriter:
         if self._out.exists():
@@ -97,7 +102,7 @@ class BagWriter:
                 rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
             )
         self._writer.open()
-        self._add_topics()
+        self._add_image_topics()
         return self
 
     def __exit__(
@@ -118,49 +123,64 @@ class BagWriter:
         finally:
             shutil.rmtree(self._staging, ignore_errors=True)
 
+    @property
+    def types(self) -> Mapping[str, Any]:
+        """The classes of Jazzy's messages by name, e.g. `nav_msgs/msg/Odometry`."""
+        types: Mapping[str, Any] = self._typestore.types
+        return types
+
+    def add_topic(self, name: str, message_type: str) -> None:
+        """Add a topic to which `write_message` can write."""
+        self._connections[name] = self._writer.add_connection(
+            name, message_type, typestore=self._typestore
+        )
+
     def write(self, pair: RawPair) -> None:
         """Append one pair, recorded at its own stamp."""
         eyes = (self._calibration.left, self._calibration.right)
         for side, frame_id, eye, image in zip(
             SIDES, FRAME_IDS, eyes, (pair.left, pair.right), strict=True
         ):
-            header = self._header(pair.stamp_ns, frame_id)
-            self._write(side, 'info', pair.stamp_ns, self._info_message(header, eye))
-            self._write(side, 'image', pair.stamp_ns, self._image_message(header, image))
+            header = self.header(pair.stamp_ns, frame_id)
+            self.write_message(
+                f'/{side}/camera_info', pair.stamp_ns, self._info_message(header, eye)
+            )
+            self.write_message(
+                self._image_topic(side), pair.stamp_ns, self._image_message(header, image)
+            )
 
-    def _add_topics(self) -> None:
-        image_type, suffix = (
-            (IMAGE, '') if self._coding is ImageCoding.raw else (COMPRESSED, '/compressed')
-        )
-        image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
-        topics = (('image', f'{image}{suffix}', image_type), ('info', 'camera_info', CAMERA_INFO))
-        for side in SIDES:
-            for what, name, msgtype in topics:
-                self._connections[side, what] = self._writer.add_connection(
-                    f'/{side}/{name}', msgtype, typestore=self._typestore
-                )
-
-    def _write(self, side: str, what: str, stamp_ns: int, message: Any) -> None:
-        connection = self._connections[side, what]
+    def write_message(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Append a message of one of `types` to a topic, recorded at stamp_ns."""
+        connection = self._connections[topic]
         data = self._typestore.serialize_cdr(message, connection.msgtype)
         self._writer.write(connection, stamp_ns, data)
 
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        types = self._typestore.types
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Return a std_msgs/Header."""
         sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-        stamp = types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
-        return types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+        stamp = self.types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
+        return self.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+
+    def _add_image_topics(self) -> None:
+        kind = IMAGE if self._coding is ImageCoding.raw else COMPRESSED
+        for side in SIDES:
+            self.add_topic(self._image_topic(side), kind)
+            self.add_topic(f'/{side}/camera_info', CAMERA_INFO)
+
+    def _image_topic(self, side: str) -> str:
+        image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
+        suffix = '' if self._coding is ImageCoding.raw else '/compressed'
+        return f'/{side}/{image}{suffix}'
 
     def _image_message(self, header: Any, image: NDArray[np.uint8]) -> Any:
-        types = self._typestore.types
         pixels = np.ascontiguousarray(image)
         if self._coding is not ImageCoding.raw:
-            suffix, options = ENCODER_OPTIONS[self._coding.value]
+            suffix, options = self._encoders[self._coding]
             _, data = cv2.imencode(suffix, pixels, options)
             words = f'mono8; {self._coding.value} compressed mono8'
-            return types[COMPRESSED](header=header, format=words, data=data.ravel())
+            return self.types[COMPRESSED](header=header, format=words, data=data.ravel())
         height, width = pixels.shape
-        return types[IMAGE](
+        return self.types[IMAGE](
             header=header,
             height=height,
             width=width,
@@ -171,9 +191,8 @@ class BagWriter:
         )
 
     def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
-        types = self._typestore.types
-        whole_image = types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
-        return types[CAMERA_INFO](
+        whole_image = self.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        return self.types[CAMERA_INFO](
             header=header,
             height=eye.height,
             width=eye.width,

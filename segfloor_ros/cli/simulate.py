@@ -10,11 +10,11 @@ from typing import Annotated, Optional
 import typer
 from rich.progress import TaskID
 
-from segfloor_ros.camera.bag_writer import ImageCoding
+from segfloor_ros.camera.bag_writer import JPEG_QUALITY, ImageCoding
 from segfloor_ros.cli.options import OutOption
 from segfloor_ros.cli.output import console, progress_bar
 from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.bag import JPEG_QUALITY, SimulatedBag
+from segfloor_ros.simulation.bag import SimulatedBag
 from segfloor_ros.simulation.recording import RecordingOptions, record
 from segfloor_ros.simulation.simulation import Simulation
 
