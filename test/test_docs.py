@@ -1,0 +1,68 @@
+"""The handwritten pages name what there is."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from pathlib import Path
+
+import pytest
+import yaml
+
+from segfloor_ros.simulation import scene as scene_module
+from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped_scenes
+from segfloor_ros.simulation.textures import GENERATORS
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+SIMULATION = (DOCS / 'simulation.md').read_text()
+
+
+def fields_of(kind: type) -> dict[str, set[str]]:
+    """Return the names of a description's entries and, below each, those of its parts."""
+    found = {}
+    for name, hint in typing.get_type_hints(kind, vars(scene_module)).items():
+        inner = next(
+            (k for k in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(k)), None
+        )
+        found[name] = {f.name for f in dataclasses.fields(inner)} if inner else set()
+    return found
+
+
+def table_rows(text: str) -> list[set[str]]:
+    """Return the names in code style of every table row."""
+    lines = [line for line in text.splitlines() if line.startswith('|')]
+    return [set(re.findall(r'`([a-z0-9_]+)`', line)) for line in lines]
+
+
+def test_the_simulation_page_lists_the_shipped_scenes() -> None:
+    assert {frozenset({name}) for name in shipped_scenes()} <= {
+        frozenset(row) for row in table_rows(SIMULATION)
+    }
+
+
+@pytest.mark.parametrize('entry', sorted(fields_of(Scene)))
+def test_the_simulation_page_explains_every_entry_of_a_scene(entry) -> None:
+    rows = [row for row in table_rows(SIMULATION) if entry in row]
+    parts = fields_of(Scene)[entry]
+    assert any(parts <= row for row in rows), parts
+
+
+def test_the_simulation_page_names_the_textures() -> None:
+    words = SIMULATION.partition('Textures: `')[2].partition('`')[0].split()
+    assert words == list(GENERATORS)
+
+
+def test_the_page_names_no_entry_that_does_not_exist() -> None:
+    known = set().union(fields_of(Scene), *fields_of(Scene).values())
+    known |= {field.name for field in dataclasses.fields(scene_module.Vibration)}
+    table = SIMULATION.partition('| entry | holds |')[2]
+    assert set().union(*table_rows(table)) <= known
+
+
+def test_the_scene_of_the_page_can_be_opened() -> None:
+    values = yaml.safe_load(SIMULATION.partition('```yaml\n')[2].partition('```')[0])
+    assert values.pop('like') in shipped_scenes()
+    scene = scene_from_mapping(values, 'docs')
+    assert scene.boxes[0].size == (0.6, 0.4, 0.3)
