@@ -1,15 +1,19 @@
 # make        everything needed, in .venv        make test   style, types and all tests
 # make demo   record a drive, map it, score it   make lint   style and types only
-# PYTHON=/path/to/python chooses the interpreter (3.10 or newer).
+# make test-noble   all tests with the versions of Ubuntu 24.04, in .venv-noble
+# PYTHON=/path/to/python chooses the interpreter (3.10 or newer), PYTHON312=... that of test-noble.
 
 CANDIDATES := $(PYTHON) python3 python3.12 python3.11 python3.13 python3.10
 OLD_ENOUGH := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info < (3, 14))
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+NOBLE := .venv-noble
+NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
+IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 CODE := segfloor_ros test launch_configs docs setup.py
 
-.PHONY: all test demo lint format docs clean
+.PHONY: all test test-noble noble-python demo lint format docs clean
 
 all: $(STAMP)
 
@@ -31,6 +35,28 @@ $(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python
 test: $(STAMP) lint
 	$(BIN)/python -m pytest
 
+test-noble: $(NOBLE)/.installed
+	$(NOBLE)/bin/python -m pytest
+
+noble-python:
+	@for python in $(NOBLE_CANDIDATES); do \
+	  if "$$python" -c '$(IS_312)' 2>/dev/null; then echo "$$python"; exit 0; fi; \
+	done; \
+	echo 'no Python 3.12 with venv was found; name one: make test-noble PYTHON312=/path/to/it' >&2; \
+	exit 1
+
+# The four packages come in the versions of Ubuntu 24.04, everything else as in .venv.
+$(NOBLE)/.installed: constraints-noble.txt constraints.txt setup.py setup.cfg pyproject.toml
+	@python="$$($(MAKE) -s noble-python)" && "$$python" -m venv --clear $(NOBLE)
+	@{ cat constraints-noble.txt; grep -vE \
+	  "^($$(sed -n 's/==.*//p' constraints-noble.txt | paste -sd '|'))==" constraints.txt; \
+	} > $(NOBLE)/constraints.txt
+	$(NOBLE)/bin/python -m pip install -q --disable-pip-version-check \
+	  -c $(NOBLE)/constraints.txt pip setuptools
+	$(NOBLE)/bin/python -m pip install -q --disable-pip-version-check \
+	  -c $(NOBLE)/constraints.txt --no-build-isolation -e '.[ros,cli,sim,test]'
+	@touch $@
+
 demo: $(STAMP)
 	$(BIN)/segfloor demo
 
@@ -47,4 +73,4 @@ docs: $(STAMP)
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV) build install log .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) $(NOBLE) build install log .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterator
@@ -36,20 +37,11 @@ def shared_data() -> Path:
 @pytest.fixture
 def make_graph() -> Iterator[Callable[..., Any]]:
     """Make a graph whose nodes get the given ROS arguments, in a domain that nobody else uses."""
-    import rclpy
-    from ros_graph import Graph
+    from ros_graph import Graph, fresh_graph
 
-    from segfloor_ros.cli.replay_graph import free_domain
+    with contextlib.ExitStack() as stack:
 
-    graphs: list[Graph] = []
+        def make(*arguments: str) -> Graph:
+            return stack.enter_context(fresh_graph(*arguments))
 
-    def make(*arguments: str) -> Graph:
-        os.environ['ROS_DOMAIN_ID'] = str(free_domain())
-        rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
-        graphs.append(Graph())
-        return graphs[-1]
-
-    yield make
-    for graph in graphs:
-        graph.close()
-    os.environ.pop('ROS_DOMAIN_ID', None)
+        yield make

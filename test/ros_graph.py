@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from segfloor_ros.cli.replay_graph import free_domain
 from segfloor_ros.messages.diagnostics import Status, statuses
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 
@@ -81,3 +84,16 @@ class Graph:
         for node in self._nodes:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+@contextlib.contextmanager
+def fresh_graph(*arguments: str) -> Iterator[Graph]:
+    """A graph whose nodes get the given ROS arguments, in a domain that nobody else uses."""
+    os.environ['ROS_DOMAIN_ID'] = str(free_domain())
+    rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
+    graph = Graph()
+    try:
+        yield graph
+    finally:
+        graph.close()
+        os.environ.pop('ROS_DOMAIN_ID', None)
