@@ -14,6 +14,11 @@ from segfloor_ros.settings import StageSettings, setting
 class NodeSettings(StageSettings):
     """Base of the settings of one node."""
 
+    autostart: bool = setting(
+        True,
+        'Configure and activate at the start; off: wait for a lifecycle manager.',
+    )
+
     @classmethod
     def stage_name(cls) -> str:
         """Return the node's name: `StereoSlamNodeSettings` → `stereo_slam`."""
@@ -81,12 +86,12 @@ class StereoSlamNodeSettings(NodeSettings):
 
 @dataclass(frozen=True)
 class FloorSegmentationNodeSettings(NodeSettings):
-    """Nothing beyond the stage's own settings."""
+    """Nothing beyond what every node has."""
 
 
 @dataclass(frozen=True)
 class CloudLabellingNodeSettings(NodeSettings):
-    """Nothing beyond the stage's own settings."""
+    """Nothing beyond what every node has."""
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,19 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
 
     def __init__(self) -> None:
         super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
-        self._stage = CloudLabelling(self.parameters.stage)
+
+    def set_up(self) -> None:
+        """Make the topics."""
         self._labelled = self.output('labelled_points')
         self._by_label = {
             FLOOR: self.output('floor_points'),
             OBSTACLE: self.output('obstacle_points'),
         }
         self.join((MAP_POINTS, FEATURES, MASK), self._take)
+
+    def start_anew(self) -> None:
+        """Begin without points."""
+        self._stage = CloudLabelling(self.parameters.stage)
 
     def on_settings_changed(self) -> None:
         """Label the next keyframe with the new settings."""

@@ -29,16 +29,22 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
 
     def __init__(self) -> None:
         super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings)
+
+    def set_up(self) -> None:
+        """Make the topics."""
         self._mount: Mount | None = None
         self._base_frame = ''
-        self._camera: StereoCamera | None = None
-        self._stage: FloorSegmentation | None = None
-        self._waiting: list[tuple[int, dict[str, Any]]] = []
         self._disparity = self.output('keyframe/disparity')
         self._mask = self.output('keyframe/floor_mask')
         self._scan = self.output('keyframe/floor_scan')
         self.listen('camera_mount', self._take_mount)
         self.join((LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE), self._take)
+
+    def start_anew(self) -> None:
+        """Begin without memory of the floor."""
+        self._camera: StereoCamera | None = None
+        self._stage: FloorSegmentation | None = None
+        self._waiting: list[tuple[int, dict[str, Any]]] = []
 
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings."""

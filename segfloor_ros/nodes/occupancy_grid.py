@@ -30,14 +30,33 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
 
     def __init__(self) -> None:
         super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings)
-        self._stage = OccupancyGridMapper(self.parameters.stage)
+
+    def set_up(self) -> None:
+        """Make the topics and the service."""
+        self._later: Timer | None = None
         self._map = self.output('map')
+        self.join((POINTS, FEATURES, PATH, POSE, SCAN), self._take)
+        self.offer(Trigger, 'save_map', self._save)
+
+    def start_anew(self) -> None:
+        """Begin with an empty map."""
+        self._stage = OccupancyGridMapper(self.parameters.stage)
         self._stamp_ns = 0
         self._frame_id = ''
         self._published_s = -float('inf')
-        self._later: Timer | None = None
-        self.join((POINTS, FEATURES, PATH, POSE, SCAN), self._take)
-        self.create_service(Trigger, 'save_map', self._save)
+
+    def forget(self) -> None:
+        """Drop the map."""
+        super().forget()
+        if self._later is not None:
+            self.destroy_timer(self._later)
+        self._later = None
+
+    def on_inputs_closed(self) -> None:
+        """Publish the map if it was still to come."""
+        super().on_inputs_closed()
+        if self._later is not None and self.context.ok():
+            self._publish()
 
     def on_settings_changed(self) -> None:
         """Map the next keyframe with the new settings."""

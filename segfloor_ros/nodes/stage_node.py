@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -25,6 +24,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.node_settings import NodeSettings
+from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.parameters import NodeParameters
 from segfloor_ros.settings import StageSettings
 
@@ -33,42 +33,59 @@ Own = TypeVar('Own', bound=NodeSettings)
 
 CONNECTION_CHECK_S = 0.1
 HEARTBEAT_S = 1.0
+MAX_WAITING_SETS = 100
 REPEAT_FAULT_S = 5.0
 
 
-class StageNode(Node, Generic[Stage, Own]):
-    """A node around one stage. Subclasses create the topics and hand messages to the stage.
+class StageNode(ManagedNode, Generic[Stage, Own]):
+    """A node around one stage. Subclasses create the topics in `set_up`, the stage in `start_anew`,
+    and hand messages to the stage.
 
     Callbacks run one after the other; the depth of the subscriptions is the queue. A fault of a
     message or of the stage is one line in the log and one status; the node lives on.
     """
 
     def __init__(self, stage: type[Stage], own: type[Own]) -> None:
-        super().__init__(stage.stage_name(), automatically_declare_parameters_from_overrides=True)
+        super().__init__(stage.stage_name())
         self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
         self.add_on_set_parameters_callback(self._change_parameters)
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
         )
         self._outputs: dict[str, Publisher] = {}
+        self._joiners: list[StampJoiner] = []
         self._connections: dict[str, str] = {}
         self._last_heartbeat_s = 0.0
         self._faults: dict[str, float] = {}
         self.create_timer(CONNECTION_CHECK_S, self._report_connections)
+        if self.parameters.own.autostart:
+            self.start()
 
     def on_settings_changed(self) -> None:
         """Take over changed live parameters; the next message is processed with them."""
 
+    def on_inputs_closed(self) -> None:
+        """Give up the sets that are not complete."""
+        for joiner in self._joiners:
+            joiner.clear()
+
+    def forget(self) -> None:
+        """Give up what waits; the outputs go with the topics."""
+        self._joiners.clear()
+        self._outputs.clear()
+
     def output(self, name: str) -> Publisher:
-        """Create the publisher of a topic of `TOPICS`."""
+        """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
         topic = TOPICS[name]
-        self._outputs[name] = self.create_publisher(topic.type, name, topic.profile)
+        self._outputs[name] = self.keep_publisher(topic.type, name, topic.profile)
         return self._outputs[name]
 
     def listen(
         self, name: str, callback: Callable[[Any], None], profile: QoSProfile | None = None
     ) -> None:
-        """Subscribe to a topic of `TOPICS`; faults in the callback are logged with its name."""
+        """Subscribe to a topic of `TOPICS` while the node is active; faults in the callback are
+        logged with the topic's name.
+        """
         topic = TOPICS[name]
 
         def guarded(message: Any) -> None:
@@ -77,14 +94,21 @@ class StageNode(Node, Generic[Stage, Own]):
             except Exception as error:
                 self.say_fault(name, error)
 
-        self.create_subscription(topic.type, name, guarded, profile or topic.profile)
+        self.subscribe_while_open(topic.type, name, guarded, profile or topic.profile)
+
+    def joiner(
+        self, parts: Sequence[str], capacity: int = MAX_WAITING_SETS, tolerance_ns: int = 0
+    ) -> StampJoiner:
+        """Return a joiner that is emptied when the inputs close."""
+        self._joiners.append(StampJoiner(parts, capacity, tolerance_ns))
+        return self._joiners[-1]
 
     def join(self, parts: Sequence[str], process: Callable[[int, dict[str, Any]], None]) -> None:
         """Subscribe to topics whose messages belong together; `process` gets the stamp and the
         messages by topic once all with one stamp have arrived. Those that remain alone are
         reported.
         """
-        joiner = StampJoiner(parts)
+        joiner = self.joiner(parts)
 
         def take(part: str, message: Any) -> None:
             stamp_ns = to_ns(message.header.stamp)
@@ -171,20 +195,23 @@ def one_line(error: Exception) -> str:
     return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
 
 
-def run_node(make_node: Callable[[], Node]) -> None:
+def run_node(make_node: Callable[[], ManagedNode]) -> None:
     """Run a node until it is interrupted (status 0); bad parameters or input end it with one
     line and status 2.
     """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
-    status = 0
+    status, node = 0, None
     try:
         rclpy.init()
-        rclpy.spin(make_node())
+        node = make_node()
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except SegfloorError as error:
         print(f'segfloor: {error}', file=sys.stderr)
         status = 2
     finally:
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(status)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 from diagnostic_msgs.msg import DiagnosticArray
-from std_srvs.srv import SetBool
 
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
@@ -29,27 +27,45 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
 
     def __init__(self) -> None:
         super().__init__(StereoCameraSettings, StereoCameraNodeSettings)
+
+    def set_up(self) -> None:
+        """Open the recording and make the topics."""
         if not self.parameters.stage.input:
             raise InputError('stereo_camera.input is empty; name a recording or a device')
         own = self.parameters.own
         self._source: StereoSource = open_source(self.parameters.stage)
-        self._pairs: Iterator[RawPair] = self._source.raw_pairs()
-        self._next: RawPair | None = None
-        self._frames_sent = 0
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
         self._images = {side: self.output(f'{side}/image_raw') for side in self._frame_ids}
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
-        self._paused = own.start_paused
+        if own.lossless or not own.rate:
+            # Also while paused: frames are under way then, too.
+            self.keep_subscription(
+                DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
+            )
+        self.every(TICK_S, self._advance)
+        self.pause(own.start_paused)
+
+    def start_anew(self) -> None:
+        """Begin with the first frame."""
+        own = self.parameters.own
+        self._pairs = self._source.raw_pairs()
+        self._next: RawPair | None = None
+        self._frames_sent = 0
         self._connected = self._finished = False
         self._said_waiting_s = time.monotonic()
         self._clock_pace = ClockPace(own.rate) if own.rate else None
         self._chain_pace = ChainPace() if own.lossless or not own.rate else None
-        if self._chain_pace is not None:
-            self.create_subscription(
-                DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
-            )
-        self.create_service(SetBool, '~/pause', self._pause)
-        self.create_timer(TICK_S, self._advance)
+
+    def forget(self) -> None:
+        """Stop reading."""
+        super().forget()
+        self._pairs = iter(())
+
+    def on_inputs_opened(self) -> None:
+        """Keep the recording's pace from here on."""
+        self._said_waiting_s = time.monotonic()
+        if self._clock_pace is not None:
+            self._clock_pace.restart()
 
     def _advance(self) -> None:
         """Send the next pairs as far as they may go now."""
@@ -64,7 +80,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             self._finish(Level.ERROR, str(error))
 
     def _may_play(self) -> bool:
-        if self._finished or self._paused:
+        if self._finished:
             return False
         if not self._connected:
             outputs = (*self._images.values(), *self._infos.values())
@@ -112,19 +128,14 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self.publish_status(RECORDING, stamp_ns, level, message, values)
 
     def _take_status(self, message: DiagnosticArray) -> None:
-        assert self._chain_pace is not None
+        if self._chain_pace is None:
+            return
         namespace = self.get_namespace().rstrip('/')
         for status in statuses(message):
             if status.name == f'{namespace}/{status.node}':
                 note_status(self._chain_pace, status)
-        self._advance()
-
-    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._paused = bool(request.data)
-        if self._clock_pace is not None:
-            self._clock_pace.restart()
-        response.success, response.message = True, 'paused' if self._paused else 'playing'
-        return response
+        if self.is_open:
+            self._advance()
 
     def _say_waiting_for(self, what: str) -> None:
         now_s = time.monotonic()

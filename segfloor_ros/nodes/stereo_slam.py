@@ -18,7 +18,6 @@ from segfloor_ros.messages.camera_info import eye_calibration
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey_image
-from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
@@ -36,22 +35,44 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
 
     def __init__(self) -> None:
         super().__init__(StereoSlamSettings, StereoSlamNodeSettings)
+
+    def set_up(self) -> None:
+        """Make the topics."""
+        self._slam: StereoSlam | None = None
         own = self.parameters.own
         self._outputs_of_slam = SlamOutputs(self, own)
         self._transforms = Transforms(self, own)
         self._eyes: dict[str, EyeCalibration] = {}
+        self._left, self._right = self._subscribe(own)
+        tolerance_ns = round(own.sync_tolerance_s * 1e9)
+        self._pairs = self.joiner((self._left, self._right), MAX_WAITING_PAIRS, tolerance_ns)
+
+    def start_anew(self) -> None:
+        """Begin with an empty map; the mount of the camera is found again, too."""
+        self._end_stage()
         self._calibration: StereoCalibration | None = None
         self._frames = CameraFrames('', '')
         self._rectifier: StereoRectifier | None = None
         self._eight_bit = EightBitScale()
-        self._slam: StereoSlam | None = None
         self._mount: Mount | None = None
         self._mount_from_tf = False
         self._frame_count = 0
         self._waiting: list[dict[str, Any]] = []
-        self._left, self._right = self._subscribe(own)
-        tolerance_ns = round(own.sync_tolerance_s * 1e9)
-        self._pairs = StampJoiner((self._left, self._right), MAX_WAITING_PAIRS, tolerance_ns)
+
+    def forget(self) -> None:
+        """Drop the map."""
+        super().forget()
+        self._end_stage()
+
+    def on_inputs_closed(self) -> None:
+        """Give up the images that wait."""
+        super().on_inputs_closed()
+        self._waiting = []
+
+    def _end_stage(self) -> None:
+        if self._slam is not None:
+            self._slam.close()
+        self._slam = None
 
     def _subscribe(self, own: StereoSlamNodeSettings) -> tuple[str, str]:
         kind = 'image_rect' if own.rectified_input else 'image_raw'
@@ -133,12 +154,6 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._mount_from_tf = mount is not None
         background = self.parameters.own.background
         self._slam = make_slam(self._rectifier.camera, settings, mount, background=background)
-
-    def destroy_node(self) -> None:
-        """End the node and its background thread."""
-        if self._slam is not None:
-            self._slam.close()
-        super().destroy_node()
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self._mount = mount

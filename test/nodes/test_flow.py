@@ -37,6 +37,7 @@ def test_a_node_has_the_topics_that_are_declared_and_no_others(make_graph, tmp_p
     graph = make_graph('-r', '__ns:=/robot', *arguments)
     made = make(node, graph)
     publishers = dict(made.get_publisher_names_and_types_by_node(node, '/robot'))
+    assert publishers.pop(f'/robot/{node}/transition_event')
     expected = {f'/robot/{t.name}': [t.type_name] for t in published_by(node)}
     found = {k: v for k, v in publishers.items() if k not in OF_EVERY_NODE and '/tf' not in k}
     assert found == expected

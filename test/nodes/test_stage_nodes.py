@@ -6,15 +6,26 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from node_messages import (
+    FEATURES,
+    LABELLED,
+    MASK,
+    POINTS,
+    SCAN,
+    STAMP_NS,
+    cloud_messages,
+    grid_messages,
+    pose_message_at,
+    publish,
+)
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud.labels import FLOOR
 from segfloor_ros.cloud.settings import CloudLabellingSettings
-from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import invert
@@ -27,21 +38,16 @@ from segfloor_ros.messages.camera_info import (
     rectified_calibration,
 )
 from segfloor_ros.messages.clouds import (
-    features_message,
     labelled_arrays,
-    labelled_message,
     sparse_cloud_arrays,
-    sparse_cloud_message,
 )
 from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.floor import scan_arrays, scan_message
+from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import (
-    odometry_message,
     path_arrays,
-    path_message,
     pose_array,
     transform_array,
     transform_message,
@@ -51,9 +57,8 @@ from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+from segfloor_ros.slam.results import KeyframePath
 
-STAMP_NS = 12_345_678_901
 CALIBRATION = rectified_calibration(CAMERA)
 
 
@@ -228,14 +233,14 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
     graph = make_graph()
     masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_scan')
     graph.add(FloorSegmentationNode())
-    messages = {'keyframe/odometry': _pose(np.eye(4))}
+    messages = {'keyframe/odometry': pose_message_at(STAMP_NS)}
     for side in ('left', 'right'):
         image = image_message(STAMP_NS, side, getattr(frame, side))
         messages[f'keyframe/{side}/image_rect'] = image
         info = camera_info_message(STAMP_NS, side, getattr(CALIBRATION, side))
         messages[f'keyframe/{side}/camera_info'] = info
     mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
-    _publish(graph, {**messages, 'camera_mount': mount})
+    publish(graph, {**messages, 'camera_mount': mount})
     graph.until(lambda: masks and scans, 'mask and scan')
     assert to_ns(masks[0].header.stamp) == to_ns(scans[0].header.stamp) == STAMP_NS
     assert (masks[0].encoding, masks[0].header.frame_id) == ('mono8', 'left')
@@ -245,23 +250,12 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
     assert (expected.mask == 255).mean() > 0.1
 
 
-POINTS = SparseCloud(
-    np.array([2, 5, 8], np.int32), np.array([[1, 0, 0], [2, 0, 1], [3, 1, 0]], np.float32)
-)
-FEATURES = KeyframeFeatures(
-    np.array([[2.0, 9.0], [2.0, 1.0], [5.0, 5.0]], np.float32),
-    np.array([2, 5, -1], np.int32),
-    np.array([[1, 0, 0], [2, 0, 1], [np.nan] * 3], np.float32),
-)
-MASK = np.repeat(np.array([0] * 5 + [255] * 5, np.uint8)[:, None], 10, axis=1)
-
-
 def test_cloud_labelling_is_the_stage(make_graph) -> None:
     expected = CloudLabelling(CloudLabellingSettings()).update(POINTS, FEATURES, MASK)
     graph = make_graph()
     labelled, floor = graph.collect('labelled_points'), graph.collect('floor_points')
     graph.add(CloudLabellingNode())
-    _publish(graph, _cloud_messages(STAMP_NS))
+    publish(graph, cloud_messages(STAMP_NS))
     graph.until(lambda: labelled and floor, 'labelled points')
     assert to_ns(labelled[0].header.stamp) == STAMP_NS
     assert labelled[0].header.frame_id == 'map'
@@ -276,10 +270,10 @@ def test_a_missing_partner_is_named_and_the_next_keyframe_goes_through(make_grap
     graph = make_graph()
     labelled = graph.collect('labelled_points')
     graph.add(CloudLabellingNode())
-    alone = _cloud_messages(STAMP_NS)
+    alone = cloud_messages(STAMP_NS)
     del alone['keyframe/floor_mask']
-    publishers = _publish(graph, alone)
-    _publish(graph, _cloud_messages(STAMP_NS + 1), publishers)
+    publishers = publish(graph, alone)
+    publish(graph, cloud_messages(STAMP_NS + 1), publishers)
     graph.until(lambda: labelled, 'the second keyframe')
     assert to_ns(labelled[0].header.stamp) == STAMP_NS + 1
     (error,) = (s for s in graph.reports('cloud_labelling') if s.level is Level.ERROR)
@@ -288,16 +282,9 @@ def test_a_missing_partner_is_named_and_the_next_keyframe_goes_through(make_grap
 
 
 def test_the_grid_is_the_stage_and_is_saved_on_request(make_graph, tmp_path) -> None:
-    labelled = LabelledPoints(
-        np.array([2, 5], np.int32),
-        np.array([[1.0, 0, 0], [2, 0.3, 0.5]], np.float32),
-        np.array([FLOOR, OBSTACLE], np.uint8),
-        np.ones(2, np.float32),
-    )
     path = KeyframePath(np.array([STAMP_NS]), np.eye(4)[None])
-    scan = FloorScan(-0.5, 0.25, np.array([1.5, 1.5, 1.5, 1.5, 1.5], np.float32))
     stage = OccupancyGridMapper(OccupancyGridSettings())
-    stage.update(STAMP_NS, labelled, FEATURES, path, scan)
+    stage.update(STAMP_NS, LABELLED, FEATURES, path, SCAN)
     expected = stage.grid()
     file = tmp_path / 'saved.yaml'
     graph = make_graph('-p', f'map_file:={file}')
@@ -305,14 +292,7 @@ def test_the_grid_is_the_stage_and_is_saved_on_request(make_graph, tmp_path) -> 
     early = graph.call(Trigger, 'save_map', Trigger.Request())
     assert not early.success
     assert not file.exists()
-    messages = {
-        'labelled_points': labelled_message(STAMP_NS, 'map', labelled),
-        'keyframe/features': features_message(STAMP_NS, 'map', FEATURES),
-        'keyframe/path': path_message(STAMP_NS, 'map', path),
-        'keyframe/odometry': _pose(np.eye(4)),
-        'keyframe/floor_scan': scan_message(STAMP_NS, 'base_link', scan),
-    }
-    _publish(graph, messages)
+    publish(graph, grid_messages(STAMP_NS))
     graph.until(lambda: graph.reports('occupancy_grid'), 'the update')
     late = graph.collect('map')
     graph.until(lambda: late, 'the map, latched')
@@ -324,28 +304,6 @@ def test_the_grid_is_the_stage_and_is_saved_on_request(make_graph, tmp_path) -> 
     saved = graph.call(Trigger, 'save_map', Trigger.Request())
     assert (saved.success, saved.message) == (True, str(file))
     np.testing.assert_array_equal(load_map(file).cells, expected.cells)
-
-
-def _cloud_messages(stamp_ns: int):
-    return {
-        'map_points': sparse_cloud_message(stamp_ns, 'map', POINTS),
-        'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
-        'keyframe/floor_mask': image_message(stamp_ns, 'left', MASK),
-    }
-
-
-def _pose(T_map_base):
-    return odometry_message(STAMP_NS, 'map', 'base_link', T_map_base, np.zeros((6, 6)))
-
-
-def _publish(graph, messages, publishers=None):
-    publishers = {} if publishers is None else publishers
-    for name in messages.keys() - publishers.keys():
-        publishers[name] = graph.publisher(name)
-    graph.connected(list(publishers.values()))
-    for name, message in messages.items():
-        publishers[name].publish(message)
-    return publishers
 
 
 def _stamps(statuses) -> set[int]:

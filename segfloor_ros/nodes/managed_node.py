@@ -1,0 +1,211 @@
+"""A node that can be managed (configure, activate, deactivate, cleanup, shutdown), and that starts
+by itself where nobody manages it.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool, Trigger
+
+from segfloor_ros.errors import SegfloorError
+
+DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class ManagedNode(LifecycleNode):
+    """The states of a node (REP-2002 in rclpy's form), and the services `~/pause` and `~/reset`.
+
+    Configured, it has its topics and services and an empty map (`set_up`, `start_anew`); while it
+    is active and not paused, its inputs are open: subscriptions and timers made with `listen` and
+    `every`. Deactivated or paused it receives nothing and keeps its map, and what it has latched
+    stays to be had; cleaned up it has neither.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self._openers: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = []
+        self._open: list[tuple[Any, Callable[[Any], Any]]] = []
+        self._kept: list[tuple[Any, Callable[[Any], Any]]] = []
+        self._is_set_up = self._is_active = self._is_paused = False
+        self._fault: Exception | None = None
+        self._answer_impossible_transitions()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the inputs are open: the node is active and not paused."""
+        return self._is_active and not self._is_paused
+
+    def set_up(self) -> None:
+        """Make the topics and services. Raises SegfloorError when that cannot be."""
+        raise NotImplementedError
+
+    def start_anew(self) -> None:
+        """Begin with an empty map, first of all after `set_up`."""
+        raise NotImplementedError
+
+    def forget(self) -> None:
+        """Drop the map and end what works on it."""
+
+    def on_inputs_opened(self) -> None:
+        """Prepare for messages, at first and after a pause."""
+
+    def on_inputs_closed(self) -> None:
+        """Give up what waits for more messages."""
+
+    def start(self) -> None:
+        """Configure and activate. Raises what stands in the way."""
+        for step in (self.trigger_configure, self.trigger_activate):
+            if step() != DONE:
+                assert self._fault is not None
+                raise self._fault
+
+    def pause(self, paused: bool) -> None:
+        """Close the inputs until further notice, or open them again."""
+        self._is_paused = paused
+        self._open_or_close()
+
+    def keep_publisher(self, kind: Any, name: str, profile: QoSProfile) -> Publisher:
+        """Create a publisher that lives until the node is cleaned up."""
+        publisher = self.create_publisher(kind, name, profile)
+        self._kept.append((publisher, self.destroy_publisher))
+        return publisher
+
+    def keep_subscription(
+        self, kind: Any, name: str, callback: Callable[[Any], None], profile: QoSProfile
+    ) -> None:
+        """Subscribe until the node is cleaned up, whether it is active or not."""
+        subscription = self.create_subscription(kind, name, callback, profile)
+        self._kept.append((subscription, self.destroy_subscription))
+
+    def offer(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
+        """Offer a service until the node is cleaned up."""
+        self._kept.append((self.create_service(kind, name, answer), self.destroy_service))
+
+    def subscribe_while_open(
+        self, kind: Any, name: str, callback: Callable[[Any], None], profile: QoSProfile
+    ) -> None:
+        """Subscribe to a topic while the inputs are open."""
+        self._openers.append(
+            (
+                lambda: self.create_subscription(kind, name, callback, profile),
+                self.destroy_subscription,
+            )
+        )
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call something regularly while the inputs are open."""
+        self._openers.append((lambda: self.create_timer(period_s, callback), self.destroy_timer))
+
+    def destroy_node(self) -> None:
+        """End the node and what works for it."""
+        self._clean_up()
+        super().destroy_node()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make topics, services and an empty map."""
+        return self._try(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the inputs."""
+        self._is_active = True
+        result = self._try(self._open_or_close)
+        self._is_active = result == DONE
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the inputs and keep the map."""
+        self._is_active = False
+        return self._try(self._open_or_close)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop the map, topics and services."""
+        return self._try(self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop everything, from any state."""
+        return self._try(self._clean_up)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop everything; the node can be configured again."""
+        return self._try(self._clean_up)
+
+    def _try(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        """Take a step of a transition; a fault is logged and the transition refused."""
+        try:
+            step()
+        except Exception as error:
+            self._fault = error
+            self.get_logger().error(' '.join(str(error).split()) or repr(error))
+            if not isinstance(error, SegfloorError):
+                self.get_logger().debug(''.join(traceback.format_exception(error)))
+            return REFUSED
+        return DONE
+
+    def _configure(self) -> None:
+        try:
+            self.offer(SetBool, '~/pause', self._answer_pause)
+            self.offer(Trigger, '~/reset', self._answer_reset)
+            self._is_set_up = True
+            self.set_up()
+            self.start_anew()
+        except Exception:
+            self._clean_up()
+            raise
+
+    def _clean_up(self) -> None:
+        self._is_active = self._is_paused = False
+        self._open_or_close()
+        self._openers.clear()
+        if self._is_set_up:
+            self._is_set_up = False
+            self.forget()
+        while self._kept:
+            entity, destroy = self._kept.pop()
+            destroy(entity)
+
+    def _open_or_close(self) -> None:
+        if self.is_open and not self._open:
+            self._open = [(make(), destroy) for make, destroy in self._openers]
+            self.on_inputs_opened()
+        elif not self.is_open and self._open:
+            while self._open:
+                entity, destroy = self._open.pop()
+                destroy(entity)
+            self.on_inputs_closed()
+
+    def _answer_pause(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        self.pause(bool(request.data))
+        response.success, response.message = True, 'paused' if self._is_paused else 'running'
+        return response
+
+    def _answer_reset(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        response.success = self._try(self.start_anew) == DONE
+        response.message = 'begun anew' if response.success else str(self._fault)
+        return response
+
+    def _answer_impossible_transitions(self) -> None:
+        """Refuse a transition that the present state does not have; in rclpy's own handler it
+        raises, which would end the node.
+        """
+        change_state = self._service_change_state.callback
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change_state(request, response)
+            except rclpy_implementation.RCLError as error:
+                self.get_logger().warning(str(error).partition(', at ')[0])
+                response.success = False
+                return response
+
+        self._service_change_state.callback = answer

@@ -1,0 +1,70 @@
+"""Messages of one keyframe for the nodes behind SLAM, and how they are sent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.messages.clouds import features_message, labelled_message, sparse_cloud_message
+from segfloor_ros.messages.floor import scan_message
+from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.poses import odometry_message, path_message
+from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+
+STAMP_NS = 12_345_678_901
+POINTS = SparseCloud(
+    np.array([2, 5, 8], np.int32), np.array([[1, 0, 0], [2, 0, 1], [3, 1, 0]], np.float32)
+)
+FEATURES = KeyframeFeatures(
+    np.array([[2.0, 9.0], [2.0, 1.0], [5.0, 5.0]], np.float32),
+    np.array([2, 5, -1], np.int32),
+    np.array([[1, 0, 0], [2, 0, 1], [np.nan] * 3], np.float32),
+)
+MASK = np.repeat(np.array([0] * 5 + [255] * 5, np.uint8)[:, None], 10, axis=1)
+LABELLED = LabelledPoints(
+    np.array([2, 5], np.int32),
+    np.array([[1.0, 0, 0], [2, 0.3, 0.5]], np.float32),
+    np.array([FLOOR, OBSTACLE], np.uint8),
+    np.ones(2, np.float32),
+)
+SCAN = FloorScan(-0.5, 0.25, np.array([1.5, 1.5, 1.5, 1.5, 1.5], np.float32))
+
+
+def cloud_messages(stamp_ns: int) -> dict[str, Any]:
+    """Return what `cloud_labelling` needs of one keyframe."""
+    return {
+        'map_points': sparse_cloud_message(stamp_ns, 'map', POINTS),
+        'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
+        'keyframe/floor_mask': image_message(stamp_ns, 'left', MASK),
+    }
+
+
+def grid_messages(stamp_ns: int) -> dict[str, Any]:
+    """Return what `occupancy_grid` needs of one keyframe, the first one of a map."""
+    path = KeyframePath(np.array([stamp_ns]), np.eye(4)[None])
+    return {
+        'labelled_points': labelled_message(stamp_ns, 'map', LABELLED),
+        'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
+        'keyframe/path': path_message(stamp_ns, 'map', path),
+        'keyframe/odometry': pose_message_at(stamp_ns),
+        'keyframe/floor_scan': scan_message(stamp_ns, 'base_link', SCAN),
+    }
+
+
+def pose_message_at(stamp_ns: int) -> Any:
+    """Return the pose of a keyframe at the origin of the map."""
+    return odometry_message(stamp_ns, 'map', 'base_link', np.eye(4), np.zeros((6, 6)))
+
+
+def publish(graph, messages: dict[str, Any], publishers: dict[str, Any] | None = None):
+    """Send messages by topic once all topics have listeners; returns the publishers by topic."""
+    publishers = {} if publishers is None else publishers
+    for name in messages.keys() - publishers.keys():
+        publishers[name] = graph.publisher(name)
+    graph.connected([publishers[name] for name in messages])
+    for name, message in messages.items():
+        publishers[name].publish(message)
+    return publishers
