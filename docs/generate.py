@@ -46,22 +46,42 @@ Builds the occupancy grid from the labelled points, the rays to floor points and
 follows every later correction of the keyframes.""",
 }
 
+PAUSE, RESET = ('`~/pause`', '`std_srvs/srv/SetBool`'), ('`~/reset`', '`std_srvs/srv/Trigger`')
+PAUSING = 'Pause (true): receive and process nothing, keep the map. Go on (false).'
+NEW_MAP = 'Drop what is kept of the map and begin anew with the next keyframe.'
+
 SERVICES = {
     CAMERA: [
-        (
-            '`~/pause`',
-            '`std_srvs/srv/SetBool`',
-            'Pause (true) or go on (false) with the recording.',
-        )
+        (*PAUSE, 'Pause (true) or go on (false) with the recording.'),
+        (*RESET, 'Begin with the first frame again.'),
     ],
+    SLAM: [
+        (*PAUSE, PAUSING),
+        (
+            *RESET,
+            'Begin a new map. The nodes behind it see it by the path of the keyframes and drop '
+            'theirs. The same happens when the stamps of the images go back by more than half a '
+            'second, as when a recording begins again.',
+        ),
+    ],
+    FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
+    CLOUD: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
     GRID: [
+        (*PAUSE, PAUSING),
+        (*RESET, NEW_MAP),
         (
             '`save_map`',
             '`std_srvs/srv/Trigger`',
             'Write the map to `map_file` in the format of Nav2’s map_server.',
-        )
+        ),
     ],
 }
+
+MANAGED = """\
+The node is managed: `ros2 lifecycle set` and lifecycle managers configure, activate, deactivate and
+clean it up. By default it does the first two itself (`autostart`). Deactivated it keeps its map and
+receives nothing; cleaned up it has no topics and no map. It makes no bond: give Nav2's lifecycle
+manager `bond_timeout: 0.0`."""
 
 STATUS = {
     CAMERA: 'One status per pair sent (`frame_index`), and `stereo_camera: recording` at its end '
@@ -90,8 +110,8 @@ def page(node: str) -> str:
         _topics([*published_by(node), DIAGNOSTICS]),
         STATUS[node] + ' Once a second `connections` tells the subscribers of each topic.',
     ]
-    if node in SERVICES:
-        sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
+    sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
+    sections += [MANAGED]
     sections += ['## Parameters', _parameters(stage)]
     if own:
         sections += ['Only the node has these; `segfloor run` passes over them:', _parameters(own)]

@@ -41,6 +41,12 @@ class Graph:
         self._executor.add_node(node)
         return node
 
+    def remove(self, node: Node) -> None:
+        """End a node."""
+        self._nodes.remove(node)
+        self._executor.remove_node(node)
+        node.destroy_node()
+
     def collect(self, name: str) -> list[Any]:
         """Subscribe to a topic; the list grows with its messages."""
         topic, received = TOPICS[name], []

@@ -42,6 +42,16 @@ def eye_calibration(message: CameraInfo, topic: str) -> EyeCalibration:
     )
 
 
+def same_calibration(a: CameraInfo, b: CameraInfo) -> bool:
+    """Return whether two messages hold the same calibration."""
+    sizes = ((a.width, a.height), (b.width, b.height))
+    return (
+        sizes[0] == sizes[1]
+        and a.distortion_model == b.distortion_model
+        and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ('d', 'k', 'r', 'p'))
+    )
+
+
 def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
     """Return the calibration of rectified images of a camera."""
     P = np.zeros((3, 4))

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+MAX_DISORDER_NS = 500_000_000
+"""A stamp older than the latest by no more is a late message; by more, a recording has begun
+again.
+"""
 
 
 @dataclass(frozen=True)
@@ -21,13 +26,21 @@ class StampJoiner:
 
     Every topic delivers in order, so once a set is complete, the sets that were begun before it
     cannot be completed any more: they are dropped and what they lacked is kept for the report. At
-    most `capacity` sets wait. A stamp that was handed out recently is not taken again, and a jump
-    back in time starts new sets like any other stamp. With a tolerance, stamps that differ by no
-    more are one set.
+    most `capacity` sets wait. A stamp that was handed out recently is not taken again, unless time
+    has jumped back meanwhile. With a tolerance, stamps that differ by no more are one set.
+    optional: parts that a set waits for only while the function says that they may come.
     """
 
-    def __init__(self, parts: Sequence[str], capacity: int = 100, tolerance_ns: int = 0) -> None:
+    def __init__(
+        self,
+        parts: Sequence[str],
+        capacity: int = 100,
+        tolerance_ns: int = 0,
+        optional: Mapping[str, Callable[[], bool]] | None = None,
+    ) -> None:
         self._parts = tuple(parts)
+        self._optional = dict(optional or {})
+        self._latest: dict[str, int] = {}
         self._capacity = capacity
         self._tolerance_ns = tolerance_ns
         self._waiting: OrderedDict[int, dict[str, Any]] = OrderedDict()
@@ -36,12 +49,13 @@ class StampJoiner:
 
     def add(self, part: str, stamp_ns: int, value: Any) -> dict[str, Any] | None:
         """Take in one part; returns the values by part when its set is complete with it."""
+        self._note_time(part, stamp_ns)
         key = self._set_for(part, stamp_ns)
         if key is None:
             return None
         parts = self._waiting.setdefault(key, {})
         parts[part] = value
-        if len(parts) == len(self._parts):
+        if not self._missing(parts):
             return self._complete(key)
         if len(self._waiting) > self._capacity:
             self._drop(next(iter(self._waiting)))
@@ -54,7 +68,7 @@ class StampJoiner:
 
     def waiting_for(self) -> tuple[str, ...]:
         """Return the parts that every waiting set lacks; () when nothing waits."""
-        lacking = [set(self._parts) - parts.keys() for parts in self._waiting.values()]
+        lacking = [set(self._missing(parts)) for parts in self._waiting.values()]
         if not lacking:
             return ()
         everywhere = set.intersection(*lacking)
@@ -65,6 +79,18 @@ class StampJoiner:
         self._waiting.clear()
         self._done.clear()
         self._dropped.clear()
+        self._latest.clear()
+
+    def _note_time(self, part: str, stamp_ns: int) -> None:
+        latest_ns = self._latest.get(part, stamp_ns)
+        if stamp_ns < latest_ns - MAX_DISORDER_NS:
+            self._done.clear()
+            self._latest.clear()
+        self._latest[part] = max(stamp_ns, self._latest.get(part, stamp_ns))
+
+    def _missing(self, parts: Mapping[str, Any]) -> tuple[str, ...]:
+        needed = (*self._parts, *(part for part, may_come in self._optional.items() if may_come()))
+        return tuple(part for part in needed if part not in parts)
 
     def _set_for(self, part: str, stamp_ns: int) -> int | None:
         if self._near(self._done, stamp_ns) is not None:
@@ -92,6 +118,5 @@ class StampJoiner:
         return self._waiting.pop(key)
 
     def _drop(self, key: int) -> None:
-        parts = self._waiting.pop(key)
-        missing = tuple(part for part in self._parts if part not in parts)
-        self._dropped.append(Dropped(key, missing))
+        parts, known = self._waiting.pop(key), (*self._parts, *self._optional)
+        self._dropped.append(Dropped(key, tuple(part for part in known if part not in parts)))

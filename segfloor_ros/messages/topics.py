@@ -116,8 +116,9 @@ _ALL = [
         Path,
         qos.KEYFRAMES,
         SLAM,
-        (GRID,),
-        'base_link in map of all keyframes as now optimised; each pose with its own stamp.',
+        (FLOOR, CLOUD, GRID),
+        'base_link in map of all keyframes as now optimised; each pose with its own stamp. Where '
+        'earlier keyframes are missing, a new map has begun.',
     ),
     Topic(
         'map_points',

@@ -13,6 +13,7 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.messages.camera_info import eye_calibration
 from segfloor_ros.messages.floor import disparity_message, scan_message
+from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
@@ -33,6 +34,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
     def set_up(self) -> None:
         """Make the topics."""
         self._mount: Mount | None = None
+        self._mount_stamp_ns = 0
         self._base_frame = ''
         self._disparity = self.output('keyframe/disparity')
         self._mask = self.output('keyframe/floor_mask')
@@ -46,12 +48,18 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._stage: FloorSegmentation | None = None
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
+    def on_new_map(self, first_stamp_ns: int) -> None:
+        """Wait for the mount that belongs to the map, unless it is here already."""
+        if self._mount_stamp_ns != first_stamp_ns:
+            self._mount = None
+
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings."""
         self._stage = None
 
     def _take_mount(self, message: TransformStamped) -> None:
         self._mount = Mount.from_transform(transform_array(message))
+        self._mount_stamp_ns = to_ns(message.header.stamp)
         self._base_frame = message.header.frame_id
         waiting, self._waiting = self._waiting, []
         for stamp_ns, parts in waiting:

@@ -12,6 +12,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
@@ -33,6 +34,7 @@ class ManagedNode(LifecycleNode):
         self._openers: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = []
         self._open: list[tuple[Any, Callable[[Any], Any]]] = []
         self._kept: list[tuple[Any, Callable[[Any], Any]]] = []
+        self._heard: dict[str, Subscription] = {}
         self._is_set_up = self._is_active = self._is_paused = False
         self._fault: Exception | None = None
         self._answer_impossible_transitions()
@@ -47,7 +49,7 @@ class ManagedNode(LifecycleNode):
         raise NotImplementedError
 
     def start_anew(self) -> None:
-        """Begin with an empty map, first of all after `set_up`."""
+        """Begin with an empty map, first of all after `set_up`. The topics stay."""
         raise NotImplementedError
 
     def forget(self) -> None:
@@ -65,6 +67,17 @@ class ManagedNode(LifecycleNode):
             if step() != DONE:
                 assert self._fault is not None
                 raise self._fault
+
+    def reset(self) -> None:
+        """Drop the map and whatever waits, because somebody asked for it."""
+        self.begin_anew('asked to by ~/reset')
+
+    def begin_anew(self, reason: str) -> None:
+        """Drop the map and begin anew, with one line in the log. What waits to be processed is of
+        the new map already.
+        """
+        self.get_logger().info(f'begins anew: {reason}')
+        self.start_anew()
 
     def pause(self, paused: bool) -> None:
         """Close the inputs until further notice, or open them again."""
@@ -89,15 +102,24 @@ class ManagedNode(LifecycleNode):
         self._kept.append((self.create_service(kind, name, answer), self.destroy_service))
 
     def subscribe_while_open(
-        self, kind: Any, name: str, callback: Callable[[Any], None], profile: QoSProfile
+        self,
+        kind: Any,
+        name: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile,
+        raw: bool = False,
     ) -> None:
-        """Subscribe to a topic while the inputs are open."""
-        self._openers.append(
-            (
-                lambda: self.create_subscription(kind, name, callback, profile),
-                self.destroy_subscription,
-            )
-        )
+        """Subscribe to a topic while the inputs are open. raw: take the serialized messages."""
+
+        def subscribe() -> Subscription:
+            self._heard[name] = self.create_subscription(kind, name, callback, profile, raw=raw)
+            return self._heard[name]
+
+        self._openers.append((subscribe, self.destroy_subscription))
+
+    def is_published(self, name: str) -> bool:
+        """Whether anybody publishes a topic that the node listens to now."""
+        return name in self._heard and self._heard[name].get_publisher_count() > 0
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""
@@ -178,6 +200,7 @@ class ManagedNode(LifecycleNode):
             while self._open:
                 entity, destroy = self._open.pop()
                 destroy(entity)
+            self._heard.clear()
             self.on_inputs_closed()
 
     def _answer_pause(
@@ -190,7 +213,7 @@ class ManagedNode(LifecycleNode):
     def _answer_reset(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        response.success = self._try(self.start_anew) == DONE
+        response.success = self._try(self.reset) == DONE
         response.message = 'begun anew' if response.success else str(self._fault)
         return response
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path as FilePath
 from typing import Any
 
+from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
@@ -19,9 +21,9 @@ from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
-from segfloor_ros.nodes.stage_node import StageNode, run_node
+from segfloor_ros.nodes.stage_node import PATH, StageNode, run_node
 
-POINTS, FEATURES, PATH = 'labelled_points', 'keyframe/features', 'keyframe/path'
+POINTS, FEATURES = 'labelled_points', 'keyframe/features'
 POSE, SCAN = 'keyframe/odometry', 'keyframe/floor_scan'
 
 
@@ -68,7 +70,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
     def _update(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         points = labelled_arrays(parts[POINTS], POINTS)
         features = features_arrays(parts[FEATURES], FEATURES)
-        path = path_arrays(parts[PATH])
+        path = path_arrays(deserialize_message(parts[PATH], Path))
         scan = scan_arrays(parts[SCAN], SCAN)
         self._stage.update(stamp_ns, points, features, path, scan)
         self._stamp_ns, self._frame_id = stamp_ns, parts[POSE].header.frame_id
@@ -93,7 +95,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         self._map.publish(grid_message(self._stamp_ns, self._frame_id, self._stage.grid()))
 
     def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        path = Path(self.parameters.own.map_file).expanduser().absolute()
+        path = FilePath(self.parameters.own.map_file).expanduser().absolute()
         if not self._frame_id:
             response.message = 'there is no map yet: no keyframe has arrived'
             return response

@@ -44,6 +44,10 @@ class SlamOutputs:
         self._map_points = node.output('map_points')
         self._last: FrameResult | None = None
 
+    def start_anew(self) -> None:
+        """Forget the frame before; velocities are not known across a reset."""
+        self._last = None
+
     def publish_mount(self, stamp_ns: int, frames: CameraFrames, mount: Mount) -> None:
         """Publish where the left camera sits on the base."""
         base = self._own.base_frame

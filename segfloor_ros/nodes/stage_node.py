@@ -7,7 +7,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -22,6 +21,7 @@ from segfloor_ros.memory import rss_mb
 from segfloor_ros.messages.diagnostics import CONNECTIONS, Level, Status, status_message
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.node_settings import NodeSettings
 from segfloor_ros.nodes.managed_node import ManagedNode
@@ -33,7 +33,7 @@ Own = TypeVar('Own', bound=NodeSettings)
 
 CONNECTION_CHECK_S = 0.1
 HEARTBEAT_S = 1.0
-MAX_WAITING_SETS = 100
+PATH = 'keyframe/path'
 REPEAT_FAULT_S = 5.0
 
 
@@ -54,9 +54,11 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         )
         self._outputs: dict[str, Publisher] = {}
         self._joiners: list[StampJoiner] = []
+        self._life = MapLife()
         self._connections: dict[str, str] = {}
         self._last_heartbeat_s = 0.0
         self._faults: dict[str, float] = {}
+        self._said: dict[str, float] = {}
         self.create_timer(CONNECTION_CHECK_S, self._report_connections)
         if self.parameters.own.autostart:
             self.start()
@@ -69,10 +71,18 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         for joiner in self._joiners:
             joiner.clear()
 
+    def reset(self) -> None:
+        """Drop the map, and all that waits."""
+        for joiner in self._joiners:
+            joiner.clear()
+        self._life = MapLife()
+        super().reset()
+
     def forget(self) -> None:
         """Give up what waits; the outputs go with the topics."""
         self._joiners.clear()
         self._outputs.clear()
+        self._life = MapLife()
 
     def output(self, name: str) -> Publisher:
         """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
@@ -81,10 +91,14 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         return self._outputs[name]
 
     def listen(
-        self, name: str, callback: Callable[[Any], None], profile: QoSProfile | None = None
+        self,
+        name: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile | None = None,
+        raw: bool = False,
     ) -> None:
         """Subscribe to a topic of `TOPICS` while the node is active; faults in the callback are
-        logged with the topic's name.
+        logged with the topic's name. raw: hand on the serialized message.
         """
         topic = TOPICS[name]
 
@@ -94,31 +108,45 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
             except Exception as error:
                 self.say_fault(name, error)
 
-        self.subscribe_while_open(topic.type, name, guarded, profile or topic.profile)
+        self.subscribe_while_open(topic.type, name, guarded, profile or topic.profile, raw)
 
-    def joiner(
-        self, parts: Sequence[str], capacity: int = MAX_WAITING_SETS, tolerance_ns: int = 0
-    ) -> StampJoiner:
+    def joiner(self, parts: Sequence[str], **limits: Any) -> StampJoiner:
         """Return a joiner that is emptied when the inputs close."""
-        self._joiners.append(StampJoiner(parts, capacity, tolerance_ns))
+        self._joiners.append(StampJoiner(parts, **limits))
         return self._joiners[-1]
 
     def join(self, parts: Sequence[str], process: Callable[[int, dict[str, Any]], None]) -> None:
-        """Subscribe to topics whose messages belong together; `process` gets the stamp and the
-        messages by topic once all with one stamp have arrived. Those that remain alone are
-        reported.
+        """Subscribe to topics whose messages belong to one keyframe; `process` gets the stamp and
+        the messages by topic once all with one stamp have arrived. Those that remain alone are
+        reported. Where SLAM publishes `keyframe/path`, it tells when a new map begins: the node
+        then begins anew. The path is handed on serialized.
         """
-        joiner = self.joiner(parts)
+        joiner = self.joiner(parts, optional={PATH: lambda: self.is_published(PATH)})
 
-        def take(part: str, message: Any) -> None:
-            stamp_ns = to_ns(message.header.stamp)
+        def take(part: str, stamp_ns: int, message: Any) -> None:
             complete = joiner.add(part, stamp_ns, message)
             self.say_dropped(joiner)
-            if complete is not None:
-                process(stamp_ns, complete)
+            if complete is None:
+                return
+            if PATH in complete:
+                self._follow_life(path_head(complete[PATH], PATH))
+            process(stamp_ns, complete)
+
+        def listen(part: str) -> None:
+            self.listen(part, lambda message: take(part, to_ns(message.header.stamp), message))
 
         for part in parts:
-            self.listen(part, partial(take, part))
+            if part != PATH:
+                listen(part)
+        self.listen(PATH, lambda data: take(PATH, path_head(data, PATH).stamp_ns, data), raw=True)
+
+    def on_new_map(self, first_stamp_ns: int) -> None:
+        """Note that SLAM's map now begins at this stamp."""
+
+    def _follow_life(self, head: PathHead) -> None:
+        if self._life.is_new(head):
+            self.begin_anew('stereo_slam has begun a new map')
+            self.on_new_map(head.first_stamp_ns)
 
     def work(self, stamp_ns: int, step: Callable[[], Mapping[str, Any]]) -> None:
         """Run the stage's step for one stamp and report how it went, with the values it returns."""
@@ -164,6 +192,14 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         self.get_logger().error(f'{where}: {text}')
         if not isinstance(error, SegfloorError):
             self.get_logger().debug(''.join(traceback.format_exception(error)))
+
+    def say(self, text: str) -> None:
+        """Warn, at most every few seconds of the same."""
+        now_s = time.monotonic()
+        self._said = {t: s for t, s in self._said.items() if now_s - s < REPEAT_FAULT_S}
+        if text not in self._said:
+            self._said[text] = now_s
+            self.get_logger().warning(text)
 
     def say_waiting(self, what: str) -> None:
         """Warn that something does not arrive, unless it comes at once."""

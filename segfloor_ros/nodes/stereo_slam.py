@@ -14,10 +14,11 @@ from segfloor_ros.camera.images import EightBitScale
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.camera.rectification import StereoRectifier
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import eye_calibration
+from segfloor_ros.messages.camera_info import eye_calibration, same_calibration
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey_image
+from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
@@ -42,14 +43,19 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         own = self.parameters.own
         self._outputs_of_slam = SlamOutputs(self, own)
         self._transforms = Transforms(self, own)
+        self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
         self._left, self._right = self._subscribe(own)
         tolerance_ns = round(own.sync_tolerance_s * 1e9)
-        self._pairs = self.joiner((self._left, self._right), MAX_WAITING_PAIRS, tolerance_ns)
+        self._pairs = self.joiner(
+            (self._left, self._right), capacity=MAX_WAITING_PAIRS, tolerance_ns=tolerance_ns
+        )
 
     def start_anew(self) -> None:
         """Begin with an empty map; the mount of the camera is found again, too."""
         self._end_stage()
+        self._outputs_of_slam.start_anew()
+        self._last_stamp_ns: int | None = None
         self._calibration: StereoCalibration | None = None
         self._frames = CameraFrames('', '')
         self._rectifier: StereoRectifier | None = None
@@ -85,9 +91,12 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         return left, right
 
     def _take_info(self, topic: str, message: CameraInfo) -> None:
-        if topic in self._eyes:
+        if topic in self._infos and same_calibration(message, self._infos[topic]):
             return
         self._eyes[topic] = eye_calibration(message, topic)
+        self._infos[topic] = message
+        if self._slam is not None:
+            self.say(f'{topic}: the calibration is not the one in use; ~/reset takes it over')
         waiting, self._waiting = self._waiting, []
         for pair in waiting:
             self._take_pair(pair)
@@ -105,6 +114,9 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self.say_waiting('left/camera_info and right/camera_info')
             return
         stamp_ns = to_ns(pair[self._left].header.stamp)
+        if not self._is_in_order(stamp_ns):
+            self.report(stamp_ns, Level.ERROR, 'older than the pair before it; dropped')
+            return
         start = time.perf_counter()
         try:
             results = self._process(stamp_ns, pair)
@@ -123,6 +135,19 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
                 processing_ms=f'{milliseconds:.3f}',
             )
 
+    def _is_in_order(self, stamp_ns: int) -> bool:
+        """Whether a pair comes after the one before; where time has jumped back, e.g. because a
+        recording begins again, the map is begun anew.
+        """
+        last_ns = self._last_stamp_ns
+        if last_ns is not None and stamp_ns < last_ns - MAX_DISORDER_NS:
+            jump_s = 1e-9 * (last_ns - stamp_ns)
+            self.begin_anew(f'the stamps of the images went back by {jump_s:.3f} s')
+        elif last_ns is not None and stamp_ns <= last_ns:
+            return False
+        self._last_stamp_ns = stamp_ns
+        return True
+
     def _process(self, stamp_ns: int, pair: dict[str, Any]) -> list[FrameResult]:
         if self._slam is None:
             self._start(pair)
@@ -131,10 +156,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         left, right = self._rectifier.rectify(*self._eight_bit(*images))
         frame = StereoFrame(self._frame_count, stamp_ns, left, right)
         self._frame_count += 1
-        results = self._slam.process(frame)
-        if self._mount is None and self._slam.mount is not None:
-            self._announce_mount(results[0].stamp_ns if results else stamp_ns, self._slam.mount)
-        return results
+        return self._slam.process(frame)
 
     def _start(self, pair: dict[str, Any]) -> None:
         """Build the stage, now that the calibration is known."""
@@ -166,7 +188,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._transforms.broadcast_mount(stamp_ns, self._frames.left, mount)
 
     def _publish(self, result: FrameResult, milliseconds: float) -> None:
-        assert self._calibration is not None
+        assert self._calibration is not None and self._slam is not None
+        if self._mount is None and result.keyframe is not None and self._slam.mount is not None:
+            # Its stamp tells which map it belongs to.
+            self._announce_mount(int(result.keyframe.path.stamp_ns[0]), self._slam.mount)
         self._outputs_of_slam.publish(result, self._calibration, self._frames)
         if result.tracked:
             self._transforms.broadcast(result)

@@ -1,0 +1,179 @@
+"""A map begun anew: by service, by a recording that begins again, by SLAM started again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from node_messages import cloud_messages, publish
+from rclpy.serialization import serialize_message
+from std_srvs.srv import Trigger
+from stereo_drive import room_drive, write_kitti
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
+from segfloor_ros.messages.clouds import labelled_arrays
+from segfloor_ros.messages.grids import grid_arrays
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
+from segfloor_ros.messages.poses import path_message
+from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.slam.results import KeyframePath
+
+S = 1_000_000_000
+FRAMES, MIDDLE = 12, 6
+CALIBRATION = rectified_calibration(CAMERA)
+BEHIND_SLAM = (FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
+
+
+class Chain:
+    """The four nodes behind the camera, fed frame by frame."""
+
+    def __init__(self, make_graph) -> None:
+        self.graph = make_graph(
+            '-p', 'background:=false', '-p', 'publish_period_s:=0.0',
+            '-p', f'camera_height_m:={MOUNT.height_m}', '-p', 'camera_roll_rad:=0.0',
+            '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+        )  # fmt: skip
+        self._maps = self.graph.collect('map')
+        self._labelled = self.graph.collect('labelled_points')
+        for make in BEHIND_SLAM:
+            self.graph.add(make())
+        self.start_slam()
+        names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
+        self._inputs = {name: self.graph.publisher(name) for name in names}
+        self.connect()
+
+    def start_slam(self) -> None:
+        self.slam = self.graph.add(StereoSlamNode())
+
+    def connect(self) -> None:
+        self.graph.connected(list(self._inputs.values()))
+        self.graph.statuses.clear()
+        self.graph.until(self._connected, 'the connections of all nodes')
+
+    def send(self, frames) -> list[Any]:
+        """Send frames, each once the one before is answered; returns the answers."""
+        self.graph.statuses.clear()
+        for done, frame in enumerate(frames, start=1):
+            for side in ('left', 'right'):
+                info = camera_info_message(frame.stamp_ns, side, getattr(CALIBRATION, side))
+                self._inputs[f'{side}/camera_info'].publish(info)
+                image = image_message(frame.stamp_ns, side, getattr(frame, side))
+                self._inputs[f'{side}/image_raw'].publish(image)
+            self.graph.until(
+                lambda done=done: len(self.graph.reports('stereo_slam')) == done, 'the answer'
+            )
+        return self.graph.reports('stereo_slam')
+
+    def drive(self, frames) -> tuple[Any, Any]:
+        """Send frames; returns the map and the labelled points of the last keyframe."""
+        keyframes = [s.stamp_ns for s in self.send(frames) if s.values['keyframe'] == '1']
+        assert len(keyframes) > 1
+        for messages in (self._maps, self._labelled):
+            self.graph.until(
+                lambda messages=messages: (
+                    messages and to_ns(messages[-1].header.stamp) == keyframes[-1]
+                ),
+                'the results of the last keyframe',
+            )
+        return grid_arrays(self._maps[-1], ''), labelled_arrays(self._labelled[-1], '')
+
+    def _connected(self) -> bool:
+        counts = {s.node: s.values for s in self.graph.statuses if s.kind == 'connections'}
+        found = {name: int(n) for values in counts.values() for name, n in values.items()}
+        return len(counts) == 4 and all(
+            found.get(topic.name, 0) >= len(topic.subscribers)
+            for topic in TOPICS.values()
+            if topic.publisher not in ('', 'stereo_camera')
+        )
+
+
+def assert_same(found, expected) -> None:
+    np.testing.assert_array_equal(found[0].cells, expected[0].cells)
+    assert found[0].origin_xy_m == expected[0].origin_xy_m
+    for name in ('point_id', 'xyz_map', 'label', 'confidence'):
+        np.testing.assert_array_equal(getattr(found[1], name), getattr(expected[1], name))
+
+
+def test_a_recording_that_begins_again_gives_the_map_of_a_fresh_run(make_graph) -> None:
+    frames, _ = room_drive(FRAMES)
+    chain = Chain(make_graph)
+    first = chain.drive(frames)
+    assert_same(chain.drive(frames), first)
+
+
+@pytest.mark.parametrize('how', ['service', 'killed'])
+def test_slam_begun_anew_in_mid_drive_takes_all_nodes_along(make_graph, how) -> None:
+    """Keyframes before and after do not mix: the result is that of the second half alone."""
+    frames, _ = room_drive(FRAMES)
+    chain = Chain(make_graph)
+    chain.drive(frames[:MIDDLE])
+    if how == 'service':
+        assert chain.graph.call(Trigger, 'stereo_slam/reset', Trigger.Request()).success
+    else:
+        chain.graph.remove(chain.slam)
+        chain.start_slam()
+        chain.connect()
+    after = chain.drive(frames[MIDDLE:])
+    chain.graph.close()
+    assert_same(after, Chain(make_graph).drive(frames[MIDDLE:]))
+
+
+def test_a_late_pair_is_dropped_and_does_not_begin_anew(make_graph) -> None:
+    frames, _ = room_drive(4)
+    chain = Chain(make_graph)
+    chain.send([frames[0], frames[1], frames[3]])
+    (late,) = chain.send([frames[2]])
+    assert 'older than the pair before it' in late.message
+
+
+def test_the_camera_reset_plays_from_the_first_frame(make_graph, tmp_path) -> None:
+    frames, _ = room_drive(3)
+    drive = write_kitti(tmp_path / 'drive', frames)
+    graph = make_graph('-p', f'input:={drive}', '-p', 'rate:=50.0')
+    received = graph.collect('left/image_raw')
+    for name in ('right/image_raw', 'left/camera_info', 'right/camera_info'):
+        graph.collect(name)
+    graph.add(StereoCameraNode())
+    graph.until(lambda: len(received) == 3, 'the recording')
+    assert graph.call(Trigger, 'stereo_camera/reset', Trigger.Request()).success
+    graph.until(lambda: len(received) == 6, 'the recording again')
+    stamps = [to_ns(message.header.stamp) for message in received]
+    assert stamps == [frame.stamp_ns for frame in frames] * 2
+
+
+def test_a_reset_node_forgets_and_goes_on(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    publishers = publish(graph, cloud_messages(1 * S))
+    graph.until(lambda: len(labelled) == 1, 'the first keyframe')
+    assert graph.call(Trigger, 'cloud_labelling/reset', Trigger.Request()).success
+    publish(graph, cloud_messages(2 * S), publishers)
+    graph.until(lambda: len(labelled) == 2, 'the second keyframe')
+    first, second = (labelled_arrays(message, '').confidence for message in labelled)
+    np.testing.assert_array_equal(first, second)
+
+
+def test_the_head_of_a_path_is_read_from_its_bytes() -> None:
+    for frame_id in ('', 'm', 'ma', 'map', 'maps'):
+        for stamps in ([], [5 * S + 7], [5 * S + 7, 6 * S]):
+            path = KeyframePath(np.array(stamps, np.int64), np.tile(np.eye(4), (len(stamps), 1, 1)))
+            data = serialize_message(path_message(9 * S + 1, frame_id, path))
+            head = PathHead(9 * S + 1, len(stamps), stamps[0] if stamps else 0)
+            assert path_head(data, 'path') == head
+
+
+def test_a_path_that_grows_is_of_the_same_map() -> None:
+    life = MapLife()
+    heads = [(1, 1, 1), (2, 2, 1), (4, 4, 1), (5, 1, 5), (6, 2, 5), (1, 1, 1), (1, 1, 1)]
+    found = [life.is_new(PathHead(*head)) for head in heads]
+    assert found == [False, False, False, True, False, True, True]
