@@ -105,9 +105,10 @@ def page(node: str) -> str:
         f'# {node}',
         PURPOSE[node],
         '## Subscribes to',
-        _topics(subscribed_by(node)) or 'Nothing (at rate 0 or lossless: `/diagnostics`).',
+        _topics(subscribed_by(node, alternatives=True))
+        or 'Nothing (at rate 0 or lossless: `/diagnostics`).',
         '## Publishes',
-        _topics([*published_by(node), DIAGNOSTICS]),
+        _topics([*published_by(node, alternatives=True), DIAGNOSTICS]),
         STATUS[node] + ' Once a second `connections` tells the subscribers of each topic.',
     ]
     sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]

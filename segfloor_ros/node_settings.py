@@ -18,6 +18,14 @@ class NodeSettings(StageSettings):
         True,
         'Configure and activate at the start; off: wait for a lifecycle manager.',
     )
+    resume_within_s: float = setting(
+        30.0,
+        'A node that was killed goes on with what it knew if it is started again within this time; '
+        '0: it begins anew.',
+        unit='s',
+        minimum=0.0,
+        maximum=3600.0,
+    )
 
     @classmethod
     def stage_name(cls) -> str:
@@ -38,6 +46,23 @@ class StereoCameraNodeSettings(NodeSettings):
     lossless: bool = setting(
         False,
         'Slow down rather than lose a frame when the nodes cannot follow; always so at rate 0.',
+    )
+    image_transport: str = setting(
+        'raw',
+        'Publish the images raw or compressed, the latter on left/image_raw/compressed and '
+        'right/image_raw/compressed, for links that raw images would fill.',
+        choices=('raw', 'compressed'),
+    )
+    compression: str = setting(
+        'jpeg',
+        'How images are compressed: jpeg, small, or png, without loss.',
+        choices=('jpeg', 'png'),
+    )
+    jpeg_quality: int = setting(
+        90,
+        'Quality of the JPEG images; above 90 they grow much faster than they improve.',
+        minimum=1,
+        maximum=100,
     )
     start_paused: bool = setting(False, 'Wait for the service ~/pause before the first frame.')
     left_frame: str = setting('left_camera_optical_frame', 'Optical frame of the left camera.')
@@ -69,6 +94,12 @@ class StereoSlamNodeSettings(NodeSettings):
     )
     rectified_input: bool = setting(
         False, 'Take left/image_rect and right/image_rect instead of the raw images.'
+    )
+    image_transport: str = setting(
+        'raw',
+        'Subscribe to raw or to compressed images, the latter on the topics with /compressed '
+        'behind their names.',
+        choices=('raw', 'compressed'),
     )
     image_reliability: str = setting(
         'reliable',

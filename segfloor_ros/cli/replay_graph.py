@@ -60,7 +60,8 @@ def unconnected(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
         if node not in counts:
             missing.append(f'{node} (no sign of life)')
             continue
-        needed = {topic.name: _listeners_of(topic.name) for topic in published_by(node)}
+        topics = [topic.name for topic in published_by(node)]
+        needed = {topic: _listeners_of(topic) for topic in topics}
         needed[DIAGNOSTICS.name] = STATUS_LISTENERS
         missing += [
             f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'

@@ -96,9 +96,16 @@ class ReplaySession:
         nodes have (frames, rates) comes from the user's file.
         """
         parameters = self._configuration.as_ros_parameters()
-        playing = {'rate': float(self._rate), 'lossless': True, 'start_paused': True}
+        playing = {
+            'rate': float(self._rate),
+            'lossless': True,
+            'start_paused': True,
+            'image_transport': 'raw',
+        }
         parameters[CAMERA]['ros__parameters'].update(playing)
-        parameters[SLAM]['ros__parameters'].update(background=False)
+        for node in NODES:
+            parameters[node]['ros__parameters'].update(resume_within_s=0.0)
+        parameters[SLAM]['ros__parameters'].update(background=False, image_transport='raw')
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))

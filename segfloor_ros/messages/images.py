@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import array
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
-from segfloor_ros.camera.images import Grey, decode_raw
+from segfloor_ros.camera.images import Grey, decode_compressed, decode_raw
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
@@ -38,12 +39,31 @@ def image_message(
     )
 
 
-def grey_image(message: Image, topic: str) -> Grey:
+def compressed_message(
+    stamp_ns: int, frame_id: str, image: NDArray[np.generic], jpeg_quality: int | None
+) -> CompressedImage:
+    """Return a grey image (H, W) as a message as image_transport makes it: JPEG of a quality of
+    1 to 100, or PNG, without loss, where that is None or the image has 16 bits.
+    """
+    kind = 'png' if jpeg_quality is None or image.dtype == np.uint16 else 'jpeg'
+    options = [] if kind == 'png' else [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality or 0)]
+    _, data = cv2.imencode(f'.{kind}', np.ascontiguousarray(image), options)
+    encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
+    return CompressedImage(
+        header=make_header(stamp_ns, frame_id),
+        format=f'{encoding}; {kind} compressed {encoding}',
+        data=array.array('B', data.tobytes()),
+    )
+
+
+def grey_image(message: Image | CompressedImage, topic: str) -> Grey:
     """Return the grey image (H, W) of a message, uint8 or uint16; colour becomes grey.
 
-    Raises MessageError, naming the topic, for an encoding that is no picture or sizes that
-    contradict the data.
+    Raises MessageError, naming the topic, for an encoding that is no picture, sizes that
+    contradict the data, and damaged files.
     """
+    if isinstance(message, CompressedImage):
+        return _grey_of_file(message, topic)
     width, height = int(message.width), int(message.height)
     if width * height > MAX_PIXELS:
         raise MessageError(f'{topic}: an image of {width}x{height} pixels is not taken')
@@ -66,3 +86,14 @@ def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         raise MessageError(f'{topic}: {message.encoding} has 16 bits, expected mono8')
     return image.astype(np.uint8, copy=False)
+
+
+def _grey_of_file(message: CompressedImage, topic: str) -> Grey:
+    try:
+        image = decode_compressed(bytes(message.data))
+    except InputError as error:
+        raise MessageError(f'{topic}: {error}') from None
+    if image.size > MAX_PIXELS:
+        rows, columns = image.shape
+        raise MessageError(f'{topic}: an image of {columns}x{rows} pixels is not taken')
+    return image

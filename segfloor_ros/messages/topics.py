@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, Image, LaserScan, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan, PointCloud2
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.messages import qos
@@ -29,7 +29,9 @@ OTHERS = ''
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic. about: what its messages hold, with units and frames."""
+    """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
+    it replaces by parameter, where it does.
+    """
 
     name: str
     type: type[Any]
@@ -37,6 +39,7 @@ class Topic:
     publisher: str
     subscribers: tuple[str, ...]
     about: str
+    instead_of: str = ''
 
     @property
     def type_name(self) -> str:
@@ -47,20 +50,31 @@ class Topic:
 def _images() -> list[Topic]:
     topics = []
     for side in ('left', 'right'):
-        image, info = f'{side}/image_raw', f'{side}/camera_info'
+        raw, rectified, info = f'{side}/image_raw', f'{side}/image_rect', f'{side}/camera_info'
+        name = f'{side.capitalize()} image'
         topics += [
-            Topic(image, Image, qos.IMAGES, CAMERA, (SLAM,), f'{side.capitalize()} image, raw.'),
+            Topic(raw, Image, qos.IMAGES, CAMERA, (SLAM,), f'{name}, raw.'),
+            _compressed(raw, CAMERA, f'{name}, raw, as JPEG or PNG'),
             Topic(
-                f'{side}/image_rect',
+                rectified,
                 Image,
                 qos.IMAGES,
                 OTHERS,
                 (SLAM,),
-                f'{side.capitalize()} image, rectified; taken instead of {image} by parameter.',
+                f'{name}, rectified; taken instead of {raw} by parameter.',
+                instead_of=raw,
             ),
-            Topic(info, CameraInfo, qos.IMAGES, CAMERA, (SLAM,), f'Calibration for {image}.'),
+            _compressed(rectified, OTHERS, f'{name}, rectified, as JPEG or PNG'),
+            Topic(info, CameraInfo, qos.IMAGES, CAMERA, (SLAM,), f'Calibration for {raw}.'),
         ]
     return topics
+
+
+def _compressed(image: str, publisher: str, what: str) -> Topic:
+    """Return the topic of an image for thin links, named as image_transport does."""
+    about = f'{what}; instead of {image} by parameter.'
+    name = f'{image}/compressed'
+    return Topic(name, CompressedImage, qos.IMAGES, publisher, (SLAM,), about, instead_of=image)
 
 
 def _keyframe_images() -> list[Topic]:
@@ -201,11 +215,17 @@ DIAGNOSTICS = Topic(
 """Published by every node."""
 
 
-def published_by(node: str) -> list[Topic]:
-    """Return the topics of a node's publishers, without diagnostics."""
-    return [topic for topic in TOPICS.values() if topic.publisher == node]
+def published_by(node: str, alternatives: bool = False) -> list[Topic]:
+    """Return the topics of a node's publishers, without diagnostics; alternatives: also those that
+    replace others by parameter.
+    """
+    mine = [topic for topic in TOPICS.values() if topic.publisher == node]
+    return [topic for topic in mine if alternatives or not topic.instead_of]
 
 
-def subscribed_by(node: str) -> list[Topic]:
-    """Return the topics a node may subscribe to, without diagnostics."""
-    return [topic for topic in TOPICS.values() if node in topic.subscribers]
+def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
+    """Return the topics a node subscribes to, without diagnostics; alternatives: also those that
+    replace others by parameter.
+    """
+    mine = [topic for topic in TOPICS.values() if node in topic.subscribers]
+    return [topic for topic in mine if alternatives or not topic.instead_of]

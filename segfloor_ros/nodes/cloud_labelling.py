@@ -40,6 +40,12 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         """Begin without points."""
         self._stage = CloudLabelling(self.parameters.stage)
 
+    def resume(self, state: CloudLabelling) -> None:
+        """Go on with the labels of a killed node."""
+        self._stage = state
+        self._stage.settings = self.parameters.stage
+        self.get_logger().warning('going on with the labels of a node that was killed')
+
     def on_settings_changed(self) -> None:
         """Label the next keyframe with the new settings."""
         self._stage.settings = self.parameters.stage
@@ -57,6 +63,7 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         for label, output in self._by_label.items():
             if output.get_subscription_count():
                 output.publish(points_of_label(stamp_ns, frame_id, labelled, label))
+        self.keep(self._stage)
         return {'points': len(labelled.point_id)}
 
 

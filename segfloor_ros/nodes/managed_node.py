@@ -52,6 +52,9 @@ class ManagedNode(LifecycleNode):
         """Begin with an empty map, first of all after `set_up`. The topics stay."""
         raise NotImplementedError
 
+    def take_up(self) -> None:
+        """Go on, right after the first `start_anew`, with what a killed node has left."""
+
     def forget(self) -> None:
         """Drop the map and end what works on it."""
 
@@ -177,6 +180,7 @@ class ManagedNode(LifecycleNode):
             self._is_set_up = True
             self.set_up()
             self.start_anew()
+            self.take_up()
         except Exception:
             self._clean_up()
             raise

@@ -47,6 +47,13 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         self._frame_id = ''
         self._published_s = -float('inf')
 
+    def resume(self, state: tuple[OccupancyGridMapper, int, str]) -> None:
+        """Go on with the map of a killed node, and publish it at once."""
+        self._stage, self._stamp_ns, self._frame_id = state
+        self._stage.change_settings(self.parameters.stage)
+        self.get_logger().warning('going on with the map of a node that was killed')
+        self._publish()
+
     def forget(self) -> None:
         """Drop the map."""
         super().forget()
@@ -74,6 +81,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         scan = scan_arrays(parts[SCAN], SCAN)
         self._stage.update(stamp_ns, points, features, path, scan)
         self._stamp_ns, self._frame_id = stamp_ns, parts[POSE].header.frame_id
+        self.keep((self._stage, self._stamp_ns, self._frame_id))
         self._publish_soon()
         return {}
 

@@ -24,6 +24,7 @@ from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.node_settings import NodeSettings
+from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.parameters import NodeParameters
 from segfloor_ros.settings import StageSettings
@@ -55,6 +56,8 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         self._outputs: dict[str, Publisher] = {}
         self._joiners: list[StampJoiner] = []
         self._life = MapLife()
+        resume_within_s = self.parameters.own.resume_within_s
+        self._kept_state = KeptState(self.get_fully_qualified_name(), resume_within_s)
         self._connections: dict[str, str] = {}
         self._last_heartbeat_s = 0.0
         self._faults: dict[str, float] = {}
@@ -78,8 +81,28 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         self._life = MapLife()
         super().reset()
 
+    def begin_anew(self, reason: str) -> None:
+        """Drop the map, and what was kept of it."""
+        self._kept_state.remove()
+        super().begin_anew(reason)
+
+    def take_up(self) -> None:
+        """Go on with what a killed node of this name has left, where the node keeps something."""
+        kept = self._kept_state.take()
+        if kept is not None:
+            self._life, state = kept
+            self.resume(state)
+
+    def keep(self, state: Any, always: bool = False) -> None:
+        """Keep a state for `resume` of a later node, should this one be killed."""
+        self._kept_state.save((self._life, state), always)
+
+    def resume(self, state: Any) -> None:
+        """Go on with a state that a killed node has given to `keep`."""
+
     def forget(self) -> None:
         """Give up what waits; the outputs go with the topics."""
+        self._kept_state.remove()
         self._joiners.clear()
         self._outputs.clear()
         self._life = MapLife()

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 
+from segfloor_ros.camera.images import Grey
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level, Status, statuses
-from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.topics import CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
@@ -35,7 +37,9 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         own = self.parameters.own
         self._source: StereoSource = open_source(self.parameters.stage)
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
-        self._images = {side: self.output(f'{side}/image_raw') for side in self._frame_ids}
+        self._compressed = own.image_transport == 'compressed'
+        kind = 'image_raw/compressed' if self._compressed else 'image_raw'
+        self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
         if own.lossless or not own.rate:
             # Also while paused: frames are under way then, too.
@@ -116,9 +120,16 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))
-            self._images[side].publish(image_message(pair.stamp_ns, frame_id, image))
+            self._images[side].publish(self._image_message(pair.stamp_ns, frame_id, image))
         self._frames_sent += 1
         self.report(pair.stamp_ns, Level.OK, 'sent', frame_index=pair.index)
+
+    def _image_message(self, stamp_ns: int, frame_id: str, image: Grey) -> Any:
+        if not self._compressed:
+            return image_message(stamp_ns, frame_id, image)
+        own = self.parameters.own
+        quality = own.jpeg_quality if own.compression == 'jpeg' else None
+        return compressed_message(stamp_ns, frame_id, image, quality)
 
     def _finish(self, level: Level, message: str) -> None:
         self._finished = True

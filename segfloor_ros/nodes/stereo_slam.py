@@ -7,7 +7,7 @@ import time
 from functools import partial
 from typing import Any
 
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import EightBitScale
@@ -21,8 +21,10 @@ from segfloor_ros.messages.images import grey_image
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
+from segfloor_ros.nodes.slam_resumption import SlamResumption
 from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
 from segfloor_ros.nodes.transforms import Transforms
+from segfloor_ros.slam.continuation import LastState
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -56,6 +58,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._end_stage()
         self._outputs_of_slam.start_anew()
         self._last_stamp_ns: int | None = None
+        self._resumption = SlamResumption(self.keep)
         self._calibration: StereoCalibration | None = None
         self._frames = CameraFrames('', '')
         self._rectifier: StereoRectifier | None = None
@@ -64,6 +67,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._mount_from_tf = False
         self._frame_count = 0
         self._waiting: list[dict[str, Any]] = []
+
+    def resume(self, state: LastState) -> None:
+        """Go on with the map of a killed node once the images come."""
+        self._resumption = SlamResumption(self.keep, state)
 
     def forget(self) -> None:
         """Drop the map."""
@@ -82,6 +89,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
 
     def _subscribe(self, own: StereoSlamNodeSettings) -> tuple[str, str]:
         kind = 'image_rect' if own.rectified_input else 'image_raw'
+        kind += '/compressed' if own.image_transport == 'compressed' else ''
         left, right = f'left/{kind}', f'right/{kind}'
         profile = qos.images(own.image_reliability)
         for info in ('left/camera_info', 'right/camera_info'):
@@ -101,7 +109,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         for pair in waiting:
             self._take_pair(pair)
 
-    def _take_image(self, topic: str, message: Image) -> None:
+    def _take_image(self, topic: str, message: Image | CompressedImage) -> None:
         pair = self._pairs.add(topic, to_ns(message.header.stamp), message)
         self.say_dropped(self._pairs)
         if pair is not None:
@@ -127,6 +135,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         milliseconds = 1e3 * (time.perf_counter() - start)
         for result in results:
             self._publish(result, milliseconds / len(results))
+        if self._resumption.is_hopeless(stamp_ns):
+            self.begin_anew('the place where the last SLAM was killed is not found')
         if not results:
             self.report(
                 stamp_ns,
@@ -156,7 +166,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         left, right = self._rectifier.rectify(*self._eight_bit(*images))
         frame = StereoFrame(self._frame_count, stamp_ns, left, right)
         self._frame_count += 1
-        return self._slam.process(frame)
+        return self._resumption.join(self._slam.process(frame))
 
     def _start(self, pair: dict[str, Any]) -> None:
         """Build the stage, now that the calibration is known."""
@@ -174,8 +184,11 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if all(math.isnan(value) for value in given):
             mount = self._transforms.find_mount(self._frames.left)
         self._mount_from_tf = mount is not None
+        camera, stamp_ns = self._rectifier.camera, to_ns(pair[self._left].header.stamp)
+        mount = self._resumption.mount_for(camera, stamp_ns) or mount
         background = self.parameters.own.background
-        self._slam = make_slam(self._rectifier.camera, settings, mount, background=background)
+        self._slam = make_slam(camera, settings, mount, background=background)
+        self._resumption.begin(self._slam)
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self._mount = mount
@@ -192,6 +205,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._mount is None and result.keyframe is not None and self._slam.mount is not None:
             # Its stamp tells which map it belongs to.
             self._announce_mount(int(result.keyframe.path.stamp_ns[0]), self._slam.mount)
+        if self._mount is not None:
+            self._resumption.keep(self._calibration.camera, self._mount, result)
         self._outputs_of_slam.publish(result, self._calibration, self._frames)
         if result.tracked:
             self._transforms.broadcast(result)

@@ -72,6 +72,28 @@ def test_an_image_that_contradicts_itself_is_refused_by_name(change) -> None:
         images.grey_image(message, 'left/image_raw')
 
 
+@pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
+def test_a_png_survives_and_a_jpeg_nearly(dtype) -> None:
+    y, x = np.mgrid[0:40, 0:60]
+    image = (100 + 50 * np.sin(x / 9) + y).astype(dtype)
+    exact = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, None))
+    assert (to_ns(exact.header.stamp), exact.header.frame_id) == (STAMP_NS, 'left')
+    found = images.grey_image(exact, 'left/image_raw/compressed')
+    np.testing.assert_array_equal(found, image)
+    assert found.dtype == dtype
+    small = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, 90))
+    assert small.format.endswith('mono8' if dtype == np.uint8 else 'mono16')
+    lossy = images.grey_image(small, 'left/image_raw/compressed')
+    assert np.abs(lossy.astype(int) - image.astype(int)).max() <= (8 if dtype == np.uint8 else 0)
+
+
+def test_a_damaged_file_is_refused_by_topic() -> None:
+    message = images.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
+    message.data = message.data[:-9]
+    with pytest.raises(MessageError, match='left/image_raw/compressed: the JPEG is truncated'):
+        images.grey_image(message, 'left/image_raw/compressed')
+
+
 def test_calibrations_survive() -> None:
     camera = StereoCamera(640, 480, 400.0, 410.0, 320.5, 240.25, 0.12)
     rectified = rectified_calibration(camera)

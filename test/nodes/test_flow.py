@@ -43,10 +43,21 @@ def test_a_node_has_the_topics_that_are_declared_and_no_others(make_graph, tmp_p
     assert found == expected
     assert DIAGNOSTICS.name in publishers
     subscribers = dict(made.get_subscriber_names_and_types_by_node(node, '/robot'))
-    declared = {f'/robot/{t.name}': [t.type_name] for t in subscribed_by(node)}
     found = {k: v for k, v in subscribers.items() if k not in OF_EVERY_NODE and '/tf' not in k}
-    rectified = {f'/robot/{side}/image_rect' for side in ('left', 'right')}
-    assert found == {k: v for k, v in declared.items() if k not in rectified}
+    assert found == {f'/robot/{t.name}': [t.type_name] for t in subscribed_by(node)}
+
+
+@pytest.mark.parametrize('node', ['stereo_camera', 'stereo_slam'])
+def test_compressed_images_take_the_place_of_raw_ones(make_graph, tmp_path, node) -> None:
+    drive = write_kitti(tmp_path / 'drive', room_drive(1)[0])
+    arguments = ('-p', f'input:={drive}') if node == 'stereo_camera' else ()
+    made = make(node, make_graph('-p', 'image_transport:=compressed', *arguments))
+    publishers = made.get_publisher_names_and_types_by_node(node, '/')
+    subscribers = made.get_subscriber_names_and_types_by_node(node, '/')
+    names = dict(publishers if node == 'stereo_camera' else subscribers)
+    assert names['/left/image_raw/compressed'] == ['sensor_msgs/msg/CompressedImage']
+    assert '/right/image_raw/compressed' in names
+    assert '/left/image_raw' not in names
 
 
 def test_slam_takes_rectified_images_by_parameter(make_graph) -> None:

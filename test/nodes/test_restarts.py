@@ -1,0 +1,174 @@
+"""Each node killed without warning and started again in the middle of a drive."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from node_chain import CHAIN, NodeChain
+from ros_graph import fresh_graph
+from stereo_drive import room_drive
+
+from segfloor_ros.cloud.labels import UNKNOWN, LabelledPoints
+from segfloor_ros.geometry import invert
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.messages.clouds import labelled_arrays
+from segfloor_ros.messages.diagnostics import Level, Status
+from segfloor_ros.messages.grids import grid_arrays
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.messages.topics import GRID
+from segfloor_ros.nodes.kept_state import KeptState
+
+PLACES = 24
+FRAME_NS = 100_000_000
+REJOIN_S = 60.0
+
+
+@pytest.fixture(scope='module')
+def drive():
+    return room_drive(PLACES, step_m=0.05)
+
+
+class Journey:
+    """A drive to and fro through the chain, with the map and the cloud at every keyframe."""
+
+    def __init__(self, chain: NodeChain, drive) -> None:
+        self.chain = chain
+        self._views, self._poses = drive
+        self._count = 0
+        self._truth: dict[int, np.ndarray] = {}
+        self._received = {n: chain.graph.collect(n) for n in ('map', 'labelled_points', 'odometry')}
+
+    def step(self) -> Status:
+        """Drive on by one frame and return SLAM's answer to it."""
+        turn = 2 * (PLACES - 1)
+        place = self._count % turn
+        place = min(place, turn - place)
+        frame = replace(self._views[place], index=self._count, stamp_ns=self._count * FRAME_NS)
+        self._count += 1
+        self._truth[frame.stamp_ns] = invert(self._poses[0]) @ self._poses[place]
+        return self.chain.drive([frame])[0]
+
+    def miss(self, count: int) -> None:
+        """Let the robot drive on unseen."""
+        self._count += count
+
+    def rejoin(self) -> None:
+        """Drive until a keyframe reaches the map again: the nodes must find each other first."""
+        begun, end_s = len(self.chain.graph.statuses), time.monotonic() + REJOIN_S
+        while not any(
+            s.node == GRID and not s.kind and s.level is Level.OK
+            for s in self.chain.graph.statuses[begun:]
+        ):
+            assert time.monotonic() < end_s
+            self.step()
+
+    def keyframes(self, count: int) -> tuple[OccupancyGrid, LabelledPoints]:
+        """Drive until there are so many more keyframes; return map and cloud of the last one."""
+        while count:
+            answer = self.step()
+            assert answer.values['tracked'] == '1', answer
+            if answer.values['keyframe'] == '1':
+                self.chain.mapped(answer.stamp_ns)
+                count -= 1
+        return (
+            grid_arrays(self._of('map', answer.stamp_ns), 'map'),
+            labelled_arrays(self._of('labelled_points', answer.stamp_ns), 'labelled_points'),
+        )
+
+    def latest(self, name: str):
+        """Return the last message of a topic."""
+        return self._received[name][-1]
+
+    def odometry_error_m(self) -> float:
+        """Return how far the last pose is from the truth."""
+        message = self.latest('odometry')
+        T_odom_base = pose_array(message.pose.pose)
+        truth = self._truth[to_ns(message.header.stamp)]
+        return float(np.linalg.norm(T_odom_base[:3, 3] - truth[:3, 3]))
+
+    def _of(self, name: str, stamp_ns: int):
+        def found():
+            return [m for m in self._received[name] if to_ns(m.header.stamp) == stamp_ns]
+
+        self.chain.graph.until(found, f'{name} at {stamp_ns}')
+        return found()[-1]
+
+
+@pytest.fixture(scope='module')
+def journey(tmp_path_factory, drive):
+    with fresh_graph() as graph:
+        chain = NodeChain(graph, tmp_path_factory.mktemp('logs'))
+        try:
+            journey = Journey(chain, drive)
+            chain.start(*CHAIN)
+            journey.keyframes(4)
+            yield journey
+        finally:
+            chain.stop()
+
+
+@pytest.mark.parametrize('node', CHAIN)
+def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
+    chain = journey.chain
+    grid, cloud = journey.keyframes(1)
+    chain.kill(node)
+    journey.miss(2)
+    chain.start(node)
+    journey.rejoin()
+    grid_after, cloud_after = journey.keyframes(2)
+    assert journey.odometry_error_m() < 0.03
+    known, known_after = known_cells(grid), known_cells(grid_after)
+    assert len(known & known_after.keys()) >= 0.98 * len(known)
+    same = [known[cell] == known_after[cell] for cell in known.keys() & known_after.keys()]
+    assert np.mean(same) > 0.97
+    ids = cloud_after.point_id
+    assert (np.diff(ids) > 0).all()
+    both = np.intersect1d(cloud.point_id[cloud.label != UNKNOWN], ids)
+    assert len(both) > 100
+    rows = np.searchsorted(ids, both)
+    assert (cloud_after.label[rows] != UNKNOWN).mean() > 0.95
+    assert 'Traceback' not in chain.log(node)
+
+
+def known_cells(grid: OccupancyGrid) -> dict[tuple[int, int], bool]:
+    """Return the cells that are free or occupied by their place in the map, and which it is."""
+    rows, columns = np.nonzero(grid.cells >= 0)
+    first = np.rint(np.array(grid.origin_xy_m) / grid.resolution_m).astype(int)
+    occupied = grid.cells[rows, columns] > 50
+    places = zip((columns + first[0]).tolist(), (rows + first[1]).tolist(), strict=True)
+    return dict(zip(places, occupied.tolist(), strict=True))
+
+
+def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkeypatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    kept = KeptState('/robot/stereo_slam', 30.0)
+    kept.save({'a': 1})
+    assert KeptState('/other/stereo_slam', 30.0).take() is None
+    assert KeptState('/robot/stereo_slam', 30.0).take() == {'a': 1}
+    assert KeptState('/robot/stereo_slam', 30.0).take() is None
+    kept.save({'a': 2}, always=True)
+    file = Path(kept._file)
+    long_ago = file.stat().st_mtime - 31
+    os.utime(file, (long_ago, long_ago))
+    assert kept.take() is None
+    assert not file.exists()
+
+
+def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    off = KeptState('/robot/damaged', 0.0)
+    off.save('state')
+    kept = KeptState('/robot/damaged', 30.0)
+    assert kept.take() is None
+    kept.save('state')
+    kept._file.write_bytes(kept._file.read_bytes()[:-3])
+    assert kept.take() is None
+    kept.save('state', always=True)
+    kept.remove()
+    assert kept.take() is None
