@@ -43,6 +43,8 @@ class KeptState:
             return
         with contextlib.suppress(OSError):
             self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            if not _is_private(self._file.parent):
+                return
             written = self._file.with_suffix('.new')
             written.write_bytes(pickle.dumps((__version__, state), pickle.HIGHEST_PROTOCOL))
             written.replace(self._file)
@@ -54,10 +56,9 @@ class KeptState:
         handed out once: a state that ends its node is not tried again.
         """
         try:
-            found, folder = self._file.stat(), self._file.parent.stat()
-            # Reading it can run code: it must be this user's, in a folder nobody else writes to.
-            is_own = found.st_uid == folder.st_uid == os.getuid() and not folder.st_mode & 0o022
-            if not is_own or time.time() - found.st_mtime > self._resume_within_s:
+            age_s = time.time() - self._file.stat().st_mtime
+            # Reading it can run code: it must lie in a folder that nobody else writes to.
+            if not _is_private(self._file.parent) or age_s > self._resume_within_s:
                 return None
             version, state = pickle.loads(self._file.read_bytes())
         except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
@@ -70,3 +71,9 @@ class KeptState:
         """Leave nothing to be taken up."""
         with contextlib.suppress(OSError):
             self._file.unlink()
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether the folder is this user's own and nobody else can write to it."""
+    found = folder.lstat()
+    return found.st_uid == os.getuid() and not found.st_mode & 0o022

@@ -172,3 +172,16 @@ def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
     kept.save('state', always=True)
     kept.remove()
     assert kept.take() is None
+
+
+def test_a_folder_that_others_can_write_to_is_not_used(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    monkeypatch.setattr('segfloor_ros.nodes.kept_state.IN_MEMORY', tmp_path)
+    kept = KeptState('/robot/open', 30.0)
+    kept.save('state')
+    kept._file.parent.chmod(0o777)
+    assert kept.take() is None
+    kept.save('state', always=True)
+    assert list(kept._file.parent.glob('*.new')) == []
+    kept._file.parent.chmod(0o700)
+    assert kept.take() is None
