@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,16 +42,15 @@ class NodeChain:
     def __init__(self, graph: Graph, folder: Path, command: Sequence[str] = ()) -> None:
         self.graph = graph
         self.inputs = {name: graph.publisher(name) for name in INPUTS}
-        self.sent: list[int] = []
         self._folder = folder
         self._command = list(command)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, *nodes: str) -> None:
+    def start(self, *nodes: str, **parameters: Any) -> None:
         """Start nodes and wait until all that run are connected with each other."""
         begun = len(self.graph.statuses)
         for node in nodes:
-            words = [f'{name}:={value}' for name, value in PARAMETERS.items()]
+            words = [f'{name}:={value}' for name, value in {**PARAMETERS, **parameters}.items()]
             options = [word for pair in words for word in ('-p', pair)]
             with (self._folder / f'{node}.log').open('ab') as log:
                 self._processes[node] = subprocess.Popen(
@@ -89,15 +89,21 @@ class NodeChain:
             self.inputs[f'{side}/image_raw'].publish(image)
 
     def drive(self, frames: Iterable[StereoFrame]) -> list[Status]:
-        """Send frames one after the other, each when the last one is answered and mapped."""
+        """Send frames, each when the one before is answered; return SLAM's answers."""
         answers = []
         for frame in frames:
             begun = len(self.graph.statuses)
             self.send(frame)
-            self.sent.append(frame.stamp_ns)
-            stamp_ns = frame.stamp_ns
-            self.graph.until(lambda: self._about(SLAM, stamp_ns, begun), f'frame {frame.index}')  # noqa: B023
-            answers.append(self._about(SLAM, stamp_ns, begun)[0])
+            answers += self.answers([frame.stamp_ns], begun)
+        return answers
+
+    def answers(self, stamps_ns: Iterable[int], since: int = 0) -> list[Status]:
+        """Return SLAM's first answers to stamps, waiting for them."""
+        answers = []
+        for stamp_ns in stamps_ns:
+            about = partial(self._about, SLAM, stamp_ns, since)
+            self.graph.until(about, f'an answer to {stamp_ns}')
+            answers.append(about()[0])
         return answers
 
     def mapped(self, stamp_ns: int) -> None:

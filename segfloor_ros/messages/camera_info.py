@@ -9,7 +9,9 @@ from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
+from segfloor_ros.messages.images import MAX_PIXELS
 
 
 def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
@@ -29,7 +31,12 @@ def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> Ca
 
 
 def eye_calibration(message: CameraInfo, topic: str) -> EyeCalibration:
-    """Return the calibration of one eye. Raises CalibrationError, naming the topic."""
+    """Return the calibration of one eye. Raises CalibrationError or MessageError, naming the
+    topic.
+    """
+    if int(message.width) * int(message.height) > MAX_PIXELS:
+        size = f'{message.width}x{message.height}'
+        raise MessageError(f'{topic}: a calibration of images of {size} pixels is not taken')
     return EyeCalibration(
         int(message.width),
         int(message.height),

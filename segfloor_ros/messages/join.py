@@ -38,7 +38,7 @@ class StampJoiner:
         tolerance_ns: int = 0,
         optional: Mapping[str, Callable[[], bool]] | None = None,
     ) -> None:
-        self._parts = tuple(parts)
+        self.parts = tuple(parts)
         self._optional = dict(optional or {})
         self._latest: dict[str, int] = {}
         self._capacity = capacity
@@ -72,7 +72,7 @@ class StampJoiner:
         if not lacking:
             return ()
         everywhere = set.intersection(*lacking)
-        return tuple(part for part in self._parts if part in everywhere)
+        return tuple(part for part in self.parts if part in everywhere)
 
     def clear(self) -> None:
         """Forget everything."""
@@ -89,7 +89,7 @@ class StampJoiner:
         self._latest[part] = max(stamp_ns, self._latest.get(part, stamp_ns))
 
     def _missing(self, parts: Mapping[str, Any]) -> tuple[str, ...]:
-        needed = (*self._parts, *(part for part, may_come in self._optional.items() if may_come()))
+        needed = (*self.parts, *(part for part, may_come in self._optional.items() if may_come()))
         return tuple(part for part in needed if part not in parts)
 
     def _set_for(self, part: str, stamp_ns: int) -> int | None:
@@ -118,5 +118,5 @@ class StampJoiner:
         return self._waiting.pop(key)
 
     def _drop(self, key: int) -> None:
-        parts, known = self._waiting.pop(key), (*self._parts, *self._optional)
+        parts, known = self._waiting.pop(key), (*self.parts, *self._optional)
         self._dropped.append(Dropped(key, tuple(part for part in known if part not in parts)))

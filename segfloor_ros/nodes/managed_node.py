@@ -120,9 +120,13 @@ class ManagedNode(LifecycleNode):
 
         self._openers.append((subscribe, self.destroy_subscription))
 
+    def publisher_count(self, name: str) -> int:
+        """Return how many publish a topic that the node listens to now."""
+        return self._heard[name].get_publisher_count() if name in self._heard else 0
+
     def is_published(self, name: str) -> bool:
         """Whether anybody publishes a topic that the node listens to now."""
-        return name in self._heard and self._heard[name].get_publisher_count() > 0
+        return self.publisher_count(name) > 0
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""

@@ -199,8 +199,14 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         """Warn about sets that were given up, naming the topics of the missing parts."""
         for dropped in joiner.take_dropped():
             names = ', '.join(dropped.missing)
-            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped'
-            self.get_logger().warning(text)
+            counts = {name: self.publisher_count(name) for name in joiner.parts}
+            crowded = ''.join(
+                f'; {name} has {count} publishers, stop or remap one'
+                for name, count in counts.items()
+                if count > 1
+            )
+            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
+            self.say(text, about=names + crowded)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def say_fault(self, where: str, error: Exception) -> None:
@@ -212,16 +218,16 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         if text in self._faults:
             return
         self._faults[text] = now_s
-        self.get_logger().error(f'{where}: {text}')
+        self.get_logger().error(text if text.startswith(where) else f'{where}: {text}')
         if not isinstance(error, SegfloorError):
             self.get_logger().debug(''.join(traceback.format_exception(error)))
 
-    def say(self, text: str) -> None:
-        """Warn, at most every few seconds of the same."""
+    def say(self, text: str, about: str = '') -> None:
+        """Warn, at most every few seconds about the same: the text, where nothing else is named."""
         now_s = time.monotonic()
         self._said = {t: s for t, s in self._said.items() if now_s - s < REPEAT_FAULT_S}
-        if text not in self._said:
-            self._said[text] = now_s
+        if (about or text) not in self._said:
+            self._said[about or text] = now_s
             self.get_logger().warning(text)
 
     def say_waiting(self, what: str) -> None:

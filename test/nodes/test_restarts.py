@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from node_chain import CHAIN, NodeChain
 from ros_graph import fresh_graph
-from stereo_drive import room_drive
+from stereo_drive import room_drive, write_kitti
 
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.cloud.labels import UNKNOWN, LabelledPoints
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.occupancy import OccupancyGrid
@@ -20,12 +21,13 @@ from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import GRID
+from segfloor_ros.messages.poses import path_arrays, pose_array
+from segfloor_ros.messages.topics import CAMERA, GRID
 from segfloor_ros.nodes.kept_state import KeptState
 
 PLACES = 24
 FRAME_NS = 100_000_000
+RECEIVED = ('map', 'labelled_points', 'odometry', 'keyframe/path')
 REJOIN_S = 60.0
 
 
@@ -42,17 +44,21 @@ class Journey:
         self._views, self._poses = drive
         self._count = 0
         self._truth: dict[int, np.ndarray] = {}
-        self._received = {n: chain.graph.collect(n) for n in ('map', 'labelled_points', 'odometry')}
+        self._received = {n: chain.graph.collect(n) for n in RECEIVED}
 
     def step(self) -> Status:
         """Drive on by one frame and return SLAM's answer to it."""
+        return self.chain.drive([self.next()])[0]
+
+    def next(self) -> StereoFrame:
+        """Return the next frame."""
         turn = 2 * (PLACES - 1)
         place = self._count % turn
         place = min(place, turn - place)
         frame = replace(self._views[place], index=self._count, stamp_ns=self._count * FRAME_NS)
         self._count += 1
         self._truth[frame.stamp_ns] = invert(self._poses[0]) @ self._poses[place]
-        return self.chain.drive([frame])[0]
+        return frame
 
     def miss(self, count: int) -> None:
         """Let the robot drive on unseen."""
@@ -134,6 +140,21 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     rows = np.searchsorted(ids, both)
     assert (cloud_after.label[rows] != UNKNOWN).mean() > 0.95
     assert 'Traceback' not in chain.log(node)
+
+
+def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
+    """A driver that comes back goes on with the stamps of the clock."""
+    chain = journey.chain
+    for life in ('first', 'second'):
+        frames = [journey.next() for _ in range(12)]
+        drive = write_kitti(tmp_path / life, [replace(f, index=i) for i, f in enumerate(frames)])
+        chain.start(CAMERA, input=drive, rate=10.0)
+        assert all(a.level is Level.OK for a in chain.answers(f.stamp_ns for f in frames[:4]))
+        chain.kill(CAMERA)
+        journey.miss(1)
+    path = path_arrays(journey.latest('keyframe/path'))
+    assert path.stamp_ns[0] == 0, 'the map was begun anew'
+    assert journey.odometry_error_m() < 0.03
 
 
 def known_cells(grid: OccupancyGrid) -> dict[tuple[int, int], bool]:
