@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.deblocking import deblocked
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 
 class StereoRectifier:
     """Rectifies pairs of one calibration. The maps are computed once, in fixed point (a 32nd of
-    a pixel); pairs that are rectified already pass through.
+    a pixel); pairs that are rectified already keep their geometry.
     """
 
     def __init__(self, calibration: StereoCalibration) -> None:
@@ -28,11 +29,12 @@ class StereoRectifier:
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Return the rectified grey images (H, W) of a raw grey pair (H, W), uint8.
 
-        Pixels that lie outside of the raw image are 0. Raises CalibrationError when the size is
-        not the calibration's.
+        The block grid of compressed images is smoothed. Pixels that lie outside of the raw image
+        are 0. Raises CalibrationError when the size is not the calibration's.
         """
         for side, image in (('the left image', left), ('the right image', right)):
             self.calibration.check_size(image.shape[1], image.shape[0], side)
+        left, right = deblocked(left), deblocked(right)
         if self._maps is None:
             return left, right
         return (

@@ -31,6 +31,8 @@ _WEAK_SUPPORT = 0.08
 _MAX_VIOLATIONS = 0.05
 _REST = 5
 """So many keyframes in a row must agree where the floor is not plain to see."""
+_LEVEL_SIGMA = np.array([np.inf, np.radians(2.0), np.inf])
+"""Cameras are mounted level, more or less: where little floor is seen, roll is the least certain."""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
 _TEXTURE_GREY = 1.2
@@ -105,7 +107,16 @@ class MountEstimator:
         total = np.maximum(total, 0) * preference(guesses, self._travel())
         order = np.argsort(-total, kind='stable')[:_KEPT]
         self._guesses = guesses[order]
-        fit = refine(self._frames, self._guesses[0], self._known, self._travel())
+        # Frames that show the same err together: the prior counts once per frame, too.
+        sigma = _LEVEL_SIGMA / math.sqrt(len(self._frames))
+        fit = refine(
+            self._frames,
+            self._guesses[0],
+            self._known,
+            self._travel(),
+            prior_sigma=sigma,
+            prior_mean=np.zeros(3),
+        )
         self._guesses = np.concatenate([fit.angles_height[None], self._guesses])
         self._fits.append(fit)
         self._settled = self._suffices(fit)

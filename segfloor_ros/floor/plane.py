@@ -168,22 +168,25 @@ def refine(
     travel: Array,
     prior_sigma: Array | None = None,
     scales_px: tuple[float, ...] = _SCALES_PX,
+    prior_mean: Array | None = None,
 ) -> PlaneFit:
     """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
 
     travel: (T, 3) displacements of the camera in metres, along which the floor runs.
-    prior_sigma: (3,) how far from `start` the values may be, where it is more than a guess.
+    prior_sigma: (3,) how far from `prior_mean`, by default `start`, the values may be; infinite
+    where nothing is known.
     scales_px: scale of the biweight, one per iteration.
     """
     state = start.copy()
     free = np.isnan(known)
     information: Array = np.eye(3)
     prior = np.zeros((3, 3)) if prior_sigma is None else np.diag(prior_sigma**-2.0)
+    mean = start if prior_mean is None else prior_mean
     for scale in scales_px:
         information, gradient = _normal_equations(frames, state, scale)
         _add_travel(information, gradient, state, travel)
         information += prior
-        gradient += prior @ (start - state)
+        gradient += prior @ (mean - state)
         step = np.zeros(3)
         step[free] = np.linalg.solve(
             information[np.ix_(free, free)] + 1e-9 * np.eye(int(free.sum())), gradient[free]
