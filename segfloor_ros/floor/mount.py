@@ -31,8 +31,8 @@ _WEAK_SUPPORT = 0.08
 _MAX_VIOLATIONS = 0.05
 _REST = 5
 """So many keyframes in a row must agree where the floor is not plain to see."""
-_LEVEL_SIGMA = np.array([np.inf, np.radians(2.0), np.inf])
-"""Cameras are mounted level, more or less: where little floor is seen, roll is the least certain."""
+_LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
+"""Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
 _TEXTURE_GREY = 1.2
