@@ -29,20 +29,22 @@ class ImageRotation:
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
         self._focal = (camera.fx * self._scale, camera.fy * height / camera.height)
         self._last: NDArray[np.float32] | None = None
+        self._now: NDArray[np.float32] | None = None
 
-    def turn_since_last(self, image: NDArray[np.float32]) -> Array:
-        """Return T_now_last (4, 4), a rotation about the camera's centre, and remember the
-        image (H, W).
+    def see(self, image: NDArray[np.float32]) -> None:
+        """Take in the next image (H, W)."""
+        small = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        self._last, self._now = self._now, np.asarray(cv2.GaussianBlur(small, (0, 0), 0.75))
+
+    def turn_since_last(self) -> Array:
+        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
+        centre.
 
         The identity where there was no image before, or where the two have too little in common.
         """
-        thumbnail = cv2.GaussianBlur(
-            cv2.resize(image, self._size, interpolation=cv2.INTER_AREA), (0, 0), 0.75
-        )
-        last, self._last = self._last, thumbnail
-        if last is None:
+        if self._last is None or self._now is None:
             return np.eye(4)
-        (du, dv), response = cv2.phaseCorrelate(last, thumbnail, self._window)
+        (du, dv), response = cv2.phaseCorrelate(self._last, self._now, self._window)
         if response < MIN_RESPONSE:
             return np.eye(4)
         # A scene point that moves right by du lies further to the right now: it turned about +y.

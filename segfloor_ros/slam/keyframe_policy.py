@@ -22,8 +22,8 @@ class View:
 
     frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
     points of the reference keyframe that several keyframes see. T_last_now: motion (4, 4) since
-    the last keyframe. median_depth_m: of the tracked points. mapper_idle: whether the mapper could
-    take a keyframe at once.
+    the last keyframe. median_depth_m: of the reference keyframe's points, seen from here.
+    mapper_idle: whether the mapper could take a keyframe at once.
     """
 
     frames_since: int

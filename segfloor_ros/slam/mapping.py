@@ -11,15 +11,15 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.disparity_offset import DisparityOffset
-from segfloor_ros.slam.disparity_refinement import refine_disparity
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.matching import match_rows
+from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking import MIN_SIGMA_DISPARITY
 
 DISPARITY_REACH_PX = 4
 MIN_DISPARITY_PX = 1.0
@@ -56,8 +56,7 @@ class LocalMapper:
 
     def measure_stereo(
         self,
-        left: NDArray[np.float32],
-        right: NDArray[np.float32],
+        images: Images,
         features: Features,
         right_features: Features,
         observations: Observations,
@@ -76,11 +75,7 @@ class LocalMapper:
         missing = np.isnan(observations.uvd_px[rows, 2])
         rows, matched = rows[missing], matched[missing]
         guess = (features.uv_px[rows, 0] - right_features.uv_px[matched, 0]).astype(np.float64)
-        disparity, sigma = refine_disparity(
-            left, right, observations.uvd_px[rows, :2], guess, DISPARITY_REACH_PX
-        )
-        observations.uvd_px[rows, 2] = disparity
-        observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
+        measure_disparity(images.left, images.right, observations, rows, guess, DISPARITY_REACH_PX)
 
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]

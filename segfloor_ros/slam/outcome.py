@@ -11,14 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array, invert, skew, transform_points
 from segfloor_ros.slam.results import (
+    NO_POINT,
     FrameResult,
     Keyframe,
     KeyframeFeatures,
     KeyframePath,
     SparseCloud,
 )
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,31 @@ class MapSnapshot:
     path_T_world_camera: Array
     cloud_id: NDArray[np.int32]
     cloud_xyz_world: Array
+
+
+def take_snapshot(
+    sparse_map: SparseMap, keyframe: KeyframeRecord, frame: StereoFrame
+) -> MapSnapshot:
+    """Copy the map as it is at a keyframe made of `frame`."""
+    in_cloud = np.flatnonzero(sparse_map.alive)
+    in_cloud = in_cloud[np.argsort(sparse_map.stable_id[in_cloud])]
+    point_id = keyframe.point_id.copy()
+    xyz = np.full((len(point_id), 3), np.nan)
+    known = point_id != NO_POINT
+    xyz[known] = sparse_map.xyz_world[point_id[known]]
+    point_id[known] = sparse_map.stable_id[point_id[known]]
+    return MapSnapshot(
+        keyframe.T_world_camera,
+        frame.left,
+        frame.right,
+        keyframe.observations.uvd_px[:, :2].astype(np.float32),
+        point_id,
+        xyz,
+        np.array([k.stamp_ns for k in sparse_map.keyframes], np.int64),
+        np.stack([k.T_world_camera for k in sparse_map.keyframes]),
+        sparse_map.stable_id[in_cloud],
+        sparse_map.xyz_world[in_cloud],
+    )
 
 
 @dataclass(frozen=True)

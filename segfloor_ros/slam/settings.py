@@ -86,6 +86,12 @@ class StereoSlamSettings(StageSettings):
     min_tracked: int = setting(
         20, 'Fewest inlier matches for a pose to be believed.', minimum=6, maximum=500
     )
+    tracked_points: int = setting(
+        400,
+        'Map points, spread over the image, that are measured in a frame between keyframes.',
+        minimum=50,
+        maximum=5000,
+    )
     max_speed_mps: float = setting(
         40.0,
         'A motion faster than this is implausible and ends tracking.',

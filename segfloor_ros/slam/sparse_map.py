@@ -283,6 +283,10 @@ class SparseMap:
         self._visible_count.rows[visible] += 1
         self._found_count.rows[found] += 1
 
+    def reliability(self, ids: NDArray[np.integer]) -> Array:
+        """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
+        return self._found_count.rows[ids] / (self._visible_count.rows[ids] + 2.0)
+
     def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, or that only one keyframe saw
         although made before keyframe `settled_before`.

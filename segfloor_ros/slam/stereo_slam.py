@@ -21,11 +21,13 @@ from segfloor_ros.geometry import (
 )
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.features import FeatureExtractor, Features
+from segfloor_ros.slam.following import Follower, Sighting, Track
 from segfloor_ros.slam.image_check import image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
+from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
 from segfloor_ros.slam.mapping import LocalMapper
-from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map
+from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map, take_snapshot
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import (
     NO_POINT,
@@ -33,7 +35,7 @@ from segfloor_ros.slam.results import (
 )
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking import Track, Tracker
+from segfloor_ros.slam.tracking import FeatureTrack, Tracker
 from segfloor_ros.timing import StageTimes
 
 LOCAL_MAP_KEYFRAMES = 20
@@ -90,11 +92,13 @@ class StereoSlam:
         )
         self._rotation = ImageRotation(camera)
         self._tracker = Tracker(camera, settings)
+        self._follower = Follower(camera, settings)
         self._mapper = LocalMapper(camera, settings)
         self._adjusting = AdjustmentRunner(self._mapper, background)
         self._held: list[Outcome] = []
         self._T_camera_world: Array = np.eye(4)
         self._velocity: Array = np.zeros(6)
+        self._sighting: Sighting | None = None
         self._last_stamp_ns = 0
         self._lost = False
         self._recovery_turn = 0
@@ -112,57 +116,77 @@ class StereoSlam:
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
             fault = image_fault(frame.left, frame.right)
-            left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
-            features = None if fault else self._extractor.extract(frame.left)
+            images = Images.of(frame)
             track = None
-            if features is not None and self.map.keyframes:
-                track = self._track(frame, left, right, features)
-        starts = features is not None and not self.map.keyframes
+            if not fault and self.map.keyframes:
+                track = self._track(frame, images)
         snapshot = None
-        if features is not None and (starts or (track and self._wants_keyframe(track))):
+        if not fault and (not self.map.keyframes or (track and self._wants_keyframe(track))):
             with self._times.measure('mapping'):
-                snapshot = self._add_keyframe(frame, left, right, features, track)
+                snapshot = self._add_keyframe(frame, images, track)
         outcome = self._outcome(frame, track, fault, snapshot)
-        self._last_stamp_ns = frame.stamp_ns
+        if outcome.tracked:
+            self._last_stamp_ns = frame.stamp_ns
         return self._release(outcome)
 
     def close(self) -> None:
         """End the background thread, if there is one."""
         self._adjusting.close()
 
-    def _track(
-        self,
-        frame: StereoFrame,
-        left: NDArray[np.float32],
-        right: NDArray[np.float32],
-        features: Features,
-    ) -> Track | None:
+    def _track(self, frame: StereoFrame, images: Images) -> Track | None:
         dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
         steady: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
-        turned = self._rotation.turn_since_last(left) @ self._T_camera_world
-        ids = self._local_ids
-        track = self._tracker.track(
-            left, right, features, self.map, ids, [steady, turned], self.disparity_offset_px
-        )
-        if track is None and self._lost:
-            track = self._recover(left, right, features)
+        self._rotation.see(images.left)
+        track: Track | None = None
+        if self._sighting is not None:
+            track = self._follower.follow(
+                self._sighting,
+                images,
+                self.map,
+                self._local_ids,
+                steady,
+                self.disparity_offset_px,
+            )
+        if track is None:
+            track = self._search(frame, images, steady)
         if track is None or not (self._lost or self._plausible(track, dt_s)):
             self._lost = True
             self._velocity = np.zeros(6)
+            self._sighting = None
             return None
         motion = se3_log(track.T_camera_world @ invert(self._T_camera_world))
         velocity: Array = np.zeros(6) if self._lost else motion / dt_s
         self._velocity = velocity
         self._lost = False
         self._T_camera_world = track.T_camera_world
+        self._sighting = Sighting(images.small, track.point_ids, track.uv_px)
         self._local_ids = self._choose_local_points(track.point_ids)
         self.map.note_tracking(track.visible_ids, track.point_ids)
         self._frames_since_keyframe += 1
         return track
 
-    def _recover(
-        self, left: NDArray[np.float32], right: NDArray[np.float32], features: Features
-    ) -> Track | None:
+    def _search(
+        self,
+        frame: StereoFrame,
+        images: Images,
+        steady: Array,
+    ) -> FeatureTrack | None:
+        """Find the pose by the features of the frame, without its predecessor."""
+        features = self._extractor.extract(frame.left)
+        turned = self._rotation.turn_since_last() @ self._T_camera_world
+        track = self._tracker.track(
+            images,
+            features,
+            self.map,
+            self._local_ids,
+            [steady, turned],
+            self.disparity_offset_px,
+        )
+        if track is None and self._lost:
+            track = self._recover(images, features)
+        return track
+
+    def _recover(self, images: Images, features: Features) -> FeatureTrack | None:
         """Look for the view among the keyframes, a few per frame, the latest ones first."""
         views = [k.index for k in self.map.keyframes if k.retired is None]
         count = len(views)
@@ -174,14 +198,12 @@ class StereoSlam:
         estimate = self._tracker.locate(features, observations, self.map, ids)
         if estimate is None:
             return None
-        ids = self._choose_local_points(ids)
-        return self._tracker.track(
-            left,
-            right,
+        return self._tracker.track_at(
+            images,
             features,
             self.map,
-            ids,
-            [estimate.T_camera_world],
+            self._choose_local_points(ids),
+            estimate.T_camera_world,
             self.disparity_offset_px,
         )
 
@@ -200,12 +222,13 @@ class StereoSlam:
     def _wants_keyframe(self, track: Track) -> bool:
         last = self.map.keyframes[-1]
         known = last.point_id[last.point_id != NO_POINT]
-        reliable = self.map.observer_count[known] >= SEEN_BY_SEVERAL
-        depth = transform_points(track.T_camera_world, self.map.xyz_world[track.point_ids])[:, 2]
+        reliable = known[self.map.observer_count[known] >= SEEN_BY_SEVERAL]
+        seen = reliable if len(reliable) else known
+        depth = transform_points(track.T_camera_world, self.map.xyz_world[seen])[:, 2]
         view = View(
             self._frames_since_keyframe,
             len(track.point_ids),
-            int(reliable.sum()),
+            min(len(reliable), self._settings.tracked_points),
             last.T_camera_world @ invert(track.T_camera_world),
             float(np.median(depth)),
             self._adjusting.idle,
@@ -215,21 +238,28 @@ class StereoSlam:
     def _add_keyframe(
         self,
         frame: StereoFrame,
-        left: NDArray[np.float32],
-        right: NDArray[np.float32],
-        features: Features,
+        images: Images,
         track: Track | None,
-    ) -> MapSnapshot:
+    ) -> MapSnapshot | None:
+        """Make the frame a keyframe; None where its features do not show what was tracked."""
+        if isinstance(track, FeatureTrack):
+            matched: FeatureTrack | None = track
+            features = track.features
+        else:
+            features = self._extractor.extract(frame.left)
+            matched = self._match_features(images, features) if track else None
+            if track and matched is None:
+                return None
         right_features = self._right_extractor.extract(frame.right)
         self._take_adjustment(wait=True)
         point_id = np.full(len(features), NO_POINT, np.int32)
-        if track is None:
+        if matched is None:
             observations = self._tracker.pixel_observations(features)
         else:
-            observations = track.observations
-            alive = self.map.alive[track.point_ids]
-            point_id[track.feature_rows[alive]] = track.point_ids[alive]
-        self._mapper.measure_stereo(left, right, features, right_features, observations)
+            observations = matched.observations
+            alive = self.map.alive[matched.point_ids]
+            point_id[matched.feature_rows[alive]] = matched.point_ids[alive]
+        self._mapper.measure_stereo(images, features, right_features, observations)
         keyframe = KeyframeRecord(
             len(self.map.keyframes),
             frame.index,
@@ -239,19 +269,42 @@ class StereoSlam:
             observations,
             point_id,
         )
-        patches = sample_patches(left, observations.uvd_px[:, :2]).astype(np.uint8)
+        patches = sample_patches(images.left, observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
         if keyframe.index > 0:
             self._adjusting.submit(self._mapper.plan_adjustment(self.map, keyframe))
             if not self._background:
                 self._take_adjustment(wait=True)
         self._frames_since_keyframe = 0
-        known = keyframe.point_id[keyframe.point_id != NO_POINT]
-        self._local_ids = self._choose_local_points(known)
+        self._see_keyframe(images, keyframe)
         if self.mount is None and self._mount_meter is not None:
             self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera)
             self.mount = self._mount_meter.mount
-        return self._snapshot(frame, keyframe)
+        return take_snapshot(self.map, keyframe, frame)
+
+    def _match_features(self, images: Images, features: Features) -> FeatureTrack | None:
+        """Find which features show map points, now that the pose is known; it is refined by all
+        of them.
+        """
+        matched = self._tracker.track_at(
+            images,
+            features,
+            self.map,
+            self._local_ids,
+            self._T_camera_world,
+            self.disparity_offset_px,
+        )
+        if matched is not None:
+            self._T_camera_world = matched.T_camera_world
+            self.map.note_tracking(matched.visible_ids, matched.point_ids)
+        return matched
+
+    def _see_keyframe(self, images: Images, keyframe: KeyframeRecord) -> None:
+        """Go on from the points of a keyframe, old and new."""
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        ids = keyframe.point_id[rows]
+        self._sighting = Sighting(images.small, ids, keyframe.observations.uvd_px[rows, :2])
+        self._local_ids = self._choose_local_points(ids)
 
     def _take_adjustment(self, wait: bool) -> None:
         """Bring a finished adjustment into the map. The camera, and with it `odom`, moves along
@@ -267,27 +320,8 @@ class StereoSlam:
         self._T_camera_world = _without_drift(T_camera_reference @ reference.T_camera_world)
         self._T_world_odom = _without_drift(invert(self._T_camera_world) @ invert(T_odom_camera))
         self._local_ids = self._local_ids[self.map.alive[self._local_ids]]
-
-    def _snapshot(self, frame: StereoFrame, keyframe: KeyframeRecord) -> MapSnapshot:
-        in_cloud = np.flatnonzero(self.map.alive)
-        in_cloud = in_cloud[np.argsort(self.map.stable_id[in_cloud])]
-        point_id = keyframe.point_id.copy()
-        xyz = np.full((len(point_id), 3), np.nan)
-        known = point_id != NO_POINT
-        xyz[known] = self.map.xyz_world[point_id[known]]
-        point_id[known] = self.map.stable_id[point_id[known]]
-        return MapSnapshot(
-            keyframe.T_world_camera,
-            frame.left,
-            frame.right,
-            keyframe.observations.uvd_px[:, :2].astype(np.float32),
-            point_id,
-            xyz,
-            np.array([k.stamp_ns for k in self.map.keyframes], np.int64),
-            np.stack([k.T_world_camera for k in self.map.keyframes]),
-            self.map.stable_id[in_cloud],
-            self.map.xyz_world[in_cloud],
-        )
+        if self._sighting is not None:
+            self._sighting = self._sighting.take(self.map.alive[self._sighting.ids])
 
     def _outcome(
         self, frame: StereoFrame, track: Track | None, fault: str, snapshot: MapSnapshot | None

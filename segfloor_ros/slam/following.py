@@ -1,0 +1,155 @@
+"""Tracking of ordinary frames: the points of the last frame are followed into this one.
+
+Corners and descriptors are only needed where nothing is known of the motion, or where new points
+are wanted. Between keyframes optical flow of some points tells the pose to a pixel, and the patches
+of a spread selection of map points tell the rest (Forster et al., SVO: Semidirect Visual Odometry,
+ICRA 2014). The patches come from keyframes: errors do not add up from frame to frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.features import spread
+from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.optical_flow import follow_pixels
+from segfloor_ros.slam.point_measurement import align_pixels, measure_disparity
+from segfloor_ros.slam.pose import PoseEstimate, refine_pose
+from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.visibility import Prediction, predict_points
+
+MAX_FOLLOWED = 250
+SIGMA_FLOW_PX = 1.0
+MIN_FOUND = 0.15
+"""Share of the selected points that must be found and agree, else the frame is searched anew."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What is known of the last frame: its shrunk left image, and map points ids (N,) at its
+    pixels (N, 2).
+    """
+
+    small: NDArray[np.uint8]
+    ids: NDArray[np.int32]
+    uv_px: Array
+
+    def take(self, chosen: NDArray[np.bool_]) -> Sighting:
+        """Return it with the chosen points (N,)."""
+        return Sighting(self.small, self.ids[chosen], self.uv_px[chosen])
+
+
+@dataclass(frozen=True)
+class Track:
+    """A frame with a pose.
+
+    point_ids, uv_px: (N,), (N, 2) the points that were found and agree. visible_ids: those that
+    were looked for.
+    """
+
+    T_camera_world: Array
+    covariance: Array
+    point_ids: NDArray[np.int32]
+    uv_px: Array
+    visible_ids: NDArray[np.int32]
+
+
+class Follower:
+    """Finds the pose of a frame from the one before."""
+
+    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
+        self._camera = camera
+        self._settings = settings
+
+    def follow(
+        self,
+        last: Sighting,
+        images: Images,
+        sparse_map: SparseMap,
+        local_ids: NDArray[np.int32],
+        T_predicted: Array,
+        offset_px: float,
+    ) -> Track | None:
+        """Find the pose of a frame; None where too little of the last one is found again.
+
+        offset_px: the known error of all disparities, measured minus true.
+        """
+        estimate = self._by_flow(last, images.small, sparse_map, T_predicted)
+        if estimate is None:
+            return None
+        pose = estimate.T_camera_world
+        seen = self._select(sparse_map, local_ids, pose)
+        observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
+        rows = np.arange(len(seen.ids))
+        rows = rows[align_pixels(images.left, observations, rows, sparse_map, seen.ids, pose)]
+        measure_disparity(
+            images.left, images.right, observations, rows, seen.uvd_px[rows, 2] + offset_px
+        )
+        if len(rows) < self._settings.min_tracked:
+            return None
+        ids = seen.ids[rows]
+        measured = observations.take(rows)
+        estimate = refine_pose(
+            self._camera, pose, sparse_map.xyz_world[ids], measured.without_offset(offset_px)
+        )
+        if not self._believable(estimate, len(seen.ids)):
+            return None
+        return Track(
+            estimate.T_camera_world,
+            estimate.covariance,
+            ids[estimate.inliers],
+            measured.uvd_px[estimate.inliers, :2],
+            seen.ids,
+        )
+
+    def _by_flow(
+        self,
+        last: Sighting,
+        small: NDArray[np.uint8],
+        sparse_map: SparseMap,
+        T_predicted: Array,
+    ) -> PoseEstimate | None:
+        """Find the pose to about a pixel from where the last frame's points went."""
+        step = -(-len(last.ids) // MAX_FOLLOWED)
+        ids, uv_last = last.ids[::step], last.uv_px[::step]
+        points = transform_points(T_predicted, sparse_map.xyz_world[ids])
+        front = points[:, 2] > MIN_DEPTH_M
+        ids, uv_last, points = ids[front], uv_last[front], points[front]
+        if len(ids) < self._settings.min_tracked:
+            return None
+        guess = self._camera.project(points)[:, :2]
+        uv, found = follow_pixels(last.small, small, self._camera.width, uv_last, guess)
+        if found.sum() < self._settings.min_tracked:
+            return None
+        uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
+        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
+        estimate = refine_pose(
+            self._camera, T_predicted, sparse_map.xyz_world[ids[found]], observations
+        )
+        return estimate if self._believable(estimate, len(ids)) else None
+
+    def _select(
+        self, sparse_map: SparseMap, local_ids: NDArray[np.int32], T_camera_world: Array
+    ) -> Prediction:
+        """Return points that should be seen, spread over the image, the often found first."""
+        seen = predict_points(self._camera, self._settings, sparse_map, local_ids, T_camera_world)
+        budget = self._settings.tracked_points
+        if len(seen.ids) <= budget:
+            return seen
+        area = self._camera.width * self._camera.height
+        cell_px = max(1, int(np.sqrt(area / budget)))
+        reliability = sparse_map.reliability(seen.ids).astype(np.float32)
+        return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, budget))
+
+    def _believable(self, estimate: PoseEstimate, looked_for: int) -> bool:
+        """Whether enough points agree: a wrong pose has followers too, but not most."""
+        agreeing = int(estimate.inliers.sum())
+        enough = max(self._settings.min_tracked, MIN_FOUND * looked_for)
+        return agreeing >= enough and 2 * agreeing >= len(estimate.inliers)
