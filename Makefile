@@ -8,14 +8,15 @@ OLD_ENOUGH := import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_i
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TF := $(VENV)/.tf2_msgs
 NOBLE := .venv-noble
 NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
-CODE := segfloor_ros test launch_configs docs setup.py
+CODE := segfloor_ros test launch_configs docs tools setup.py
 
 .PHONY: all test test-noble noble-python demo lint format docs clean
 
-all: $(STAMP)
+all: $(STAMP) $(TF)
 
 $(VENV)/bin/python:
 	@for python in $(CANDIDATES); do \
@@ -32,7 +33,12 @@ $(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python
 	  --no-build-isolation -e '.[ros,cli,sim,dev]'
 	@touch $@
 
-test: $(STAMP) lint
+# The message of /tf, which the wheels lack; where it cannot be built, one line says why.
+$(TF): $(wildcard tools/tf2_msgs/*) $(STAMP)
+	@$(BIN)/python tools/tf2_msgs/build.py
+	@touch $@
+
+test: $(STAMP) $(TF) lint
 	$(BIN)/python -m pytest
 
 test-noble: $(NOBLE)/.installed
@@ -55,9 +61,10 @@ $(NOBLE)/.installed: constraints-noble.txt constraints.txt setup.py setup.cfg py
 	  -c $(NOBLE)/constraints.txt pip setuptools
 	$(NOBLE)/bin/python -m pip install -q --disable-pip-version-check \
 	  -c $(NOBLE)/constraints.txt --no-build-isolation -e '.[ros,cli,sim,test]'
+	@$(NOBLE)/bin/python tools/tf2_msgs/build.py
 	@touch $@
 
-demo: $(STAMP)
+demo: $(STAMP) $(TF)
 	$(BIN)/segfloor demo
 
 lint: $(STAMP)

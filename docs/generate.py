@@ -32,10 +32,16 @@ it is not needed: remap the driver's topics to those that `stereo_slam` subscrib
     SLAM: """\
 Tracks every stereo pair, adds keyframes, and keeps a sparse map of points with stable ids. While
 tracking is lost it publishes no pose, and `/diagnostics` says why. Where the camera sits on the
-robot comes from the parameters, else from `/tf_static` (`base_link` to the frame of the left
-image), else it is measured from the floor the camera sees; until then results are held back, and
-all of them follow. With tf2_ros installed it broadcasts `map` → `odom` → `base_link`, and the mount
-where tf did not have it.""",
+robot comes from the parameters, else from tf (`base_link` to the frame of the left image), else it
+is measured from the floor the camera sees; until then images and results are held back, and all of
+them follow.
+
+On tf (REP-105) it broadcasts `map` → `odom` → `base_link` with the stamps of the images it tracked,
+and on `/tf_static` the mount where tf lacks it; where the camera's frame hangs on another one
+already, that one is put on the base. With `publish_odom_tf: false` another node owns `odom` →
+`base_link`, e.g. robot_localization with wheels and IMU: `map` → `odom` is then what lies between
+that node's base and the one SLAM sees at the same time, and stays as it was while tracking is lost.
+tf needs tf2_ros or, from pip wheels, the message that `make` builds.""",
     FLOOR: """\
 Computes the disparity of every keyframe and marks the pixels that show floor.""",
     CLOUD: """\

@@ -76,13 +76,17 @@ class StereoSlamNodeSettings(NodeSettings):
     map_frame: str = setting('map', 'Frame of the map.')
     odom_frame: str = setting('odom', 'Continuous frame of the odometry.')
     base_frame: str = setting('base_link', 'Frame of the robot, on the floor.')
-    publish_tf: bool = setting(True, 'Broadcast map to odom (needs tf2_ros).')
+    publish_tf: bool = setting(
+        True, 'Broadcast tf: map to odom, odom to base_link, and the mount where tf lacks it.'
+    )
     publish_odom_tf: bool = setting(
-        True, 'Broadcast odom to base_link; off where another node owns it.'
+        True,
+        'Broadcast odom to base_link; off where another node does, e.g. one that fuses the wheels: '
+        'map to odom then corrects that one.',
     )
     tf_wait_s: float = setting(
-        1.0,
-        'How long to wait for the mount of the camera on tf before measuring it.',
+        5.0,
+        'How long after the start to wait for the mount of the camera on tf before measuring it.',
         unit='s',
         minimum=0.0,
         maximum=60.0,

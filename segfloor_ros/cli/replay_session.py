@@ -105,7 +105,9 @@ class ReplaySession:
         parameters[CAMERA]['ros__parameters'].update(playing)
         for node in NODES:
             parameters[node]['ros__parameters'].update(resume_within_s=0.0)
-        parameters[SLAM]['ros__parameters'].update(background=False, image_transport='raw')
+        parameters[SLAM]['ros__parameters'].update(
+            background=False, image_transport='raw', tf_wait_s=0.0
+        )
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))

@@ -38,6 +38,15 @@ ODOMETRY = _reliable(KEYFRAME_DEPTH)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 """The last value also for those who come later: the map, the camera's mount (REP-2003)."""
 
+TF = _reliable(100)
+"""Moving frames, as tf2 does."""
+
+TF_STATIC = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Fixed frames that one node broadcasts, all in one message."""
+
+TF_STATIC_LISTENER = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The fixed frames of many nodes."""
+
 DIAGNOSTICS = _reliable(KEYFRAME_DEPTH)
 """Status messages."""
 

@@ -95,10 +95,23 @@ class ManagedNode(LifecycleNode):
 
     def keep_subscription(
         self, kind: Any, name: str, callback: Callable[[Any], None], profile: QoSProfile
-    ) -> None:
-        """Subscribe until the node is cleaned up, whether it is active or not."""
-        subscription = self.create_subscription(kind, name, callback, profile)
-        self._kept.append((subscription, self.destroy_subscription))
+    ) -> Callable[[], None]:
+        """Subscribe until the node is cleaned up, whether it is active or not; the function
+        returned ends it before.
+        """
+        kept = (self.create_subscription(kind, name, callback, profile), self.destroy_subscription)
+        self._kept.append(kept)
+
+        def end() -> None:
+            if kept in self._kept:
+                self._kept.remove(kept)
+                self.destroy_subscription(kept[0])
+
+        return end
+
+    def at_cleanup(self, step: Callable[[], None]) -> None:
+        """Do something when the node is cleaned up."""
+        self._kept.append((None, lambda _: step()))
 
     def offer(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
         """Offer a service until the node is cleaned up."""

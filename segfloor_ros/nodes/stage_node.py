@@ -254,6 +254,9 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
             self.publish_status(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
 
 
+AnyStageNode = StageNode[Any, Any]
+
+
 def one_line(error: Exception) -> str:
     """Return an error in one line; unexpected ones with their type."""
     text = ' '.join(str(error).split())

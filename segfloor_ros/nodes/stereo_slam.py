@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from functools import partial
 from typing import Any
 
@@ -30,7 +31,9 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 
-MAX_WAITING_PAIRS = 30
+MAX_UNPAIRED = 30
+MAX_WAITING_PAIRS = 100
+WORK_OFF_EVERY_S = 0.2
 
 
 class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
@@ -42,21 +45,24 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def set_up(self) -> None:
         """Make the topics."""
         self._slam: StereoSlam | None = None
+        self._waiting: deque[dict[str, Any]] = deque(maxlen=MAX_WAITING_PAIRS)
         own = self.parameters.own
         self._outputs_of_slam = SlamOutputs(self, own)
         self._transforms = Transforms(self, own)
         self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
         self._left, self._right = self._subscribe(own)
+        self.every(WORK_OFF_EVERY_S, self._work_off)
         tolerance_ns = round(own.sync_tolerance_s * 1e9)
         self._pairs = self.joiner(
-            (self._left, self._right), capacity=MAX_WAITING_PAIRS, tolerance_ns=tolerance_ns
+            (self._left, self._right), capacity=MAX_UNPAIRED, tolerance_ns=tolerance_ns
         )
 
     def start_anew(self) -> None:
         """Begin with an empty map; the mount of the camera is found again, too."""
         self._end_stage()
         self._outputs_of_slam.start_anew()
+        self._transforms.start_anew()
         self._last_stamp_ns: int | None = None
         self._resumption = SlamResumption(self.keep)
         self._calibration: StereoCalibration | None = None
@@ -64,9 +70,12 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._rectifier: StereoRectifier | None = None
         self._eight_bit = EightBitScale()
         self._mount: Mount | None = None
-        self._mount_from_tf = False
         self._frame_count = 0
-        self._waiting: list[dict[str, Any]] = []
+
+    def reset(self) -> None:
+        """Drop the map, and the images that wait."""
+        self._waiting.clear()
+        super().reset()
 
     def resume(self, state: LastState) -> None:
         """Go on with the map of a killed node once the images come."""
@@ -77,10 +86,14 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         super().forget()
         self._end_stage()
 
+    def on_inputs_opened(self) -> None:
+        """Give tf time to tell the mount, from now on."""
+        self._transforms.start_waiting()
+
     def on_inputs_closed(self) -> None:
         """Give up the images that wait."""
         super().on_inputs_closed()
-        self._waiting = []
+        self._waiting.clear()
 
     def _end_stage(self) -> None:
         if self._slam is not None:
@@ -105,22 +118,37 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._infos[topic] = message
         if self._slam is not None:
             self.say(f'{topic}: the calibration is not the one in use; ~/reset takes it over')
-        waiting, self._waiting = self._waiting, []
-        for pair in waiting:
-            self._take_pair(pair)
+        self._work_off()
 
     def _take_image(self, topic: str, message: Image | CompressedImage) -> None:
         pair = self._pairs.add(topic, to_ns(message.header.stamp), message)
         self.say_dropped(self._pairs)
         if pair is not None:
-            self._take_pair(pair)
+            self._waiting.append(pair)
+            self._work_off()
+
+    def _work_off(self) -> None:
+        """Process the pairs that wait, once all is known that the first one needs."""
+        while self._waiting and self._is_ready(self._waiting[0]):
+            self._take_pair(self._waiting.popleft())
+
+    def _is_ready(self, pair: dict[str, Any]) -> bool:
+        """Whether calibration and mount are known: they come in their own time."""
+        if self._slam is not None:
+            return True
+        if len(self._eyes) < 2:
+            self.say_waiting('left/camera_info and right/camera_info')
+            return False
+        if self._mount_is_given():
+            return True
+        return self._transforms.mount_is_settled(pair[self._left].header.frame_id)
+
+    def _mount_is_given(self) -> bool:
+        settings = self.parameters.stage
+        given = (settings.camera_height_m, settings.camera_pitch_rad, settings.camera_roll_rad)
+        return not all(math.isnan(value) for value in given)
 
     def _take_pair(self, pair: dict[str, Any]) -> None:
-        if len(self._eyes) < 2:
-            # The calibration travels on topics of its own and may come a moment later.
-            self._waiting = [*self._waiting, pair][-MAX_WAITING_PAIRS:]
-            self.say_waiting('left/camera_info and right/camera_info')
-            return
         stamp_ns = to_ns(pair[self._left].header.stamp)
         if not self._is_in_order(stamp_ns):
             self.report(stamp_ns, Level.ERROR, 'older than the pair before it; dropped')
@@ -178,16 +206,11 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._frames = CameraFrames(
             pair[self._left].header.frame_id, pair[self._right].header.frame_id
         )
-        settings = self.parameters.stage
-        given = (settings.camera_height_m, settings.camera_pitch_rad, settings.camera_roll_rad)
-        mount = None
-        if all(math.isnan(value) for value in given):
-            mount = self._transforms.find_mount(self._frames.left)
-        self._mount_from_tf = mount is not None
+        mount = None if self._mount_is_given() else self._transforms.mount(self._frames.left)
         camera, stamp_ns = self._rectifier.camera, to_ns(pair[self._left].header.stamp)
         mount = self._resumption.mount_for(camera, stamp_ns) or mount
-        background = self.parameters.own.background
-        self._slam = make_slam(camera, settings, mount, background=background)
+        stage, background = self.parameters.stage, self.parameters.own.background
+        self._slam = make_slam(camera, stage, mount, background=background)
         self._resumption.begin(self._slam)
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
@@ -197,8 +220,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             f'{math.degrees(mount.pitch_rad):.2f} deg, roll {math.degrees(mount.roll_rad):.2f} deg'
         )
         self._outputs_of_slam.publish_mount(stamp_ns, self._frames, mount)
-        if not self._mount_from_tf:
-            self._transforms.broadcast_mount(stamp_ns, self._frames.left, mount)
+        self._transforms.announce_mount(stamp_ns, self._frames.left, mount)
 
     def _publish(self, result: FrameResult, milliseconds: float) -> None:
         assert self._calibration is not None and self._slam is not None
@@ -208,8 +230,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._mount is not None:
             self._resumption.keep(self._calibration.camera, self._mount, result)
         self._outputs_of_slam.publish(result, self._calibration, self._frames)
-        if result.tracked:
-            self._transforms.broadcast(result)
+        self._transforms.broadcast(result)
         self.report(
             result.stamp_ns,
             Level.OK if result.tracked else Level.ERROR,

@@ -1,77 +1,150 @@
-"""Frames of the robot over tf, where tf2_ros is installed (it is not among the pip wheels)."""
+"""The robot's frames over tf (REP-105): map → odom → base_link → camera."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from rclpy.duration import Duration
-from rclpy.node import Node
-from rclpy.time import Time
+import time
+from collections import deque
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.messages.poses import transform_array, transform_message
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.messages.poses import transform_message
 from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.stage_node import AnyStageNode
+from segfloor_ros.nodes.tf_links import TfLink, tf_link
 from segfloor_ros.slam.results import FrameResult
 
-try:
-    import tf2_ros
-except ImportError:
-    tf2_ros = None
+MAX_UNCORRECTED = 30
+TICK_S = 0.05
 
 
 class Transforms:
-    """Broadcasts map → odom → base_link → camera and looks the camera's mount up (REP-105)."""
+    """What SLAM broadcasts, and where tf has the camera's mount.
 
-    def __init__(self, node: Node, own: StereoSlamNodeSettings) -> None:
+    With `publish_odom_tf` off another node owns odom → base_link, e.g. one that fuses the wheels'
+    odometry. map → odom is then what is between that node's base and SLAM's, at the same time.
+    """
+
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
         self._node = node
         self._own = own
-        self._buffer: Any = None
-        self._dynamic: Any = None
-        self._static: Any = None
-        if tf2_ros is None:
+        self._link: TfLink | None = tf_link(node)
+        self._deadline_s = 0.0
+        self._has_own_mount = False
+        self._unsent_mount: tuple[int, str, Mount] | None = None
+        self._uncorrected: deque[FrameResult] = deque(maxlen=MAX_UNCORRECTED)
+        self._T_map_odom: Array | None = None
+        self._is_fused = own.publish_tf and not own.publish_odom_tf
+        if self._link is None:
             node.get_logger().info(
-                'tf2_ros is not installed: no tf is broadcast or read; the mount of the camera '
-                'comes from the parameters camera_height_m, camera_pitch_rad and camera_roll_rad '
-                'or is measured'
+                'no tf: neither tf2_ros nor tf2_msgs is installed; the mount of the camera comes '
+                'from the parameters camera_height_m, camera_pitch_rad and camera_roll_rad or is '
+                'measured'
             )
-            return
-        self._buffer = tf2_ros.Buffer(node=node)
-        self._listener = tf2_ros.TransformListener(self._buffer, node, spin_thread=True)
-        self._dynamic = tf2_ros.TransformBroadcaster(node)
-        self._static = tf2_ros.StaticTransformBroadcaster(node)
+        else:
+            node.every(TICK_S, self._advance)
 
-    def find_mount(self, camera_frame: str) -> Mount | None:
-        """Return where tf says the left optical frame is on the base, or None when it does not
-        say so in time.
+    def start_waiting(self) -> None:
+        """From now on tf has some time to tell the mount."""
+        self._deadline_s = time.monotonic() + self._own.tf_wait_s
+
+    def start_anew(self) -> None:
+        """Forget the map's place in odom."""
+        self._uncorrected.clear()
+        self._T_map_odom = None
+
+    def mount_is_settled(self, camera_frame: str) -> bool:
+        """Whether tf tells the mount of the left optical frame, or had time enough to."""
+        if self._link is None or self._has_own_mount or self.mount(camera_frame) is not None:
+            return True
+        base = self._own.base_frame
+        if time.monotonic() < self._deadline_s:
+            self._node.say(f'waiting for tf from {base} to {camera_frame}')
+            return False
+        self._node.say(
+            f'no tf from {base} to {camera_frame} within {self._own.tf_wait_s:g} s; the mount of '
+            'the camera is measured from the floor'
+        )
+        return True
+
+    def mount(self, camera_frame: str) -> Mount | None:
+        """Return where tf has the left optical frame on the base, or None."""
+        if self._link is None or self._has_own_mount:
+            return None
+        T_base_camera = self._link.lookup(self._own.base_frame, camera_frame)
+        return None if T_base_camera is None else Mount.from_transform(T_base_camera)
+
+    def announce_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
+        """Broadcast the mount in use where tf lacks it, once tf had its time to tell."""
+        self._unsent_mount = stamp_ns, camera_frame, mount
+
+    def _advance(self) -> None:
+        if self._unsent_mount is not None and time.monotonic() >= self._deadline_s:
+            if self._own.publish_tf:
+                self._broadcast_mount(*self._unsent_mount)
+            self._unsent_mount = None
+            # A fused odometry is listened to on and on.
+            if self._link is not None and not self._is_fused:
+                self._link.stop_listening()
+        if self._is_fused:
+            self._correct()
+
+    def _broadcast_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
+        """Where the camera's frame hangs on another one already, e.g. on the camera's body, that
+        one is put on the base: a frame has one parent.
         """
-        if self._buffer is None:
-            return None
-        base, wait = self._own.base_frame, Duration(seconds=self._own.tf_wait_s)
-        if not self._buffer.can_transform(base, camera_frame, Time(), wait):
-            self._node.get_logger().warning(
-                f'no transform from {base} to {camera_frame} within {self._own.tf_wait_s:g} s; '
-                'the mount of the camera is measured from the floor'
-            )
-            return None
-        found = self._buffer.lookup_transform(base, camera_frame, Time())
-        return Mount.from_transform(transform_array(found))
-
-    def broadcast_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
-        """Broadcast a mount that tf did not have."""
-        if self._static is not None and self._own.publish_tf:
-            self._static.sendTransform(
-                transform_message(stamp_ns, self._own.base_frame, camera_frame, mount.T_base_left)
-            )
+        assert self._link is not None
+        base, root = self._own.base_frame, self._link.root_of(camera_frame)
+        T_root_camera = self._link.lookup(root, camera_frame)
+        if T_root_camera is None or self._link.lookup(base, camera_frame) is not None:
+            return
+        self._has_own_mount = True
+        T_base_root = mount.T_base_left @ invert(T_root_camera)
+        self._link.send_fixed(transform_message(stamp_ns, base, root, T_base_root))
 
     def broadcast(self, result: FrameResult) -> None:
-        """Broadcast the frames at one tracked frame."""
-        own = self._own
-        if self._dynamic is None or not own.publish_tf:
+        """Broadcast the frames at one frame of the camera; while lost no pose is."""
+        if self._link is None or not self._own.publish_tf:
             return
-        stamp_ns = result.stamp_ns
-        transforms = [transform_message(stamp_ns, own.map_frame, own.odom_frame, result.T_map_odom)]
-        if own.publish_odom_tf:
-            transforms.append(
-                transform_message(stamp_ns, own.odom_frame, own.base_frame, result.T_odom_base)
+        if self._is_fused:
+            self._note(result)
+            self._correct()
+        elif result.tracked:
+            own, stamp_ns = self._own, result.stamp_ns
+            pairs = (
+                (own.map_frame, own.odom_frame, result.T_map_odom),
+                (own.odom_frame, own.base_frame, result.T_odom_base),
             )
-        self._dynamic.sendTransform(transforms)
+            self._link.send([transform_message(stamp_ns, *pair) for pair in pairs])
+
+    def _note(self, result: FrameResult) -> None:
+        if result.tracked:
+            self._uncorrected.append(result)
+        elif self._T_map_odom is not None:
+            # The other node's odometry goes on, from the last place that SLAM knew.
+            self._send_correction(result.stamp_ns, self._T_map_odom)
+
+    def _correct(self) -> None:
+        """Broadcast the correction for the latest frame whose time tf has reached."""
+        assert self._link is not None
+        odom, base = self._own.odom_frame, self._own.base_frame
+        for result in reversed(self._uncorrected):
+            T_odom_base = self._link.lookup(odom, base, result.stamp_ns)
+            if T_odom_base is not None:
+                T_map_base = result.T_map_odom @ result.T_odom_base
+                self._T_map_odom = T_map_base @ invert(T_odom_base)
+                self._send_correction(result.stamp_ns, self._T_map_odom)
+                while self._uncorrected and self._uncorrected[0].stamp_ns <= result.stamp_ns:
+                    self._uncorrected.popleft()
+                return
+        if len(self._uncorrected) == MAX_UNCORRECTED:
+            self._node.say(
+                f'no tf from {odom} to {base} at the times of the images, so none from '
+                f'{self._own.map_frame} to {odom} is broadcast; publish_odom_tf is off, which '
+                'leaves it to another node'
+            )
+
+    def _send_correction(self, stamp_ns: int, T_map_odom: Array) -> None:
+        assert self._link is not None
+        own = self._own
+        message = transform_message(stamp_ns, own.map_frame, own.odom_frame, T_map_odom)
+        self._link.send([message])

@@ -1,0 +1,170 @@
+"""Reading and broadcasting tf: by tf2_ros where it is installed, else by its messages alone.
+
+The wheels of pip have neither tf2_ros nor tf2_msgs; `make` builds the latter.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import yaml
+from geometry_msgs.msg import TransformStamped
+from rclpy.time import Time
+
+from segfloor_ros.frames import FrameTree
+from segfloor_ros.geometry import Array
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.errors import MessageError
+from segfloor_ros.messages.headers import to_ns, to_time
+from segfloor_ros.messages.poses import transform_array
+from segfloor_ros.nodes.managed_node import ManagedNode
+
+
+class TfLink(Protocol):
+    """What the nodes need of tf."""
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
+        """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
+
+    def root_of(self, frame: str) -> str:
+        """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
+
+    def send(self, transforms: Sequence[TransformStamped]) -> None:
+        """Broadcast transforms at one time."""
+
+    def send_fixed(self, transform: TransformStamped) -> None:
+        """Broadcast a transform that holds from now on."""
+
+    def stop_listening(self) -> None:
+        """Read no more."""
+
+
+def tf_link(node: ManagedNode) -> TfLink | None:
+    """Return the node's access to tf, or None where there is no tf."""
+    if importlib.util.find_spec('tf2_ros') is not None:
+        return Tf2Ros(node)
+    if importlib.util.find_spec('tf2_msgs') is not None:
+        return TfMessages(node)
+    return None
+
+
+class Tf2Ros:
+    """tf by tf2_ros."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        import tf2_ros
+
+        self._node = node
+        self._error: type[Exception] = tf2_ros.TransformException
+        self._buffer: Any = tf2_ros.Buffer()
+        self._listener: Any = tf2_ros.TransformListener(self._buffer, node)
+        self._moving: Any = tf2_ros.TransformBroadcaster(node)
+        self._fixed: Any = tf2_ros.StaticTransformBroadcaster(node)
+        node.at_cleanup(self._end)
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
+        """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
+        time = Time() if stamp_ns is None else Time.from_msg(to_time(stamp_ns))
+        try:
+            return transform_array(self._buffer.lookup_transform(target, source, time))
+        except self._error:
+            return None
+
+    def root_of(self, frame: str) -> str:
+        """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
+        frames = yaml.safe_load(self._buffer.all_frames_as_yaml()) or {}
+        passed = set()
+        while frame in frames and frame not in passed:
+            passed.add(frame)
+            frame = frames[frame]['parent']
+        return frame
+
+    def send(self, transforms: Sequence[TransformStamped]) -> None:
+        """Broadcast transforms at one time."""
+        self._moving.sendTransform(list(transforms))
+
+    def send_fixed(self, transform: TransformStamped) -> None:
+        """Broadcast a transform that holds from now on."""
+        self._fixed.sendTransform(transform)
+
+    def stop_listening(self) -> None:
+        """Read no more."""
+        if self._listener is not None:
+            self._listener.unregister()
+        self._listener = None
+
+    def _end(self) -> None:
+        self.stop_listening()
+        for broadcaster in (self._moving, self._fixed):
+            self._node.destroy_publisher(broadcaster.pub_tf)
+
+
+class TfMessages:
+    """tf by its messages alone."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        self._type: Any = TFMessage
+        self._node = node
+        self._frames = FrameTree()
+        self._moving = node.keep_publisher(TFMessage, '/tf', qos.TF)
+        self._fixed = node.keep_publisher(TFMessage, '/tf_static', qos.TF_STATIC)
+        self._stop = [
+            node.keep_subscription(TFMessage, '/tf', self._take_moving, qos.TF),
+            node.keep_subscription(
+                TFMessage, '/tf_static', self._take_fixed, qos.TF_STATIC_LISTENER
+            ),
+        ]
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
+        """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
+        return self._frames.lookup(target, source, stamp_ns)
+
+    def root_of(self, frame: str) -> str:
+        """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
+        return self._frames.root_of(frame)
+
+    def send(self, transforms: Sequence[TransformStamped]) -> None:
+        """Broadcast transforms at one time."""
+        self._moving.publish(self._type(transforms=list(transforms)))
+
+    def send_fixed(self, transform: TransformStamped) -> None:
+        """Broadcast a transform that holds from now on."""
+        self._fixed.publish(self._type(transforms=[transform]))
+
+    def stop_listening(self) -> None:
+        """Read no more."""
+        while self._stop:
+            self._stop.pop()()
+
+    def _take_moving(self, message: Any) -> None:
+        self._take(
+            message,
+            lambda found, T: self._frames.add_moving(
+                to_ns(found.header.stamp), found.header.frame_id, found.child_frame_id, T
+            ),
+        )
+
+    def _take_fixed(self, message: Any) -> None:
+        self._take(
+            message,
+            lambda found, T: self._frames.add_fixed(found.header.frame_id, found.child_frame_id, T),
+        )
+
+    def _take(self, message: Any, add: Callable[[TransformStamped, Array], None]) -> None:
+        for found in message.transforms:
+            self._take_one(found, add)
+
+    def _take_one(
+        self, found: TransformStamped, add: Callable[[TransformStamped, Array], None]
+    ) -> None:
+        try:
+            add(found, transform_array(found))
+        except MessageError as error:
+            self._node.get_logger().warning(
+                f'tf from {found.header.frame_id} to {found.child_frame_id}: {error}',
+                throttle_duration_sec=5.0,
+            )
