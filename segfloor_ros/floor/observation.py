@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 FLOOR = 255
 NO_EVIDENCE = 127
 NOT_FLOOR = 0
+RANGE_MAX_ERROR_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -19,19 +21,26 @@ class FloorScan:
     clockwise from x forward. ranges_m: (N,) float32 in metres; 0 where something stands right
     in front, NaN where the image shows nothing about that bearing. obstacle_m: (N,) float32,
     distance at which the nearest upright thing was measured on that bearing, NaN where none
-    was; None from a source that does not tell.
+    was; None from a source that does not tell. range_max_m: the range whose error, one sigma, is
+    `RANGE_MAX_ERROR_M`; errors grow with the square of the range.
     """
 
     angle_min_rad: float
     angle_increment_rad: float
     ranges_m: NDArray[np.float32]
     obstacle_m: NDArray[np.float32] | None = None
+    range_max_m: float = math.inf
 
     @property
     def bearings_rad(self) -> NDArray[np.float64]:
         """Bearings (N,) in radians."""
         steps = np.arange(len(self.ranges_m), dtype=np.float64)
         return self.angle_min_rad + self.angle_increment_rad * steps
+
+    @property
+    def error_per_m(self) -> float:
+        """The error of a range, one sigma, is this times the square of the range."""
+        return RANGE_MAX_ERROR_M / self.range_max_m**2
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
@@ -23,6 +25,12 @@ _SPREAD = 0.06
 """What stands upright is measured within this share of its range."""
 _UPRIGHT_M = 0.08
 """So much of an upright surface must be seen to end the scan."""
+_LOG_STEP = 0.01
+_SPREAD_BINS = round(_SPREAD / _LOG_STEP)
+_NEAREST_M = 0.1
+_MEDIAN_ROUNDS = 3
+_MEDIAN_NOISE = 0.35
+"""Error of the median of the disparities on one bearing, as a share of that of one disparity."""
 
 
 class FloorScanner:
@@ -35,11 +43,19 @@ class FloorScanner:
         self._height_m = mount.height_m
         border = _floor_on_border(camera, mount)
         bearing = np.arctan2(border[:, 1], border[:, 0])
-        step = settings.scan_increment_rad
+        # Whole in single precision, as a message carries it.
+        step = self._step = float(np.float32(settings.scan_increment_rad))
         first = np.floor(bearing.min() / step) if len(border) else 0.0
-        self._angle_min = float(first * step)
+        self._angle_min = float(np.float32(first * step))
         self._count = int(np.ceil(bearing.max() / step) - first) + 1 if len(border) else 1
-        self._middle = (np.arange(0, settings.scan_range_m, RANGE_STEP_M)) + RANGE_STEP_M / 2
+        noise_px = _MEDIAN_NOISE * settings.disparity_noise_px
+        # Depth from disparity: an error of the disparity d grows to Z^2 / (f b) times as much.
+        range_max_m = math.sqrt(RANGE_MAX_ERROR_M * camera.disparity_times_depth / noise_px)
+        self._range_max_m = float(np.float32(range_max_m))
+        range_m = settings.scan_range_m or range_max_m
+        self._middle = np.arange(0, range_m, RANGE_STEP_M) + RANGE_STEP_M / 2
+        decades = np.log(range_m / _NEAREST_M)
+        self._log_bins = np.arange(math.ceil(decades / _LOG_STEP))
         nearest = np.full(self._count, np.inf)
         np.minimum.at(nearest, self._bearing_index(border.T), np.hypot(*border.T))
         self._nearest = nearest
@@ -93,9 +109,10 @@ class FloorScanner:
         upright_m = np.where(touches | in_front, upright_m, np.nan)
         return FloorScan(
             self._angle_min,
-            self._settings.scan_increment_rad,
+            self._step,
             ranges.astype(np.float32),
             upright_m.astype(np.float32),
+            self._range_max_m,
         )
 
     def _tolerance(self, range_m: Array) -> Array:
@@ -123,34 +140,56 @@ class FloorScanner:
         """Return the range (N,) of the nearest upright thing, NaN where there is none.
 
         It must show as many pixels, within the spread of its disparities, as an upright surface
-        of a given height does at its range.
+        of a given height does at its range. Its range is the median of its pixels: of those within
+        the spread on both sides of it.
         """
-        camera, middle = self._camera, self._middle
-        wide = camera.fx * self._settings.scan_increment_rad * density
+        camera, middle = self._camera, _NEAREST_M * np.exp(_LOG_STEP * (self._log_bins + 0.5))
+        wide = camera.fx * self._step * density
         needed = np.maximum(2.0, 0.5 * wide * _UPRIGHT_M * camera.fy / middle)
-        total = np.concatenate([np.zeros((self._count, 1)), np.cumsum(counts, axis=1)], axis=1)
-        first = np.arange(len(middle))
-        end = np.minimum(np.ceil(middle * (1 + _SPREAD) / RANGE_STEP_M), len(middle)).astype(int)
-        within = total[:, end] - total[:, first]
+        last = len(middle)
+        total = np.zeros((self._count, last + 1))
+        np.cumsum(counts, axis=1, out=total[:, 1:])
+        within = total[:, np.minimum(self._log_bins + _SPREAD_BINS, last)] - total[:, :-1]
         enough = within >= needed
-        begin = np.where(enough.any(axis=1), enough.argmax(axis=1), 0)
-        rows = np.arange(self._count)
-        half = total[rows, begin] + 0.5 * within[rows, begin]
-        centre = (total[:, 1:] >= half[:, None]).argmax(axis=1)
-        return np.where(enough.any(axis=1), middle[centre], np.nan)
+        found = np.flatnonzero(enough.any(axis=1))
+        total, begin = total[found], enough[found].argmax(axis=1)
+        end = np.minimum(begin + _SPREAD_BINS, last)
+        for _ in range(_MEDIAN_ROUNDS):
+            at = _median_bin(total, begin, end)
+            middle_bin = at.astype(np.intp)
+            begin = np.maximum(middle_bin - _SPREAD_BINS, 0)
+            end = np.minimum(middle_bin + _SPREAD_BINS + 1, last)
+        upright_m = np.full(self._count, np.nan)
+        upright_m[found] = _NEAREST_M * np.exp(_LOG_STEP * _median_bin(total, begin, end))
+        return upright_m
 
     def _bearing_index(self, xy: NDArray[np.floating]) -> NDArray[np.intp]:
         bearing = np.arctan2(xy[1], xy[0])
-        offset = (bearing - self._angle_min) / self._settings.scan_increment_rad
+        offset = (bearing - self._angle_min) / self._step
         return np.clip(np.rint(offset), 0, self._count - 1).astype(np.intp)
 
     def _polar_counts(self, xy: NDArray[np.float32]) -> NDArray[np.intp]:
-        n, m = self._count, len(self._middle)
-        ranges = np.hypot(xy[0], xy[1])
-        near = ranges < self._settings.scan_range_m
-        cell = self._bearing_index(xy[:, near]) * m
-        cell += np.minimum((ranges[near] / RANGE_STEP_M).astype(np.intp), m - 1)
+        """Return how many points (2, M) lie at every bearing in bins of the same share of the
+        range.
+        """
+        n, m = self._count, len(self._log_bins)
+        ranges = np.maximum(np.hypot(xy[0], xy[1]), _NEAREST_M)
+        bins = (np.log(ranges * (1 / _NEAREST_M)) * (1 / _LOG_STEP)).astype(np.intp)
+        near = bins < m
+        cell = self._bearing_index(xy[:, near]) * m + bins[near]
         return np.bincount(cell, minlength=n * m).reshape(n, m)
+
+
+def _median_bin(total: Array, begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
+    """Return where, in bins (N,), half of what lies in the bins from begin to end (N,) is passed.
+
+    total: (N, M + 1), how much lies in all bins before one.
+    """
+    rows = np.arange(len(total))
+    half = 0.5 * (total[rows, begin] + total[rows, end])
+    middle = (total[:, 1:] >= half[:, None]).argmax(axis=1)
+    before, after = total[rows, middle], total[rows, middle + 1]
+    return middle + (half - before) / np.maximum(after - before, 1.0)
 
 
 def _floor_on_border(camera: StereoCamera, mount: Mount) -> Array:

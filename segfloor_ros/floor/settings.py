@@ -163,10 +163,10 @@ class FloorSegmentationSettings(StageSettings):
         maximum=0.1,
     )
     scan_range_m: float = setting(
-        8.0,
-        'Longest range of the floor scan.',
+        0.0,
+        'Longest range of the floor scan; 0 derives it from focal length and baseline.',
         unit='m',
-        minimum=0.5,
+        minimum=0.0,
         maximum=60.0,
     )
     scan_gap_m: float = setting(

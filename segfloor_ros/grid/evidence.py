@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +12,15 @@ from numpy.typing import NDArray
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.grid.fan import find_jumps, unit_vectors
+from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
 QUARTILE = 0.675
 """Quartiles of a normal distribution lie this many sigmas from its mean."""
+
+_FREE_ERROR_M = 0.12
+"""Where the end of the floor is less certain than this, one sigma, it is not mapped by default."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,7 @@ class KeyframeEvidence:
     that reach farther than the fan. Then come lines along what the floor ends at, num_contacts
     ends and as many starts; the others are obstacle points at any height that concerns the robot.
     thickness_m: (num_contacts,) float16, how deep the things behind these lines are taken to be.
+    hit_range_m: up to where an obstacle would have been placed well enough.
     """
 
     first_rad: float
@@ -37,6 +43,7 @@ class KeyframeEvidence:
     num_rays: int
     num_contacts: int
     thickness_m: NDArray[np.float16]
+    hit_range_m: float
 
 
 def gather_evidence(
@@ -48,14 +55,16 @@ def gather_evidence(
 ) -> KeyframeEvidence:
     """Return what the keyframe at T_map_base (4, 4) says, by its features and its floor scan."""
     if not settings.use_scan:
-        scan = FloorScan(0.0, 1.0, np.zeros(0, np.float32))
+        nothing = np.zeros(0, np.float32)
+        scan = dataclasses.replace(scan, ranges_m=nothing, obstacle_m=None)
     floor, obstacles = _seen_points(points, features, T_map_base)
     if not settings.use_points:
         floor, obstacles = floor[:0], obstacles[:0]
-    free_m = np.minimum(_floor_end(scan, settings), settings.max_range_m)
+    faces_m, hit_m = _faces(scan, settings), hit_range_m(scan, settings)
+    free_m = np.minimum(_floor_end(scan, faces_m), free_range_m(scan, settings))
     rays = _rays(floor, scan, settings)
-    starts, ends = _contacts(scan, settings)
-    obstacles = obstacles[np.hypot(obstacles[:, 0], obstacles[:, 1]) <= hit_range_m(settings)]
+    starts, ends = _contacts(scan, faces_m)
+    obstacles = obstacles[np.hypot(obstacles[:, 0], obstacles[:, 1]) <= hit_m]
     return KeyframeEvidence(
         first_rad=scan.angle_min_rad,
         step_rad=scan.angle_increment_rad,
@@ -63,16 +72,28 @@ def gather_evidence(
         positions_m=np.concatenate([rays, ends, starts, obstacles]).T.astype(np.float16),
         num_rays=len(rays),
         num_contacts=len(starts),
-        thickness_m=_thickness_m(starts, settings),
+        thickness_m=_thickness_m(starts, scan, settings),
+        hit_range_m=hit_m,
     )
 
 
-def hit_range_m(settings: OccupancyGridSettings) -> float:
+def hit_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
     """Return up to which distance an obstacle is placed well enough to mark a cell."""
-    if settings.range_error_per_m == 0:
+    limit_m = free_range_m(scan, settings)
+    if scan.error_per_m == 0:
+        return limit_m
+    return min(limit_m, math.sqrt(settings.max_hit_error_m / scan.error_per_m))
+
+
+def free_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
+    """Return up to which distance floor is marked free: as set, or where the scan's error becomes
+    that of a map still worth having.
+    """
+    if settings.max_range_m > 0:
         return settings.max_range_m
-    certain = float(np.sqrt(settings.max_hit_error_m / settings.range_error_per_m))
-    return min(settings.max_range_m, certain)
+    if scan.error_per_m == 0:
+        return math.inf
+    return math.sqrt(_FREE_ERROR_M / scan.error_per_m)
 
 
 def ray_length_limit(lengths_m: Array) -> float:
@@ -97,35 +118,40 @@ def _seen_points(
     return in_base[label == FLOOR, :2], in_base[label == OBSTACLE, :2]
 
 
-def _floor_end(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
+def _floor_end(scan: FloorScan, faces_m: Array) -> Array:
     """Return how far the floor certainly reaches along the scan's bearings, (S,), 0 where unknown.
 
-    Where the floor fades out, its end is as uncertain as its distance. Where it ends at something
-    that was placed itself, that is the end; matching blurs the seam between the two, and a gap no
-    wider than the blur is floor up to the foot of what stands there.
+    Where it ends at a face (S,), that is the end; where it fades out, its end is as uncertain as
+    its distance.
     """
     seen_m = np.nan_to_num(scan.ranges_m.astype(np.float64))
-    end_m = _certain(seen_m, settings)
-    if scan.obstacle_m is None:
-        return end_m
+    ends = np.isfinite(faces_m) & (seen_m > 0)
+    return np.where(ends, faces_m, _certain(seen_m, scan))
+
+
+def _faces(scan: FloorScan, settings: OccupancyGridSettings) -> Array:
+    """Return where, along the scan's bearings, faces begin that are placed well enough, (S,), NaN
+    elsewhere.
+
+    A cell into which something reaches by more than a share of its side is occupied, but cells
+    are decided by their centres: faces are taken to stand that much nearer.
+    """
+    if scan.obstacle_m is None or len(scan.obstacle_m) == 0:
+        return np.full(len(scan.ranges_m), np.nan)
     standing_m = scan.obstacle_m.astype(np.float64)
-    seam_m = settings.seam_m + settings.seam_per_m * standing_m**2
-    with np.errstate(invalid='ignore'):
-        joined = (seen_m > 0) & (standing_m - seen_m <= seam_m)
-        joined &= standing_m <= hit_range_m(settings)
-    return np.where(joined, standing_m, end_m)
+    standing_m[~(standing_m <= hit_range_m(scan, settings))] = np.nan
+    nearer_m = (0.5 - settings.occupied_share) * settings.resolution_m
+    return np.maximum(standing_m - nearer_m * slant(standing_m, scan.angle_increment_rad), 0.0)
 
 
-def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> tuple[Array, Array]:
-    """Return the faces that the scan's bearings end at, as lines: starts (C, 2) and ends (C, 2)
-    in the base frame.
+def _contacts(scan: FloorScan, faces_m: Array) -> tuple[Array, Array]:
+    """Return the faces (S,) that the scan's bearings end at as lines: starts (C, 2) and ends
+    (C, 2) in the base frame.
 
     A line joins neighbouring bearings where they see the same surface, and is a point elsewhere.
     """
-    if scan.obstacle_m is None:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    near = np.flatnonzero(scan.obstacle_m <= hit_range_m(settings))
-    distance_m = scan.obstacle_m[near].astype(np.float64)
+    near = np.flatnonzero(np.isfinite(faces_m))
+    distance_m = faces_m[near]
     start = (unit_vectors(scan.bearings_rad[near]) * distance_m).T
     joined = np.zeros(len(near), np.bool_)
     joined[:-1] = (np.diff(near) == 1) & ~find_jumps(distance_m)
@@ -133,17 +159,19 @@ def _contacts(scan: FloorScan, settings: OccupancyGridSettings) -> tuple[Array, 
     return start, end
 
 
-def _thickness_m(faces: Array, settings: OccupancyGridSettings) -> NDArray[np.float16]:
+def _thickness_m(
+    faces: Array, scan: FloorScan, settings: OccupancyGridSettings
+) -> NDArray[np.float16]:
     """Return how deep (C,) to mark behind faces (C, 2): two sigma of their distance, and no less
     than things that stand have.
     """
-    error_m = settings.range_error_per_m * (faces**2).sum(axis=1)
+    error_m = scan.error_per_m * (faces**2).sum(axis=1)
     return np.maximum(2 * error_m, settings.min_thickness_m).astype(np.float16)
 
 
-def _certain(range_m: Array, settings: OccupancyGridSettings) -> Array:
+def _certain(range_m: Array, scan: FloorScan) -> Array:
     """Return ranges (N,) shortened by their error."""
-    return np.maximum(range_m - settings.range_error_per_m * range_m**2, 0.0)
+    return np.maximum(range_m - scan.error_per_m * range_m**2, 0.0)
 
 
 def _rays(floor: Array, scan: FloorScan, settings: OccupancyGridSettings) -> Array:
@@ -153,13 +181,13 @@ def _rays(floor: Array, scan: FloorScan, settings: OccupancyGridSettings) -> Arr
     standing there are wrong.
     """
     length_m = np.hypot(floor[:, 0], floor[:, 1])
-    usable = (length_m > 0) & (length_m <= settings.max_range_m)
+    usable = (length_m > 0) & (length_m <= free_range_m(scan, settings))
     if usable.any():
         usable &= length_m <= ray_length_limit(length_m[usable])
     scanned_m, standing_m = _scan_at(scan, floor)
     usable &= (length_m > scanned_m) & (length_m < standing_m)
     floor, length_m = floor[usable], length_m[usable]
-    return floor * (_certain(length_m, settings) / length_m)[:, None]
+    return floor * (_certain(length_m, scan) / length_m)[:, None]
 
 
 def _scan_at(scan: FloorScan, points: Array) -> tuple[Array, Array]:

@@ -13,6 +13,8 @@ from segfloor_ros.geometry import Array
 SUBPIXEL_BITS = 4
 SAME_SURFACE_SHARE = 0.06
 """Neighbouring bearings whose ranges differ by more than this share end at different things."""
+_SLANT_STEPS = 3
+_MAX_SLANT = 4.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,20 @@ def find_jumps(lengths: Array) -> NDArray[np.bool_]:
     """Tell where neighbouring lengths (S,) end at different things, (S - 1,)."""
     first, second = lengths[:-1], lengths[1:]
     return np.abs(first - second) > SAME_SURFACE_SHARE * np.minimum(first, second)
+
+
+def slant(range_m: Array, step_rad: float) -> Array:
+    """Return how much longer (S,) the way through a face along its bearing is than straight across
+    it, from the ranges (S,) to faces on neighbouring bearings, NaN where there is none.
+    """
+    rise = np.full((2, len(range_m)), np.nan)
+    change = (range_m[_SLANT_STEPS:] - range_m[:-_SLANT_STEPS]) / (_SLANT_STEPS * step_rad)
+    rise[0, :-_SLANT_STEPS] = change / range_m[:-_SLANT_STEPS]
+    rise[1, _SLANT_STEPS:] = change / range_m[_SLANT_STEPS:]
+    rise[~(np.abs(rise) <= SAME_SURFACE_SHARE / step_rad)] = np.nan
+    known = np.isfinite(rise)
+    mean = np.where(known, rise, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.minimum(np.sqrt(1 + mean**2), _MAX_SLANT)
 
 
 def unit_vectors(bearing_rad: Array) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.grid.blocking import nearest_cells
-from segfloor_ros.grid.evidence import KeyframeEvidence, hit_range_m
+from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
 from segfloor_ros.grid.hits import draw_hits, draw_rays
 from segfloor_ros.grid.log_odds import ZERO, steps
@@ -29,7 +29,6 @@ class EvidenceFolder:
     def __init__(self, settings: OccupancyGridSettings) -> None:
         self._resolution_m = settings.resolution_m
         self._radius_m = settings.footprint_radius_m
-        self._hit_range = hit_range_m(settings) / settings.resolution_m
         self._least = ZERO - steps(-settings.min_log_odds)
         self._occupied = ZERO + steps(settings.occupied_log_odds)
         value = np.arange(256)
@@ -99,11 +98,11 @@ class EvidenceFolder:
 
     def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the free cells that are near enough for an obstacle there to be placed, 1."""
-        if placed.reach <= self._hit_range:
+        if placed.reach <= placed.hit_range:
             return free
         near = np.zeros_like(free)
         centre = fixed_point(placed.fan.centre[:, None])[0].tolist()
-        radius = round(self._hit_range * (1 << SUBPIXEL_BITS))
+        radius = round(placed.hit_range * (1 << SUBPIXEL_BITS))
         cv2.circle(near, centre, radius, 1, cv2.FILLED, shift=SUBPIXEL_BITS)
         near &= free
         return near

@@ -22,7 +22,7 @@ class PlacedEvidence:
     touches. previous: (2,), where the base came from. rays: (2, R), ends of single rays. faces:
     (2, C + P), starts of the lines along contacts, then obstacle points; outward: (2, C + P), unit
     vectors from the base to them. ends: (2, C), where these lines end; thickness: (C,), how deep
-    is what stands behind them.
+    is what stands behind them. hit_range: how far obstacles are placed well enough.
     """
 
     low: tuple[int, int]
@@ -34,6 +34,7 @@ class PlacedEvidence:
     faces: Array
     outward: Array
     thickness: Array
+    hit_range: float
 
     @property
     def reach(self) -> float:
@@ -88,4 +89,5 @@ def place(
         faces=positions[:, faces:],
         outward=outward,
         thickness=thickness,
+        hit_range=evidence.hit_range_m * scale,
     )

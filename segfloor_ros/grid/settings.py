@@ -19,44 +19,26 @@ class OccupancyGridSettings(StageSettings):
         maximum=0.2,
     )
     max_range_m: float = setting(
-        5.0,
-        'Longest ray that marks free cells.',
+        0.0,
+        'Longest ray that marks free cells; 0 is as far as the camera can tell where floor ends.',
         unit='m',
-        minimum=0.5,
+        minimum=0.0,
         maximum=50.0,
         live=True,
     )
-    range_error_per_m: float = setting(
-        0.003,
-        'Error of where the floor ends: this times the square of the distance in metres.',
-        unit='1/m',
-        minimum=0.0,
-        maximum=0.1,
-        live=True,
-    )
     max_hit_error_m: float = setting(
-        0.04,
+        0.05,
         'Obstacles whose distance is less certain than this mark no cell.',
         unit='m',
         minimum=0.005,
         maximum=1.0,
         live=True,
     )
-    seam_m: float = setting(
-        0.06,
-        'A gap of this width between floor and what stands behind it counts as floor.',
-        unit='m',
+    occupied_share: float = setting(
+        0.2,
+        'A cell into which an obstacle reaches by more than this share of its side is occupied.',
         minimum=0.0,
         maximum=0.5,
-        live=True,
-    )
-    seam_per_m: float = setting(
-        0.02,
-        'Growth of that width: this times the square of the distance in metres.',
-        unit='1/m',
-        minimum=0.0,
-        maximum=0.2,
-        live=True,
     )
     min_thickness_m: float = setting(
         0.03,

@@ -14,8 +14,6 @@ from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.images import image_message
 
-MAX_RANGE_M = 1000.0
-
 
 def disparity_message(
     stamp_ns: int, frame_id: str, camera: StereoCamera, floor: FloorObservation
@@ -36,7 +34,8 @@ def disparity_message(
 
 def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
     """Return the floor scan in the base's plane: how far the floor was seen, per bearing. The
-    distances of upright things go into `intensities`, which stay empty where they are not known.
+    distances of upright things go into `intensities`, which stay empty where they are not known;
+    `range_max` is the range whose error is 0.3 m, one sigma.
     """
     ranges = np.ascontiguousarray(scan.ranges_m, np.float32)
     obstacles = scan.obstacle_m if scan.obstacle_m is not None else np.zeros(0, np.float32)
@@ -47,7 +46,7 @@ def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
         angle_max=float(scan.angle_min_rad + steps * scan.angle_increment_rad),
         angle_increment=float(scan.angle_increment_rad),
         range_min=0.0,
-        range_max=MAX_RANGE_M,
+        range_max=float(scan.range_max_m),
         ranges=array.array('f', ranges.tobytes()),
         intensities=array.array('f', np.ascontiguousarray(obstacles, np.float32).tobytes()),
     )
@@ -55,6 +54,8 @@ def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
 
 def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
     """Return the floor scan of a message. Raises MessageError, naming the topic."""
+    if not message.range_max > 0:
+        raise MessageError(f'{topic}: range_max of the scan is {message.range_max:g} m')
     if not np.isfinite([message.angle_min, message.angle_increment]).all():
         raise MessageError(f'{topic}: the angles of the scan are not finite')
     ranges = np.frombuffer(message.ranges, np.float32).copy()
@@ -66,4 +67,5 @@ def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
         float(message.angle_increment),
         ranges,
         obstacles if len(obstacles) else None,
+        float(message.range_max),
     )

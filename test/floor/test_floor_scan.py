@@ -1,5 +1,7 @@
 """Scans of points placed by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
@@ -59,6 +61,38 @@ def test_a_wall_ends_the_scan_where_it_stands():
     result = scan((0.35, 1.95), (2.05, 4.0), upright=wall)
     assert at(result, result.ranges_m) == pytest.approx(2.0, abs=0.03)
     assert at(result, result.obstacle_m) == pytest.approx(2.0, abs=0.03)
+
+
+@pytest.mark.parametrize('distance_m', [0.8, 1.5, 3.0])
+def test_a_noisy_wall_is_placed_without_bias(distance_m):
+    # Disparities with an error of half a pixel, as the matcher makes them.
+    rng = np.random.default_rng(4)
+    true = np.repeat(fan(distance_m, distance_m + 0.005), 60, axis=1)
+    disparity_m = CAMERA.disparity_times_depth
+    noise_px = rng.normal(0, 0.5, true.shape[1]).astype(np.float32)
+    wall = true / (1 + noise_px * distance_m / disparity_m)
+    result = scan((0.35, distance_m - 0.05), upright=wall)
+    placed_m = result.obstacle_m[np.abs(result.bearings_rad) < np.radians(9)]
+    assert np.median(placed_m) == pytest.approx(distance_m, rel=0.004)
+    assert np.std(placed_m) < result.error_per_m * distance_m**2
+
+
+@pytest.mark.parametrize(('focal', 'baseline', 'range_max_m'), [(1, 1, 1), (4, 1, 2), (2, 8, 4)])
+def test_the_range_follows_the_camera(focal, baseline, range_max_m):
+    # Errors of depth shrink with focal length times baseline; the range grows with its root.
+    def made_by(camera):
+        scanner = FloorScanner(camera, MOUNT, SETTINGS)
+        nothing = np.zeros(scanner.cells_xy.shape[1], bool)
+        made = scanner.scan(nothing, nothing, np.zeros((2, 0), np.float32), 0.5)
+        return made, np.hypot(*scanner.cells_xy).max()
+
+    other = dataclasses.replace(
+        CAMERA, fx=focal * CAMERA.fx, baseline_m=baseline * CAMERA.baseline_m
+    )
+    (usual, usual_m), (changed, changed_m) = made_by(CAMERA), made_by(other)
+    assert changed.range_max_m / usual.range_max_m == pytest.approx(range_max_m, rel=1e-5)
+    assert changed_m / usual_m == pytest.approx(range_max_m, rel=0.02)
+    assert changed.error_per_m == pytest.approx(usual.error_per_m / range_max_m**2, rel=1e-5)
 
 
 def test_a_gap_ends_the_scan():

@@ -16,6 +16,8 @@ from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 FIELD_OF_VIEW_RAD = np.pi / 2
 SIGHT_M = 8.0
+RANGE_MAX_M = 10.0
+"""Where the error is 0.3 m: 3 mm at one metre."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,11 @@ class Drive:
         floor = np.minimum(np.where(leaks, seen + 1.5, seen), SIGHT_M)
         obstacle = np.where(leaks | (seen > SIGHT_M), np.nan, seen)
         return FloorScan(
-            -FIELD_OF_VIEW_RAD / 2, step, floor.astype(np.float32), obstacle.astype(np.float32)
+            -FIELD_OF_VIEW_RAD / 2,
+            step,
+            floor.astype(np.float32),
+            obstacle.astype(np.float32),
+            RANGE_MAX_M,
         )
 
     def look(

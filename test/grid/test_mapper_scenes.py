@@ -17,6 +17,28 @@ ROOM = World(walls=((4, -3, 4, 3), (-1, 2, 4, 2), (-1, -2, 4, -2)))
 AHEAD = [(0.02 * i, 0.0, 0.0) for i in range(100)]
 
 
+@pytest.mark.parametrize(('reach_m', 'expected'), [(0.005, 0), (0.02, 100), (0.045, 100)])
+def test_a_cell_into_which_a_wall_reaches_far_enough_is_occupied(
+    make_drive: MakeDrive, reach_m: float, expected: int
+) -> None:
+    # A fifth of 5 cm is 1 cm.
+    wall = World(walls=((2.0 - reach_m, -3, 2.0 - reach_m, 3),))
+    drive = make_drive(OccupancyGridSettings(occupied_share=0.2), error_per_m=0.0)
+    for pose in AHEAD[:40:4]:
+        drive.look(wall, pose)
+    assert (cells_at(drive.grid(), centres((1.95, 2.0), (-0.3, 0.3))) == expected).all()
+
+
+def test_a_wall_seen_askew_is_placed_across_it(make_drive: MakeDrive) -> None:
+    # Along the bearing the way through a cell is several times as long.
+    wall = World(walls=((-1.0, 0.98, 6.0, 0.98),))
+    drive = make_drive(OccupancyGridSettings(occupied_share=0.2), error_per_m=0.0)
+    for pose in AHEAD[:60:2]:
+        drive.look(wall, pose)
+    assert (cells_at(drive.grid(), centres((2.0, 3.0), (0.9, 0.95))) == 0).all()
+    assert (cells_at(drive.grid(), centres((2.0, 3.0), (0.95, 1.0))) == 100).mean() > 0.9
+
+
 def with_disc(world: World, *disc: float) -> World:
     return World((*world.discs, disc), world.walls)  # type: ignore[arg-type]
 
