@@ -70,7 +70,7 @@ setup(
     entry_points={
         'console_scripts': [
             'segfloor = segfloor_ros.cli.main:main',
-            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
+            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, 'segfloor_pipeline')),
         ],
     },
     zip_safe=True,

@@ -16,6 +16,7 @@ from segfloor_ros.messages.clouds import (
 )
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.stage_node import StageNode, run_node
 
 MAP_POINTS, FEATURES, MASK = 'map_points', 'keyframe/features', 'keyframe/floor_mask'
@@ -24,8 +25,8 @@ MAP_POINTS, FEATURES, MASK = 'map_points', 'keyframe/features', 'keyframe/floor_
 class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
     """Labels the sparse map at every keyframe."""
 
-    def __init__(self) -> None:
-        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
+    def __init__(self, hand_over: HandOver | None = None) -> None:
+        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings, hand_over)
 
     def set_up(self) -> None:
         """Make the topics."""

@@ -17,6 +17,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.stage_node import StageNode, run_node
 
 LEFT, RIGHT = 'keyframe/left/image_rect', 'keyframe/right/image_rect'
@@ -28,8 +29,8 @@ MAX_WAITING_FOR_MOUNT = 100
 class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentationNodeSettings]):
     """Segments the floor of every keyframe."""
 
-    def __init__(self) -> None:
-        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings)
+    def __init__(self, hand_over: HandOver | None = None) -> None:
+        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings, hand_over)
 
     def set_up(self) -> None:
         """Make the topics."""

@@ -16,6 +16,7 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
+from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher, LocalSubscription
 
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -29,12 +30,13 @@ class ManagedNode(LifecycleNode):
     stays to be had; cleaned up it has neither.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, hand_over: HandOver | None = None) -> None:
         super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self._hand_over = hand_over
         self._openers: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = []
         self._open: list[tuple[Any, Callable[[Any], Any]]] = []
         self._kept: list[tuple[Any, Callable[[Any], Any]]] = []
-        self._heard: dict[str, Subscription] = {}
+        self._heard: dict[str, Subscription | LocalSubscription] = {}
         self._is_set_up = self._is_active = self._is_paused = False
         self._fault: Exception | None = None
         self._answer_impossible_transitions()
@@ -87,11 +89,15 @@ class ManagedNode(LifecycleNode):
         self._is_paused = paused
         self._open_or_close()
 
-    def keep_publisher(self, kind: Any, name: str, profile: QoSProfile) -> Publisher:
+    def keep_publisher(
+        self, kind: Any, name: str, profile: QoSProfile
+    ) -> Publisher | LocalPublisher:
         """Create a publisher that lives until the node is cleaned up."""
         publisher = self.create_publisher(kind, name, profile)
         self._kept.append((publisher, self.destroy_publisher))
-        return publisher
+        if self._hand_over is None:
+            return publisher
+        return self._hand_over.publisher(publisher, profile)
 
     def keep_subscription(
         self, kind: Any, name: str, callback: Callable[[Any], None], profile: QoSProfile
@@ -127,11 +133,16 @@ class ManagedNode(LifecycleNode):
     ) -> None:
         """Subscribe to a topic while the inputs are open. raw: take the serialized messages."""
 
-        def subscribe() -> Subscription:
-            self._heard[name] = self.create_subscription(kind, name, callback, profile, raw=raw)
-            return self._heard[name]
+        def subscribe() -> Subscription | LocalSubscription:
+            local = None
+            if self._hand_over is not None:
+                topic = self.resolve_topic_name(name)
+                local = self._hand_over.subscribe(topic, callback, profile, raw)
+            made = local or self.create_subscription(kind, name, callback, profile, raw=raw)
+            self._heard[name] = made
+            return made
 
-        self._openers.append((subscribe, self.destroy_subscription))
+        self._openers.append((subscribe, self._unsubscribe))
 
     def publisher_count(self, name: str) -> int:
         """Return how many publish a topic that the node listens to now."""
@@ -223,6 +234,12 @@ class ManagedNode(LifecycleNode):
                 destroy(entity)
             self._heard.clear()
             self.on_inputs_closed()
+
+    def _unsubscribe(self, subscription: Subscription | LocalSubscription) -> None:
+        if not isinstance(subscription, LocalSubscription):
+            self.destroy_subscription(subscription)
+        elif self._hand_over is not None:
+            self._hand_over.unsubscribe(subscription)
 
     def _answer_pause(
         self, request: SetBool.Request, response: SetBool.Response

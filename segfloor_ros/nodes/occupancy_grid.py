@@ -21,6 +21,7 @@ from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.stage_node import PATH, StageNode, run_node
 
 POINTS, FEATURES = 'labelled_points', 'keyframe/features'
@@ -30,8 +31,8 @@ POSE, SCAN = 'keyframe/odometry', 'keyframe/floor_scan'
 class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettings]):
     """Builds the map at every keyframe and publishes it."""
 
-    def __init__(self) -> None:
-        super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings)
+    def __init__(self, hand_over: HandOver | None = None) -> None:
+        super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings, hand_over)
 
     def set_up(self) -> None:
         """Make the topics and the service."""

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -24,6 +24,7 @@ from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.node_settings import NodeSettings
+from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher
 from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.parameters import NodeParameters
@@ -46,14 +47,16 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
     message or of the stage is one line in the log and one status; the node lives on.
     """
 
-    def __init__(self, stage: type[Stage], own: type[Own]) -> None:
-        super().__init__(stage.stage_name())
+    def __init__(
+        self, stage: type[Stage], own: type[Own], hand_over: HandOver | None = None
+    ) -> None:
+        super().__init__(stage.stage_name(), hand_over)
         self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
         self.add_on_set_parameters_callback(self._change_parameters)
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
         )
-        self._outputs: dict[str, Publisher] = {}
+        self._outputs: dict[str, Publisher | LocalPublisher] = {}
         self._joiners: list[StampJoiner] = []
         self._life = MapLife()
         resume_within_s = self.parameters.own.resume_within_s
@@ -107,7 +110,7 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         self._outputs.clear()
         self._life = MapLife()
 
-    def output(self, name: str) -> Publisher:
+    def output(self, name: str) -> Publisher | LocalPublisher:
         """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
         topic = TOPICS[name]
         self._outputs[name] = self.keep_publisher(topic.type, name, topic.profile)
@@ -267,19 +270,30 @@ def run_node(make_node: Callable[[], ManagedNode]) -> None:
     """Run a node until it is interrupted (status 0); bad parameters or input end it with one
     line and status 2.
     """
+    run_nodes(lambda executor: [make_node()])
+
+
+def run_nodes(make_nodes: Callable[[Executor], Sequence[ManagedNode]]) -> None:
+    """Run nodes in one executor, like `run_node`; the executor comes first, for those who hand
+    work to it.
+    """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
-    status, node = 0, None
+    status = 0
+    nodes: Sequence[ManagedNode] = ()
     try:
         rclpy.init()
-        node = make_node()
-        rclpy.spin(node)
+        executor = SingleThreadedExecutor()
+        nodes = make_nodes(executor)
+        for node in nodes:
+            executor.add_node(node)
+        executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except SegfloorError as error:
         print(f'segfloor: {error}', file=sys.stderr)
         status = 2
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(status)

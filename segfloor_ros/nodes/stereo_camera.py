@@ -17,6 +17,7 @@ from segfloor_ros.messages.diagnostics import RECORDING, Level, Status, statuses
 from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.topics import CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM
 from segfloor_ros.node_settings import StereoCameraNodeSettings
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
 from segfloor_ros.nodes.stage_node import StageNode, run_node
 
@@ -27,8 +28,8 @@ SAY_WAITING_S = 5.0
 class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]):
     """Publishes every pair with its own stamp, once somebody listens."""
 
-    def __init__(self) -> None:
-        super().__init__(StereoCameraSettings, StereoCameraNodeSettings)
+    def __init__(self, hand_over: HandOver | None = None) -> None:
+        super().__init__(StereoCameraSettings, StereoCameraNodeSettings, hand_over)
 
     def set_up(self) -> None:
         """Open the recording and make the topics."""

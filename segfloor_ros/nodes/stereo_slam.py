@@ -21,6 +21,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey_image
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.slam_resumption import SlamResumption
 from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
@@ -39,8 +40,8 @@ WORK_OFF_EVERY_S = 0.2
 class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     """Tracks every stereo pair and publishes what comes of it."""
 
-    def __init__(self) -> None:
-        super().__init__(StereoSlamSettings, StereoSlamNodeSettings)
+    def __init__(self, hand_over: HandOver | None = None) -> None:
+        super().__init__(StereoSlamSettings, StereoSlamNodeSettings, hand_over)
 
     def set_up(self) -> None:
         """Make the topics."""

@@ -1,0 +1,48 @@
+"""The five nodes in one process: same names, topics, services and parameters, fewer copies.
+
+Messages between them are handed over instead of sent; see `hand_over`. The camera is among them
+where `input` names a recording or a device.
+"""
+
+from __future__ import annotations
+
+from rclpy.executors import Executor
+from rclpy.node import Node
+
+from segfloor_ros.messages.topics import CAMERA
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.hand_over import HandOver
+from segfloor_ros.nodes.managed_node import ManagedNode
+from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.stage_node import run_nodes
+from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+
+STAGES = (StereoSlamNode, FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
+"""In the order of the flow: a node finds the publishers of what it subscribes to."""
+
+
+def make_nodes(executor: Executor) -> list[ManagedNode]:
+    """Make the nodes of the pipeline."""
+    hand_over = HandOver(executor)
+    nodes: list[ManagedNode] = [StereoCameraNode(hand_over)] if _has_input() else []
+    return [*nodes, *(make(hand_over) for make in STAGES)]
+
+
+def _has_input() -> bool:
+    """Whether the parameters of the camera name a recording or a device."""
+    probe = Node(CAMERA, automatically_declare_parameters_from_overrides=True)
+    try:
+        return bool(probe.get_parameter_or('input').value)
+    finally:
+        probe.destroy_node()
+
+
+def main() -> None:
+    """Run the nodes."""
+    run_nodes(make_nodes)
+
+
+if __name__ == '__main__':
+    main()
