@@ -1,8 +1,10 @@
-"""The five nodes, each a process of its own. Without `input`, the images come from a driver."""
+"""The five nodes, each a process of its own or all in one. Without `input`, the images come from a
+driver.
+"""
 
-from launch import LaunchDescription
+from launch import Condition, LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
@@ -16,7 +18,11 @@ def generate_launch_description() -> LaunchDescription:
     """Return the nodes and the arguments."""
     defaults = PathJoinSubstitution([FindPackageShare(PACKAGE), 'params', 'default.yaml'])
     source = LaunchConfiguration('input')
-    has_source = IfCondition(PythonExpression([repr(''), ' != ', "'", source, "'"]))
+    composed = LaunchConfiguration('composed')
+    has_source = PythonExpression([repr(''), ' != ', "'", source, "'"])
+    plays = IfCondition(
+        PythonExpression([has_source, " and '", composed, "'.lower() in ('false', '0')"])
+    )
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -38,15 +44,20 @@ def generate_launch_description() -> LaunchDescription:
                 description='Recording or device to play; empty: a camera driver publishes '
                 'left/image_raw, right/image_raw and their camera_info.',
             ),
-            stage('stereo_camera', has_source, input=ParameterValue(source, value_type=str)),
-            *(stage(name) for name in STAGES),
+            DeclareLaunchArgument(
+                'composed',
+                default_value='false',
+                description='Run all nodes in one process, for small machines: true or false.',
+            ),
+            all_in_one(source, IfCondition(composed)),
+            stage('stereo_camera', plays, input=ParameterValue(source, value_type=str)),
+            *(stage(name, UnlessCondition(composed)) for name in STAGES),
         ]
     )
 
 
-def stage(name: str, condition: IfCondition | None = None, **parameters: ParameterValue) -> Node:
+def stage(name: str, condition: Condition, **parameters: ParameterValue) -> Node:
     """Return one node with the parameter file and what the arguments say beside it."""
-    use_sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     return Node(
         package=PACKAGE,
         executable=name,
@@ -54,8 +65,27 @@ def stage(name: str, condition: IfCondition | None = None, **parameters: Paramet
         namespace=LaunchConfiguration('namespace'),
         parameters=[
             ParameterFile(LaunchConfiguration('params_file')),
-            {'use_sim_time': use_sim_time, **parameters},
+            {**sim_time(), **parameters},
         ],
         condition=condition,
         output='screen',
     )
+
+
+def all_in_one(source: LaunchConfiguration, condition: Condition) -> Node:
+    """Return the process of all nodes; they name themselves."""
+    return Node(
+        package=PACKAGE,
+        executable='segfloor_pipeline',
+        namespace=LaunchConfiguration('namespace'),
+        parameters=[ParameterFile(LaunchConfiguration('params_file')), sim_time()],
+        # Of parameters for all nodes, only those of the command line win over the file's sections.
+        ros_arguments=['-p', ["input:='", source, "'"]],
+        condition=condition,
+        output='screen',
+    )
+
+
+def sim_time() -> dict[str, ParameterValue]:
+    """Return the parameter that says whose time it is."""
+    return {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}

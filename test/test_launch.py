@@ -52,9 +52,9 @@ def test_only_launch_is_imported(path) -> None:
 def test_the_five_nodes_are_started() -> None:
     tree = ast.parse((FOLDER / 'segfloor.launch.py').read_text())
     words = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    assert words >= NODES
+    assert words >= NODES | {'segfloor_pipeline'}
     declared = {call.args[0].value for call in calls(tree, 'DeclareLaunchArgument')}
-    assert declared == {'namespace', 'params_file', 'use_sim_time', 'input'}
+    assert declared == {'namespace', 'params_file', 'use_sim_time', 'input', 'composed'}
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)

@@ -115,7 +115,7 @@ def installed(workspace: Path, command: str, **environment: str) -> subprocess.P
 
 def test_the_install_has_what_ros_looks_for(workspace) -> None:
     prefix = workspace / 'install' / 'segfloor_ros'
-    for node in (*NODES, 'segfloor'):
+    for node in (*NODES, 'segfloor_pipeline', 'segfloor'):
         assert os.access(prefix / 'lib' / 'segfloor_ros' / node, os.X_OK), node
     share = prefix / 'share'
     assert (share / 'ament_index' / 'resource_index' / 'packages' / 'segfloor_ros').exists()
