@@ -115,7 +115,10 @@ def page(node: str) -> str:
         or 'Nothing (at rate 0 or lossless: `/diagnostics`).',
         '## Publishes',
         _topics([*published_by(node, alternatives=True), DIAGNOSTICS]),
-        STATUS[node] + ' Once a second `connections` tells the subscribers of each topic.',
+        STATUS[node] + ' Once a second `connections` tells the subscribers of each topic, and '
+        '`health` how the node fares: its `state`, `rate_hz` and `delay_s` of each input, how many '
+        'keyframes or frames were `processed`, `failed` or `dropped`, `processing_ms`, `rss_mb`, '
+        'and in words what is wrong and what to do about it.',
     ]
     sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
     sections += [MANAGED]

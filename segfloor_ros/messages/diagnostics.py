@@ -13,6 +13,11 @@ from segfloor_ros.messages.headers import make_header, to_ns
 CONNECTIONS = 'connections'
 """Kind of the status that says how many subscribers each topic of a node has."""
 
+HEALTH = 'health'
+"""Kind of the status that says once a second how a node fares."""
+
+HEALTH_PERIOD_S = 1.0
+
 RECORDING = 'recording'
 """Kind of the status of the camera that says that its recording has ended."""
 

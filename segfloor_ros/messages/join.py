@@ -118,5 +118,6 @@ class StampJoiner:
         return self._waiting.pop(key)
 
     def _drop(self, key: int) -> None:
-        parts, known = self._waiting.pop(key), (*self.parts, *self._optional)
-        self._dropped.append(Dropped(key, tuple(part for part in known if part not in parts)))
+        parts = self._waiting.pop(key)
+        missing = self._missing(parts) or tuple(p for p in self._optional if p not in parts)
+        self._dropped.append(Dropped(key, missing))

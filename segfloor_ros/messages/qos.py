@@ -58,5 +58,10 @@ def images(reliability: str) -> QoSProfile:
 
 def describe(profile: QoSProfile) -> str:
     """Return a profile in words, e.g. `reliable, volatile, depth 30`."""
+    return f'{describe_policies(profile)}, depth {profile.depth}'
+
+
+def describe_policies(profile: QoSProfile) -> str:
+    """Return what both sides must agree on in words, e.g. `reliable, volatile`."""
     words = (profile.reliability.name, profile.durability.name)
-    return ', '.join(word.lower().replace('_', ' ') for word in words) + f', depth {profile.depth}'
+    return ', '.join(word.lower().replace('_', ' ') for word in words)

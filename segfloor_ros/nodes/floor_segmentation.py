@@ -9,6 +9,7 @@ from geometry_msgs.msg import TransformStamped
 
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.mount_check import MountCheck
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.messages.camera_info import eye_calibration
@@ -47,6 +48,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         """Begin without memory of the floor."""
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
+        self._mount_check: MountCheck | None = None
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
     def on_new_map(self, first_stamp_ns: int) -> None:
@@ -84,7 +86,23 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
         if self._disparity.get_subscription_count():
             self._disparity.publish(disparity_message(stamp_ns, frame_id, camera, floor))
+        if self._mount_check is not None and not self._mount_check.is_done:
+            self._compare_mounts(self._mount_check.add(left, right, T_map_base))
         return {}
+
+    def _compare_mounts(self, words: str | None) -> None:
+        if words is not None:
+            self.diagnose(
+                'mount',
+                f'{words}; correct the tf from {self._base_frame} to the camera, or the parameters '
+                'camera_height_m, camera_pitch_rad and camera_roll_rad of stereo_slam',
+                lasts_s=float('inf'),
+            )
+
+    def find_problems(self) -> None:
+        """Say what the keyframes wait for."""
+        if self._waiting:
+            self.diagnose('camera_mount', 'no message on camera_mount; is stereo_slam running?')
 
     def _stage_for(self, parts: Mapping[str, Any]) -> tuple[FloorSegmentation, StereoCamera]:
         eyes = (eye_calibration(parts[topic], topic) for topic in (LEFT_INFO, RIGHT_INFO))
@@ -92,6 +110,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         if self._stage is None or camera != self._camera:
             self._camera = camera
             self._stage = FloorSegmentation(camera, self.parameters.stage)
+            assert self._mount is not None
+            self._mount_check = self._mount_check or MountCheck(camera, self._mount)
         return self._stage, camera
 
 

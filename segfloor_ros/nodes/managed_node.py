@@ -5,9 +5,10 @@ by itself where nobody manages it.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
@@ -40,6 +41,13 @@ class ManagedNode(LifecycleNode):
         self._is_set_up = self._is_active = self._is_paused = False
         self._fault: Exception | None = None
         self._answer_impossible_transitions()
+
+    @property
+    def state_in_words(self) -> str:
+        """The state of the node: unconfigured, inactive, active, paused or finalized."""
+        if self._is_active and self._is_paused:
+            return 'paused'
+        return str(self._state_machine.current_state[1])
 
     @property
     def is_open(self) -> bool:
@@ -93,7 +101,9 @@ class ManagedNode(LifecycleNode):
         self, kind: Any, name: str, profile: QoSProfile
     ) -> Publisher | LocalPublisher:
         """Create a publisher that lives until the node is cleaned up."""
-        publisher = self.create_publisher(kind, name, profile)
+        # What does not connect is said by `qos_check`, in words and on /diagnostics.
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        publisher = self.create_publisher(kind, name, profile, event_callbacks=quiet)
         self._kept.append((publisher, self.destroy_publisher))
         if self._hand_over is None:
             return publisher
@@ -138,7 +148,10 @@ class ManagedNode(LifecycleNode):
             if self._hand_over is not None:
                 topic = self.resolve_topic_name(name)
                 local = self._hand_over.subscribe(topic, callback, profile, raw)
-            made = local or self.create_subscription(kind, name, callback, profile, raw=raw)
+            quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+            made = local or self.create_subscription(
+                kind, name, callback, profile, raw=raw, event_callbacks=quiet
+            )
             self._heard[name] = made
             return made
 
@@ -147,6 +160,11 @@ class ManagedNode(LifecycleNode):
     def publisher_count(self, name: str) -> int:
         """Return how many publish a topic that the node listens to now."""
         return self._heard[name].get_publisher_count() if name in self._heard else 0
+
+    @property
+    def subscriptions_by_topic(self) -> Mapping[str, Subscription | LocalSubscription]:
+        """The open subscriptions by the topic's name as in the code, before remapping."""
+        return self._heard
 
     def is_published(self, name: str) -> bool:
         """Whether anybody publishes a topic that the node listens to now."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import sys
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -13,33 +12,27 @@ import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.memory import rss_mb
-from segfloor_ros.messages.diagnostics import CONNECTIONS, Level, Status, status_message
+from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
-from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.node_settings import NodeSettings
-from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher
+from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.parameters import NodeParameters
+from segfloor_ros.nodes.reporting_node import PATH, ReportingNode
 from segfloor_ros.settings import StageSettings
 
 Stage = TypeVar('Stage', bound=StageSettings)
 Own = TypeVar('Own', bound=NodeSettings)
 
-CONNECTION_CHECK_S = 0.1
-HEARTBEAT_S = 1.0
-PATH = 'keyframe/path'
-REPEAT_FAULT_S = 5.0
 
-
-class StageNode(ManagedNode, Generic[Stage, Own]):
+class StageNode(ReportingNode, Generic[Stage, Own]):
     """A node around one stage. Subclasses create the topics in `set_up`, the stage in `start_anew`,
     and hand messages to the stage.
 
@@ -53,19 +46,10 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         super().__init__(stage.stage_name(), hand_over)
         self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
         self.add_on_set_parameters_callback(self._change_parameters)
-        self._diagnostics = self.create_publisher(
-            DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
-        )
-        self._outputs: dict[str, Publisher | LocalPublisher] = {}
         self._joiners: list[StampJoiner] = []
         self._life = MapLife()
         resume_within_s = self.parameters.own.resume_within_s
         self._kept_state = KeptState(self.get_fully_qualified_name(), resume_within_s)
-        self._connections: dict[str, str] = {}
-        self._last_heartbeat_s = 0.0
-        self._faults: dict[str, float] = {}
-        self._said: dict[str, float] = {}
-        self.create_timer(CONNECTION_CHECK_S, self._report_connections)
         if self.parameters.own.autostart:
             self.start()
 
@@ -104,17 +88,11 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         """Go on with a state that a killed node has given to `keep`."""
 
     def forget(self) -> None:
-        """Give up what waits; the outputs go with the topics."""
+        """Give up what waits."""
+        super().forget()
         self._kept_state.remove()
         self._joiners.clear()
-        self._outputs.clear()
         self._life = MapLife()
-
-    def output(self, name: str) -> Publisher | LocalPublisher:
-        """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
-        topic = TOPICS[name]
-        self._outputs[name] = self.keep_publisher(topic.type, name, topic.profile)
-        return self._outputs[name]
 
     def listen(
         self,
@@ -129,6 +107,7 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         topic = TOPICS[name]
 
         def guarded(message: Any) -> None:
+            self.note_received(name, None if raw else to_ns(message.header.stamp))
             try:
                 callback(message)
             except Exception as error:
@@ -180,64 +159,10 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
         try:
             values = step()
         except Exception as error:
-            self.say_fault(f'stamp {stamp_ns}', error)
-            self.report(stamp_ns, Level.ERROR, one_line(error))
+            self.report_fault(stamp_ns, error)
             return
         milliseconds = 1e3 * (time.perf_counter() - start)
-        self.report(stamp_ns, Level.OK, 'running', processing_ms=f'{milliseconds:.3f}', **values)
-
-    def report(self, stamp_ns: int, level: Level, message: str, **values: Any) -> None:
-        """Publish a status about one stamp."""
-        self.publish_status('', stamp_ns, level, message, {**values, 'rss_mb': f'{rss_mb():.2f}'})
-
-    def publish_status(
-        self, kind: str, stamp_ns: int, level: Level, message: str, values: Mapping[str, Any]
-    ) -> None:
-        """Publish a status of a kind of its own."""
-        name = self.get_fully_qualified_name() + (f': {kind}' if kind else '')
-        texts = {key: str(value) for key, value in values.items()}
-        self._diagnostics.publish(status_message(Status(stamp_ns, name, level, message, texts)))
-
-    def say_dropped(self, joiner: StampJoiner) -> None:
-        """Warn about sets that were given up, naming the topics of the missing parts."""
-        for dropped in joiner.take_dropped():
-            names = ', '.join(dropped.missing)
-            counts = {name: self.publisher_count(name) for name in joiner.parts}
-            crowded = ''.join(
-                f'; {name} has {count} publishers, stop or remap one'
-                for name, count in counts.items()
-                if count > 1
-            )
-            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
-            self.say(text, about=names + crowded)
-            self.report(dropped.stamp_ns, Level.ERROR, text)
-
-    def say_fault(self, where: str, error: Exception) -> None:
-        """Log a fault in one line, at most every few seconds; the traceback of an unexpected
-        one goes to the debug log.
-        """
-        text, now_s = one_line(error), time.monotonic()
-        self._faults = {t: s for t, s in self._faults.items() if now_s - s < REPEAT_FAULT_S}
-        if text in self._faults:
-            return
-        self._faults[text] = now_s
-        self.get_logger().error(text if text.startswith(where) else f'{where}: {text}')
-        if not isinstance(error, SegfloorError):
-            self.get_logger().debug(''.join(traceback.format_exception(error)))
-
-    def say(self, text: str, about: str = '') -> None:
-        """Warn, at most every few seconds about the same: the text, where nothing else is named."""
-        now_s = time.monotonic()
-        self._said = {t: s for t, s in self._said.items() if now_s - s < REPEAT_FAULT_S}
-        if (about or text) not in self._said:
-            self._said[about or text] = now_s
-            self.get_logger().warning(text)
-
-    def say_waiting(self, what: str) -> None:
-        """Warn that something does not arrive, unless it comes at once."""
-        self.get_logger().warning(
-            f'waiting for {what}', throttle_duration_sec=REPEAT_FAULT_S, skip_first=True
-        )
+        self.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
 
     def _change_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         result = self.parameters.change(parameters)
@@ -245,25 +170,8 @@ class StageNode(ManagedNode, Generic[Stage, Own]):
             self.on_settings_changed()
         return result
 
-    def _report_connections(self) -> None:
-        counts = {
-            name: str(output.get_subscription_count()) for name, output in self._outputs.items()
-        }
-        counts[DIAGNOSTICS.name] = str(self._diagnostics.get_subscription_count())
-        now = time.monotonic()
-        if counts != self._connections or now - self._last_heartbeat_s >= HEARTBEAT_S:
-            self._connections, self._last_heartbeat_s = counts, now
-            stamp_ns = self.get_clock().now().nanoseconds
-            self.publish_status(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
-
 
 AnyStageNode = StageNode[Any, Any]
-
-
-def one_line(error: Exception) -> str:
-    """Return an error in one line; unexpected ones with their type."""
-    text = ' '.join(str(error).split())
-    return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
 
 
 def run_node(make_node: Callable[[], ManagedNode]) -> None:

@@ -21,10 +21,11 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey_image
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.camera_watch import CameraWatch
 from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.slam_resumption import SlamResumption
-from segfloor_ros.nodes.stage_node import StageNode, one_line, run_node
+from segfloor_ros.nodes.stage_node import StageNode, run_node
 from segfloor_ros.nodes.transforms import Transforms
 from segfloor_ros.slam.continuation import LastState
 from segfloor_ros.slam.results import FrameResult
@@ -32,6 +33,7 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 
+INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
 MAX_WAITING_PAIRS = 100
 WORK_OFF_EVERY_S = 0.2
@@ -53,6 +55,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
         self._left, self._right = self._subscribe(own)
+        self._watch = CameraWatch(self, own, self._left, self._right)
         self.every(WORK_OFF_EVERY_S, self._work_off)
         tolerance_ns = round(own.sync_tolerance_s * 1e9)
         self._pairs = self.joiner(
@@ -106,7 +109,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         kind += '/compressed' if own.image_transport == 'compressed' else ''
         left, right = f'left/{kind}', f'right/{kind}'
         profile = qos.images(own.image_reliability)
-        for info in ('left/camera_info', 'right/camera_info'):
+        for info in INFOS:
             self.listen(info, partial(self._take_info, info), profile)
         for image in (left, right):
             self.listen(image, partial(self._take_image, image), profile)
@@ -122,6 +125,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._work_off()
 
     def _take_image(self, topic: str, message: Image | CompressedImage) -> None:
+        self._watch.saw_image(topic, to_ns(message.header.stamp))
         pair = self._pairs.add(topic, to_ns(message.header.stamp), message)
         self.say_dropped(self._pairs)
         if pair is not None:
@@ -133,12 +137,16 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         while self._waiting and self._is_ready(self._waiting[0]):
             self._take_pair(self._waiting.popleft())
 
+    def find_problems(self) -> None:
+        """Say what is wrong with the camera."""
+        missing = [topic for topic in INFOS if topic not in self._eyes]
+        self._watch.find_problems(missing if self._waiting else [])
+
     def _is_ready(self, pair: dict[str, Any]) -> bool:
         """Whether calibration and mount are known: they come in their own time."""
         if self._slam is not None:
             return True
         if len(self._eyes) < 2:
-            self.say_waiting('left/camera_info and right/camera_info')
             return False
         if self._mount_is_given():
             return True
@@ -158,8 +166,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         try:
             results = self._process(stamp_ns, pair)
         except Exception as error:
-            self.say_fault(f'stamp {stamp_ns}', error)
-            self.report(stamp_ns, Level.ERROR, one_line(error))
+            self.report_fault(stamp_ns, error)
             return
         milliseconds = 1e3 * (time.perf_counter() - start)
         for result in results:
@@ -167,12 +174,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._resumption.is_hopeless(stamp_ns):
             self.begin_anew('the place where the last SLAM was killed is not found')
         if not results:
-            self.report(
-                stamp_ns,
-                Level.WARN,
-                'waiting for the floor, to measure the mount of the camera',
-                processing_ms=f'{milliseconds:.3f}',
-            )
+            words = 'waiting for the floor, to measure the mount of the camera'
+            self.report_processed(stamp_ns, Level.WARN, words, milliseconds)
 
     def _is_in_order(self, stamp_ns: int) -> bool:
         """Whether a pair comes after the one before; where time has jumped back, e.g. because a
@@ -193,6 +196,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         assert self._slam is not None and self._rectifier is not None
         images = (grey_image(pair[topic], topic) for topic in (self._left, self._right))
         left, right = self._rectifier.rectify(*self._eight_bit(*images))
+        self._watch.check_rows(left, right)
         frame = StereoFrame(self._frame_count, stamp_ns, left, right)
         self._frame_count += 1
         return self._resumption.join(self._slam.process(frame))
@@ -220,6 +224,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             f'camera {mount.height_m:.3f} m above the floor, pitch '
             f'{math.degrees(mount.pitch_rad):.2f} deg, roll {math.degrees(mount.roll_rad):.2f} deg'
         )
+        if not self._mount_is_given() and self._transforms.mount(self._frames.left) is None:
+            self._watch.judge_measured(mount)
         self._outputs_of_slam.publish_mount(stamp_ns, self._frames, mount)
         self._transforms.announce_mount(stamp_ns, self._frames.left, mount)
 
@@ -232,15 +238,15 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._resumption.keep(self._calibration.camera, self._mount, result)
         self._outputs_of_slam.publish(result, self._calibration, self._frames)
         self._transforms.broadcast(result)
-        self.report(
+        self.report_processed(
             result.stamp_ns,
             Level.OK if result.tracked else Level.ERROR,
             result.state,
+            milliseconds,
             tracked=int(result.tracked),
             keyframe=int(result.keyframe is not None),
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,
-            processing_ms=f'{milliseconds:.3f}',
         )
 
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from segfloor_ros.messages.join import Dropped, StampJoiner
+from segfloor_ros.messages.join import MAX_DISORDER_NS, Dropped, StampJoiner
 
 
 def test_a_set_is_complete_with_its_last_part_in_any_order() -> None:
@@ -63,3 +63,27 @@ def test_waiting_for_names_what_every_set_lacks() -> None:
     joiner.add('a', 2, None)
     joiner.add('b', 2, None)
     assert joiner.waiting_for() == ('c',)
+
+
+def test_an_optional_part_is_waited_for_while_it_may_come() -> None:
+    may_come = [True]
+    joiner = StampJoiner(('a', 'b'), optional={'path': lambda: may_come[0]})
+    joiner.add('a', 1, 'a1')
+    assert joiner.add('b', 1, 'b1') is None
+    assert joiner.add('path', 1, 'p1') == {'a': 'a1', 'b': 'b1', 'path': 'p1'}
+    may_come[0] = False
+    joiner.add('a', 2, 'a2')
+    assert joiner.add('b', 2, 'b2') == {'a': 'a2', 'b': 'b2'}
+    joiner.add('a', 3, 'a3')
+    joiner.add('a', 4, 'a4')
+    assert joiner.add('b', 4, 'b4') is not None
+    assert joiner.take_dropped() == [Dropped(3, ('b',))]
+
+
+def test_after_a_jump_back_known_stamps_are_taken_again() -> None:
+    joiner = StampJoiner(('a', 'b'))
+    for stamp_ns in (0, MAX_DISORDER_NS, 2 * MAX_DISORDER_NS, 0):
+        joiner.add('a', stamp_ns, stamp_ns)
+        assert joiner.add('b', stamp_ns, stamp_ns) == {'a': stamp_ns, 'b': stamp_ns}
+    joiner.add('a', MAX_DISORDER_NS, 'new pass')
+    assert joiner.add('b', MAX_DISORDER_NS, 'new pass') is not None

@@ -1,0 +1,105 @@
+"""How a node fares: rates and delays of its inputs, what was lost, and what is wrong in words."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from statistics import median
+
+from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level
+
+RECENT = 50
+STALE_DELAY_S = 3600.0
+"""A stamp this old is that of a recording; its age tells nothing."""
+
+ORDER = (Level.OK, Level.WARN, Level.ERROR)
+
+
+@dataclass
+class InputMeter:
+    """Counts the messages of one topic. delays_s: age of the recent ones on arrival."""
+
+    count: int = 0
+    counted_before: int = 0
+    delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that is wrong, until a time if it is not found again."""
+
+    level: Level
+    text: str
+    until_s: float
+
+
+class Health:
+    """Gathers what a node tells about itself. Not for several threads."""
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._inputs: dict[str, InputMeter] = {}
+        self._problems: dict[str, Problem] = {}
+        self._counts = {'processed': 0, 'failed': 0, 'dropped': 0}
+        self._milliseconds: deque[float] = deque(maxlen=RECENT)
+        self._state = ''
+        self._measured_s = clock_s()
+
+    def received(self, topic: str, delay_s: float | None) -> None:
+        """Count a message; delay_s: age of its stamp, None where it has none."""
+        meter = self._inputs.setdefault(topic, InputMeter())
+        meter.count += 1
+        if delay_s is not None and abs(delay_s) < STALE_DELAY_S:
+            meter.delays_s.append(delay_s)
+
+    def processed(self, milliseconds: float, state: str) -> None:
+        """Note that something was processed, and the words for how it is."""
+        self._counts['processed'] += 1
+        self._milliseconds.append(milliseconds)
+        self._state = state
+
+    def failed(self) -> None:
+        """Note that something could not be processed."""
+        self._counts['failed'] += 1
+
+    def dropped(self) -> None:
+        """Note that something was given up because a part of it did not come."""
+        self._counts['dropped'] += 1
+
+    def found(self, about: str, level: Level, text: str, lasts_s: float) -> None:
+        """Note a problem; it is over when it is not found again for a while."""
+        self._problems[about] = Problem(level, text, self._clock_s() + lasts_s)
+
+    def over(self, about: str) -> None:
+        """Note that a problem is over."""
+        self._problems.pop(about, None)
+
+    def summary(self, state: str) -> tuple[Level, str, dict[str, str]]:
+        """Return level, words and values for the time since the last summary. state: of the node,
+        in words.
+        """
+        now_s = self._clock_s()
+        self._problems = {k: p for k, p in self._problems.items() if p.until_s > now_s}
+        problems = sorted(self._problems.values(), key=lambda p: -ORDER.index(p.level))
+        level = problems[0].level if problems else Level.OK
+        words = '; '.join(p.text for p in problems) or self._state or 'waiting for messages'
+        values = {'state': state, **{name: str(count) for name, count in self._counts.items()}}
+        if self._state:
+            values['last'] = self._state
+        if self._milliseconds:
+            values['processing_ms'] = f'{median(self._milliseconds):.1f}'
+        values.update(self._input_values(max(now_s - self._measured_s, HEALTH_PERIOD_S / 10)))
+        self._measured_s = now_s
+        return level, words, values
+
+    def _input_values(self, duration_s: float) -> dict[str, str]:
+        values = {}
+        for topic, meter in self._inputs.items():
+            rate_hz = (meter.count - meter.counted_before) / duration_s
+            meter.counted_before = meter.count
+            values[f'rate_hz {topic}'] = f'{rate_hz:.1f}'
+            if meter.delays_s:
+                values[f'delay_s {topic}'] = f'{median(meter.delays_s):.3f}'
+        return values

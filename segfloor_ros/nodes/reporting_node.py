@@ -1,0 +1,185 @@
+"""What a node tells about itself: a status per stamp, its health once a second, and the log."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+
+from segfloor_ros.errors import SegfloorError
+from segfloor_ros.memory import rss_mb
+from segfloor_ros.messages.diagnostics import (
+    CONNECTIONS,
+    HEALTH,
+    HEALTH_PERIOD_S,
+    Level,
+    Status,
+    status_message,
+)
+from segfloor_ros.messages.health import Health
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher
+from segfloor_ros.nodes.managed_node import ManagedNode
+from segfloor_ros.nodes.qos_check import incompatible_topics
+
+CONNECTION_CHECK_S = 0.1
+PATH = 'keyframe/path'
+PROBLEM_LASTS_S = 3.0
+REPEAT_FAULT_S = 5.0
+
+
+class ReportingNode(ManagedNode):
+    """A node that says on /diagnostics how it fares, in every state, and says it in the log once in
+    a while.
+    """
+
+    def __init__(self, name: str, hand_over: HandOver | None = None) -> None:
+        super().__init__(name, hand_over)
+        self._diagnostics = self.create_publisher(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
+        )
+        self._outputs: dict[str, Publisher | LocalPublisher] = {}
+        self._health = Health()
+        self._connections: dict[str, str] = {}
+        self._last_heartbeat_s = 0.0
+        self._faults: dict[str, float] = {}
+        self._said: dict[str, float] = {}
+        self.create_timer(CONNECTION_CHECK_S, self._report_connections)
+
+    def forget(self) -> None:
+        """The outputs go with the topics."""
+        self._outputs.clear()
+
+    def output(self, name: str) -> Publisher | LocalPublisher:
+        """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
+        topic = TOPICS[name]
+        self._outputs[name] = self.keep_publisher(topic.type, name, topic.profile)
+        return self._outputs[name]
+
+    def note_received(self, topic: str, stamp_ns: int | None) -> None:
+        """Count a message of a topic, and its age where its stamp is known."""
+        now_ns = self.get_clock().now().nanoseconds
+        self._health.received(topic, None if stamp_ns is None else 1e-9 * (now_ns - stamp_ns))
+
+    def report_processed(
+        self, stamp_ns: int, level: Level, message: str, milliseconds: float, **values: Any
+    ) -> None:
+        """Publish a status about what was processed."""
+        self._health.processed(milliseconds, message)
+        self.report(stamp_ns, level, message, **values, processing_ms=f'{milliseconds:.3f}')
+
+    def report_fault(self, stamp_ns: int, error: Exception) -> None:
+        """Log a fault and publish a status about it."""
+        self._health.failed()
+        self.say_fault(f'stamp {stamp_ns}', error)
+        self.report(stamp_ns, Level.ERROR, one_line(error))
+
+    def diagnose(
+        self, about: str, text: str, level: Level = Level.WARN, lasts_s: float = PROBLEM_LASTS_S
+    ) -> None:
+        """Say what is wrong and what to do about it: in the log now and then, on /diagnostics as
+        long as it is found again within `lasts_s`.
+        """
+        self._health.found(about, level, text, lasts_s)
+        self.say(text, about)
+
+    def find_problems(self) -> None:
+        """Diagnose what shows over time; called once a second while the inputs are open."""
+
+    def report(self, stamp_ns: int, level: Level, message: str, **values: Any) -> None:
+        """Publish a status about one stamp."""
+        self.publish_status('', stamp_ns, level, message, {**values, 'rss_mb': f'{rss_mb():.2f}'})
+
+    def publish_status(
+        self, kind: str, stamp_ns: int, level: Level, message: str, values: Mapping[str, Any]
+    ) -> None:
+        """Publish a status of a kind of its own."""
+        name = self.get_fully_qualified_name() + (f': {kind}' if kind else '')
+        texts = {key: str(value) for key, value in values.items()}
+        self._diagnostics.publish(status_message(Status(stamp_ns, name, level, message, texts)))
+
+    def say_dropped(self, joiner: StampJoiner) -> None:
+        """Warn about sets that were given up, naming the topics of the missing parts."""
+        for dropped in joiner.take_dropped():
+            names = ', '.join(dropped.missing)
+            counts = {name: self.publisher_count(name) for name in joiner.parts}
+            crowded = ''.join(
+                f'; {name} has {count} publishers, stop or remap one'
+                for name, count in counts.items()
+                if count > 1
+            )
+            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
+            self._health.dropped()
+            self.say(text, about=names + crowded)
+            self.report(dropped.stamp_ns, Level.ERROR, text)
+
+    def say_fault(self, where: str, error: Exception) -> None:
+        """Log a fault in one line, at most every few seconds; the traceback of an unexpected
+        one goes to the debug log.
+        """
+        text, now_s = one_line(error), time.monotonic()
+        self._faults = {t: s for t, s in self._faults.items() if now_s - s < REPEAT_FAULT_S}
+        if text in self._faults:
+            return
+        self._faults[text] = now_s
+        self.get_logger().error(text if text.startswith(where) else f'{where}: {text}')
+        if not isinstance(error, SegfloorError):
+            self.get_logger().debug(''.join(traceback.format_exception(error)))
+
+    def say(self, text: str, about: str = '') -> None:
+        """Warn, at most every few seconds about the same: the text, where nothing else is named."""
+        now_s = time.monotonic()
+        self._said = {t: s for t, s in self._said.items() if now_s - s < REPEAT_FAULT_S}
+        if (about or text) not in self._said:
+            self._said[about or text] = now_s
+            self.get_logger().warning(text)
+
+    def _report_connections(self) -> None:
+        counts = {
+            name: str(output.get_subscription_count()) for name, output in self._outputs.items()
+        }
+        counts[DIAGNOSTICS.name] = str(self._diagnostics.get_subscription_count())
+        now = time.monotonic()
+        is_due = now - self._last_heartbeat_s >= HEALTH_PERIOD_S
+        if counts != self._connections or is_due:
+            self._connections = counts
+            stamp_ns = self.get_clock().now().nanoseconds
+            self.publish_status(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
+        if is_due:
+            self._last_heartbeat_s = now
+            self._report_health()
+
+    def _report_health(self) -> None:
+        if self.is_open:
+            self._find_unconnected()
+            self.find_problems()
+        level, words, values = self._health.summary(self.state_in_words)
+        values['rss_mb'] = f'{rss_mb():.1f}'
+        self.publish_status(HEALTH, self.get_clock().now().nanoseconds, level, words, values)
+
+    def _find_unconnected(self) -> None:
+        heard = self.subscriptions_by_topic
+        outputs = (
+            output.outside if isinstance(output, LocalPublisher) else output
+            for output in self._outputs.values()
+        )
+        inputs = (found for found in heard.values() if isinstance(found, Subscription))
+        for topic, text in incompatible_topics(self, outputs, inputs):
+            self.diagnose(f'QoS of {topic}', text, Level.ERROR)
+        silent = [name for name in heard if not self.publisher_count(name) and name != PATH]
+        if silent:
+            text = f'nobody publishes {", ".join(silent)}; start the node that does, or remap'
+            self._health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
+        else:
+            self._health.over('publishers')
+
+
+def one_line(error: Exception) -> str:
+    """Return an error in one line; unexpected ones with their type."""
+    text = ' '.join(str(error).split())
+    return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'

@@ -1,0 +1,241 @@
+"""What is wrong with a camera or a connection is said in words, with the topic and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from node_messages import cloud_messages, publish
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import SetBool
+from stereo_drive import room_drive
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.camera.row_check import rows_apart_px
+from segfloor_ros.floor.mount_check import MountCheck
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
+from segfloor_ros.messages.diagnostics import HEALTH, Level
+from segfloor_ros.messages.health import Health
+from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.poses import odometry_message, transform_message
+from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+
+CALIBRATION = rectified_calibration(CAMERA)
+GIVEN = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+    '-p', 'camera_roll_rad:=0.0',
+)  # fmt: skip
+FRAME_NS = 100_000_000
+
+
+@pytest.fixture(scope='module')
+def frames():
+    return room_drive(3)[0]
+
+
+def health(graph, node: str):
+    """Return what a node said last about how it fares."""
+    found = [s for s in graph.statuses if s.node == node and s.kind == HEALTH]
+    return found[-1] if found else None
+
+
+def says(graph, node: str, *words: str):
+    """Wait until a node's health says all the words; returns the status."""
+
+    def found() -> bool:
+        status = health(graph, node)
+        return status is not None and all(word in status.message for word in words)
+
+    graph.until(found, f'{words} of {node}')
+    return health(graph, node)
+
+
+class Driver:
+    """A camera's driver that does something wrong."""
+
+    def __init__(self, graph, image: str = 'image_raw', profile: QoSProfile = qos.IMAGES) -> None:
+        self._graph = graph
+        self._image = image
+        node = graph.tester
+        for_each = {
+            f'{side}/{what}' for side in ('left', 'right') for what in (image, 'camera_info')
+        }
+        self._publishers = {
+            name: node.create_publisher(TOPICS[name].type, name, profile) for name in for_each
+        }
+
+    def connect(self) -> None:
+        self._graph.connected(list(self._publishers.values()))
+
+    def send(self, side: str, stamp_ns: int, image: np.ndarray, with_info: bool = True) -> None:
+        if with_info:
+            info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
+            self._publishers[f'{side}/camera_info'].publish(info)
+        self._publishers[f'{side}/{self._image}'].publish(image_message(stamp_ns, side, image))
+
+
+def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph, frames) -> None:
+    graph = make_graph(*GIVEN)
+    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    graph.add(StereoSlamNode())
+    words = ('/left/image_raw', '/tester', 'best effort', 'stereo_slam.image_reliability')
+    status = says(graph, 'stereo_slam', *words)
+    assert status.level is Level.ERROR
+    assert '/right/camera_info' in status.message
+    del driver
+    graph.close()
+    graph = make_graph(*GIVEN, '-p', 'image_reliability:=best_effort')
+    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    graph.add(StereoSlamNode())
+    driver.connect()
+    for side in ('left', 'right'):
+        driver.send(side, 0, getattr(frames[0], side))
+    status = says(graph, 'stereo_slam', 'tracking')
+    assert status.level is Level.OK
+
+
+def test_a_listener_that_asks_for_more_than_is_offered_is_named(make_graph) -> None:
+    graph = make_graph()
+    topic = TOPICS['labelled_points']
+    profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    graph.tester.create_subscription(topic.type, topic.name, lambda _: None, profile)
+    graph.add(CloudLabellingNode())
+    words = ('/labelled_points: nothing reaches /tester', 'transient local', 'volatile')
+    assert says(graph, 'cloud_labelling', *words).level is Level.ERROR
+
+
+def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> None:
+    graph = make_graph(*GIVEN)
+    driver = Driver(graph)
+    graph.add(StereoSlamNode())
+    driver.connect()
+    for i in range(12):
+        driver.send('left', i * FRAME_NS, frames[0].left)
+        driver.send('right', i * FRAME_NS + 40_000_000, frames[0].right)
+    words = ('left/image_raw and right/image_raw', '40.0 ms', 'sync_tolerance_s = 0.005 s')
+    assert says(graph, 'stereo_slam', *words).level is Level.ERROR
+
+
+def test_images_without_calibration_are_named(make_graph, frames) -> None:
+    graph = make_graph(*GIVEN)
+    driver = Driver(graph)
+    graph.add(StereoSlamNode())
+    driver.connect()
+    driver.send('left', 0, frames[0].left)
+    driver.send('right', 0, frames[0].right, with_info=False)
+    status = says(graph, 'stereo_slam', 'no message on right/camera_info', 'segfloor calibrate')
+    assert 'left/camera_info' not in status.message
+
+
+def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
+    graph = make_graph(*GIVEN, '-p', 'rectified_input:=true')
+    driver = Driver(graph, image='image_rect')
+    graph.add(StereoSlamNode())
+    driver.connect()
+    driver.send('left', 0, frames[0].left)
+    driver.send('right', 0, np.roll(frames[0].right, 4, axis=0))
+    words = ('left/image_rect and right/image_rect are not rectified', '4.0 rows', 'image_raw')
+    assert says(graph, 'stereo_slam', *words).level is Level.ERROR
+
+
+def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
+    graph = make_graph(*GIVEN)
+    driver = Driver(graph)
+    graph.add(StereoSlamNode())
+    driver.connect()
+    for side in ('left', 'right'):
+        driver.send(side, 0, getattr(frames[0], side))
+    says(graph, 'stereo_slam', 'no image on left/image_raw for a while', 'connected')
+
+
+def test_a_mount_that_the_floor_contradicts_is_named_with_both_numbers(make_graph, frames) -> None:
+    """The camera looks down by 0.15 rad = 8.6 deg; tf or the parameters say 14.3 deg."""
+    graph = make_graph()
+    graph.add(FloorSegmentationNode())
+    wrong = replace(MOUNT, pitch_rad=0.25)
+    mount = transform_message(0, 'base_link', 'left', wrong.T_base_left)
+    publishers = publish(graph, {'camera_mount': mount})
+    for frame in frames:
+        stamp_ns = frame.stamp_ns
+        pose = odometry_message(stamp_ns, 'map', 'base_link', np.eye(4), np.zeros((6, 6)))
+        messages = {'keyframe/odometry': pose}
+        for side in ('left', 'right'):
+            image = image_message(stamp_ns, side, getattr(frame, side))
+            info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
+            messages[f'keyframe/{side}/image_rect'] = image
+            messages[f'keyframe/{side}/camera_info'] = info
+        publish(graph, messages, publishers)
+    words = ('camera mount: pitch 14.3 deg, the floor shows 8.', 'camera_pitch_rad', 'base_link')
+    assert says(graph, 'floor_segmentation', *words).level is Level.WARN
+
+
+def test_keyframes_that_wait_for_the_mount_say_so(make_graph, frames) -> None:
+    graph = make_graph()
+    graph.add(FloorSegmentationNode())
+    status = says(graph, 'floor_segmentation', 'nobody publishes', 'camera_mount')
+    assert status.level is Level.WARN
+
+
+def test_rates_counts_and_state_are_told(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    publishers = None
+    for stamp_ns in (1, 2, 3):
+        publishers = publish(graph, cloud_messages(stamp_ns), publishers)
+    alone = {'map_points': cloud_messages(4)['map_points']}
+    publish(graph, alone, publishers)
+    publish(graph, cloud_messages(5), publishers)
+    graph.until(lambda: len(labelled) == 4, 'four keyframes')
+    graph.statuses.clear()
+    values = says(graph, 'cloud_labelling', 'running').values
+    assert (values['state'], values['processed'], values['dropped']) == ('active', '4', '1')
+    assert values['failed'] == '0'
+    assert float(values['processing_ms']) >= 0
+    assert float(values['rss_mb']) > 10
+    assert {f'rate_hz {name}' for name in alone} <= values.keys()
+    graph.call(SetBool, 'cloud_labelling/pause', SetBool.Request(data=True))
+    graph.until(lambda: health(graph, 'cloud_labelling').values['state'] == 'paused', 'the pause')
+
+
+def test_rate_delay_and_problems_are_those_of_the_time() -> None:
+    now = [100.0]
+    found = Health(clock_s=lambda: now[0])
+    for _ in range(20):
+        found.received('image', 0.25)
+    found.received('cloud', 1e9)
+    found.found('qos', Level.ERROR, 'cannot connect', 3.0)
+    found.found('stamps', Level.WARN, 'apart', 10.0)
+    now[0] = 102.0
+    level, words, values = found.summary('active')
+    assert (level, words) == (Level.ERROR, 'cannot connect; apart')
+    assert (values['rate_hz image'], values['delay_s image']) == ('10.0', '0.250')
+    assert 'delay_s cloud' not in values
+    now[0] = 104.0
+    level, words, values = found.summary('active')
+    assert (level, words, values['rate_hz image']) == (Level.WARN, 'apart', '0.0')
+    found.over('stamps')
+    found.processed(12.0, 'running')
+    assert found.summary('active')[:2] == (Level.OK, 'running')
+
+
+def test_rows_of_a_pair(frames) -> None:
+    left, right = frames[0].left, frames[0].right
+    apart, count = rows_apart_px(left, right) or (np.nan, 0)
+    assert apart < 1.0
+    assert count > 40
+    shifted, _ = rows_apart_px(left, np.roll(right, -5, axis=0)) or (np.nan, 0)
+    assert shifted == pytest.approx(5.0, abs=0.5)
+    assert rows_apart_px(left, np.zeros_like(left)) is None
+
+
+def test_a_mount_that_the_floor_confirms_is_not_mentioned(frames) -> None:
+    check = MountCheck(CAMERA, MOUNT)
+    words = [check.add(frame.left, frame.right, np.eye(4)) for frame in frames[:1]]
+    assert words == [None]
+    assert check.is_done
