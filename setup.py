@@ -21,8 +21,8 @@ def files(folder, *patterns):
 data_files = [
     ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
     (f'share/{PACKAGE}', ['package.xml']),
-    (f'share/{PACKAGE}/launch_configs', files('launch_configs', '*.launch.py', '*.rviz')),
-    (f'share/{PACKAGE}/params', files('params', '*.yaml')),
+    (f'share/{PACKAGE}/launch_configs', files('launch_configs', '*.launch.py', '*.rviz', '*.json')),
+    (f'share/{PACKAGE}/params', files('params', '*.yaml', '*.xml')),
 ]
 if 'install' in sys.argv or 'develop' in sys.argv:
     # colcon runs these commands and puts every entry point under lib/<package>, for `ros2 run`;

@@ -9,6 +9,10 @@ import numpy as np
 from stereo_room import CAMERA, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.configuration import resolve
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.pipeline import Pipeline
 
 RATE_HZ = 10.0
 
@@ -36,3 +40,15 @@ def write_kitti(folder: Path, frames: list[StereoFrame]) -> Path:
     times = ''.join(f'{frame.stamp_ns * 1e-9:.6f}\n' for frame in frames)
     (folder / 'times.txt').write_text(times)
     return folder
+
+
+def lockstep_map(recording: Path) -> OccupancyGrid:
+    """Return the map of a recording by the pipeline without ROS."""
+    configuration = resolve(assignments=[f'stereo_camera.input={recording}'])
+    source = open_source(configuration.stereo_camera)
+    pipeline = Pipeline(source.camera, configuration)
+    for frame in source.frames():
+        pipeline.process(frame)
+    grid = pipeline.finish()
+    assert grid is not None
+    return grid

@@ -60,8 +60,12 @@ def unconnected(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
         if node not in counts:
             missing.append(f'{node} (no sign of life)')
             continue
-        topics = [topic.name for topic in published_by(node)]
-        needed = {topic: _listeners_of(topic) for topic in topics}
+        names = {
+            topic.instead_of or topic.name: topic.name
+            for topic in published_by(node, alternatives=True)
+            if not topic.instead_of or topic.name in counts[node]
+        }
+        needed = {topic: _listeners_of(topic) for topic in names.values()}
         needed[DIAGNOSTICS.name] = STATUS_LISTENERS
         missing += [
             f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'

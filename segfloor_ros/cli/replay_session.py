@@ -87,7 +87,7 @@ class ReplaySession:
                 processes = NodeProcesses(NODES, arguments, environment, Path(folder))
                 with processes:
                     recorder = ReplayRecorder(context, processes.rss_mb, self._on_mask)
-                    return self._follow(_Graph(recorder, processes), Path(folder))
+                    return self._follow(ReplayGraph(recorder, processes), Path(folder))
         finally:
             rclpy.try_shutdown(context=context)
 
@@ -115,7 +115,7 @@ class ReplaySession:
         options = [word for file in files for word in ('--params-file', file)]
         return ['--ros-args', '--disable-external-lib-logs', *options]
 
-    def _follow(self, graph: _Graph, folder: Path) -> tuple[RunResult, ReplayReport]:
+    def _follow(self, graph: ReplayGraph, folder: Path) -> tuple[RunResult, ReplayReport]:
         discovery_s = graph.connect()
         start_s = time.perf_counter()
         graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
@@ -188,7 +188,7 @@ class ReplaySession:
         )
 
 
-class _Graph:
+class ReplayGraph:
     """The running nodes and the one that listens to them."""
 
     def __init__(self, recorder: ReplayRecorder, processes: NodeProcesses) -> None:

@@ -14,17 +14,13 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from ros_graph import fresh_graph
 from std_srvs.srv import SetBool, Trigger
-from stereo_drive import room_drive, write_kitti
+from stereo_drive import lockstep_map, room_drive, write_kitti
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, published_by
 from segfloor_ros.nodes.hand_over import HandOver
-from segfloor_ros.pipeline import Pipeline
 
 FRAMES = 14
 
@@ -75,17 +71,6 @@ def test_it_has_the_topics_of_the_five_nodes_and_ends_on_interrupt(pipeline) -> 
         assert {f'/{topic.name}' for topic in published_by(node)} <= found.keys()
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=20) == 0
-
-
-def lockstep_map(drive) -> OccupancyGrid:
-    configuration = resolve(assignments=[f'stereo_camera.input={drive}'])
-    source = open_source(configuration.stereo_camera)
-    pipeline = Pipeline(source.camera, configuration)
-    for frame in source.frames():
-        pipeline.process(frame)
-    grid = pipeline.finish()
-    assert grid is not None
-    return grid
 
 
 class Outside:

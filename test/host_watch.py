@@ -1,0 +1,34 @@
+"""Follows nodes that run on two hosts from one of them: lets the camera play, and saves the map."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import rclpy
+from std_srvs.srv import SetBool, Trigger
+
+from segfloor_ros.cli.replay_recorder import ReplayRecorder
+from segfloor_ros.cli.replay_session import ReplayGraph
+
+
+def main() -> None:
+    """Print how long it took."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    recorder = ReplayRecorder(context, lambda: 0.0, None)
+    graph = ReplayGraph(recorder, SimpleNamespace(check=lambda: None))
+    waited_s = graph.connect()
+    start_s = time.monotonic()
+    graph.call(SetBool, 'stereo_camera/pause', SetBool.Request(data=False))
+    graph.play(lambda count, state: None, threading.Event())
+    graph.call(Trigger, 'save_map', Trigger.Request())
+    print(f'connected after {waited_s:.1f} s, played in {time.monotonic() - start_s:.1f} s')
+    rclpy.try_shutdown(context=context)
+    sys.stdout.flush()
+
+
+if __name__ == '__main__':
+    main()
