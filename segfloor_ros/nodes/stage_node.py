@@ -200,6 +200,10 @@ def run_nodes(make_nodes: Callable[[Executor], Sequence[ManagedNode]]) -> None:
     except SegfloorError as error:
         print(f'segfloor: {error}', file=sys.stderr)
         status = 2
+    except Exception:
+        # An interrupt takes the middleware away under whatever is being done at that moment.
+        if rclpy.ok():
+            raise
     finally:
         for node in nodes:
             node.destroy_node()
