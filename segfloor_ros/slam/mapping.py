@@ -12,6 +12,7 @@ from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.matching import match_rows
 from segfloor_ros.slam.point_measurement import measure_disparity
@@ -80,9 +81,12 @@ class LocalMapper:
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
     ) -> None:
-        """Add a keyframe and new points from its stereo features."""
+        """Add a keyframe and new points from its stereo features; points that turn out to be
+        known already are fused with the older ones.
+        """
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
+        fuse_duplicates(self._camera, self._settings, sparse_map, keyframe)
 
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""

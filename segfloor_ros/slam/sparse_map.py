@@ -111,6 +111,7 @@ class SparseMap:
         self._found_count = GrowingArray((), np.int32)
         self._observer_count = GrowingArray((), np.int32)
         self._born = GrowingArray((), np.int32)
+        self._seen_last = GrowingArray((), np.int32)
         self._edge_point = GrowingArray((), np.int32)
         self._edge_keyframe = GrowingArray((), np.int32)
         self._edge_row = GrowingArray((), np.int32)
@@ -201,6 +202,7 @@ class SparseMap:
             (self._found_count, 1),
             (self._observer_count, 0),
             (self._born, born),
+            (self._seen_last, born),
         ]
         seen = [self._descriptor, self._patch, self._viewing_distance]
         seen += [self._viewing_octave, self._viewing_direction]
@@ -221,6 +223,7 @@ class SparseMap:
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
         self.descriptor[ids] = keyframe.features.descriptor[rows]
+        self._seen_last.rows[ids] = keyframe.index
         self.viewing_distance_m[ids] = distance
         self.viewing_octave[ids] = keyframe.features.octave[rows]
         self.viewing_direction[ids] = sight / distance[:, None]
@@ -274,6 +277,48 @@ class SparseMap:
             known[known] = gone[keyframe.point_id[known]]
             keyframe.point_id[known] = NO_POINT
 
+    def seen_together(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Return whether a keyframe observes both points of each pair (a[i], b[i]), (N,); no point
+        occurs twice.
+        """
+        pair: NDArray[np.intp] = np.full((2, len(self.alive)), -1)
+        pair[0, a] = pair[1, b] = np.arange(len(a))
+        of_pair = pair[:, self._edge_point.rows]
+        keyframe = self._edge_keyframe.rows
+        keys = [of[of >= 0] * len(self.keyframes) + keyframe[of >= 0] for of in of_pair]
+        together = np.zeros(len(a), bool)
+        together[np.intersect1d(*keys) // len(self.keyframes)] = True
+        return together
+
+    def merge(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
+        """Make one point of each pair (kept[i], gone[i]), (N,), that no keyframe observes both
+        of. The better known one gives the position and the patch, the one seen last the look.
+        """
+        better = self.observer_count[gone] > self.observer_count[kept]
+        later = self._seen_last.rows[gone] > self._seen_last.rows[kept]
+        view = (self._descriptor, self._viewing_distance, self._viewing_octave)
+        for arrays, chosen in (
+            ((self._xyz, self._patch, self._patch_distance), better),
+            ((*view, self._viewing_direction, self._seen_last), later),
+        ):
+            for array in arrays:
+                array.rows[kept[chosen]] = array.rows[gone[chosen]]
+        for counts in (self._visible_count, self._found_count, self._observer_count):
+            counts.rows[kept] += counts.rows[gone]
+        self._born.rows[kept] = np.minimum(self._born.rows[kept], self._born.rows[gone])
+        self._rename(kept, gone)
+        self.alive[gone] = False
+
+    def _rename(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
+        """Give the observations of points `gone` to points `kept`."""
+        new_row = np.arange(len(self.alive), dtype=np.int32)
+        new_row[gone] = kept
+        moved = np.flatnonzero(new_row[self._edge_point.rows] != self._edge_point.rows)
+        self._edge_point.rows[moved] = new_row[self._edge_point.rows[moved]]
+        for k in np.unique(self._edge_keyframe.rows[moved]):
+            mine = moved[self._edge_keyframe.rows[moved] == k]
+            self.keyframes[k].point_id[self._edge_row.rows[mine]] = self._edge_point.rows[mine]
+
     def _drop_edges(self, dropped: NDArray[np.bool_]) -> None:
         for edges in (self._edge_point, self._edge_keyframe, self._edge_row):
             edges.keep(~dropped)
@@ -293,7 +338,7 @@ class SparseMap:
         """
         found = self._found_count.rows
         seldom = found < min_found_ratio * self._visible_count.rows
-        lonely = (self._born.rows < settled_before) & (self.observer_count < 2) & (found < 4)
+        lonely = (self._born.rows < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
     def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -74,7 +74,7 @@ def test_driving_to_and_fro_adds_stamps_to_the_path_but_no_views():
     images = {}
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     stamps, views_per_turn = [], []
-    for k in range(5 * len(x)):
+    for k in range(6 * len(x)):
         at = int(x[k % len(x)])
         if at not in images:
             images[at] = room.frame(0, planar_pose(0.05 * at, 0.0, 0.0))
@@ -87,4 +87,4 @@ def test_driving_to_and_fro_adds_stamps_to_the_path_but_no_views():
         if k % len(x) == len(x) - 1:
             views_per_turn.append(sum(not r.retired for r in slam.map.keyframes))
     assert len(stamps) > views_per_turn[-1] + 3
-    assert views_per_turn[-1] <= views_per_turn[1] + 3
+    assert views_per_turn[-1] <= len(images) + 1  # about as many as there are different views
