@@ -117,6 +117,13 @@ class StereoSlamNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=0.5,
     )
+    bit_depth: int = setting(
+        0,
+        'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
+        unit='bits',
+        minimum=0,
+        maximum=16,
+    )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 from evo.core import metrics, sync
 from evo.core.filters import FilterException
 from evo.core.trajectory import PoseTrajectory3D
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
@@ -24,9 +25,9 @@ MIN_MATCHES = 3
 @dataclass(frozen=True)
 class TrajectoryScore:
     """ATE: RMSE and maximum of the distances after the best rigid alignment (no scale). RPE: RMSE
-    of the motion over one metre, NaN for shorter paths. end_error_m: distance at the last common
-    pose when the first common poses are laid on each other. tracked: share of the true poses
-    that have an estimate.
+    of the motion over one metre (per metre where frames are further apart), NaN for shorter paths.
+    end_error_m: distance at the last common pose when the first common poses are laid on each
+    other. tracked: share of the true poses that have an estimate.
     """
 
     tracked: float
@@ -141,7 +142,29 @@ def _relative(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> f
     try:
         return _statistics(metric, matched)
     except (metrics.MetricsException, FilterException):
+        return _relative_of_sparse(relation, matched)
+
+
+def _relative_of_sparse(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> float:
+    """Return the error per metre over pairs of frames: each one and the first that is at least
+    `RPE_STEP_M` further along the path.
+    """
+    steps_m = np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1)
+    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    last = np.searchsorted(along_m, along_m + RPE_STEP_M - 1e-9)
+    first = np.flatnonzero(last < len(along_m))
+    if len(first) == 0:
         return float('nan')
+    last = last[first]
+    true, estimated = (
+        invert(poses[first]) @ poses[last] for poses in (matched.truth, matched.aligned)
+    )
+    error = invert(true) @ estimated
+    if relation == metrics.PoseRelation.translation_part:
+        size = np.linalg.norm(error[:, :3, 3], axis=1)
+    else:
+        size = Rotation.from_matrix(error[:, :3, :3]).magnitude()
+    return float(np.sqrt(np.mean((size / (along_m[last] - along_m[first])) ** 2)))
 
 
 def _statistics(metric: metrics.PE, matched: MatchedTrajectories) -> float:

@@ -72,7 +72,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._calibration: StereoCalibration | None = None
         self._frames = CameraFrames('', '')
         self._rectifier: StereoRectifier | None = None
-        self._eight_bit = EightBitScale()
+        self._eight_bit = EightBitScale(self.parameters.own.bit_depth)
         self._mount: Mount | None = None
         self._frame_count = 0
 

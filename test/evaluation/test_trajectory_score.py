@@ -96,6 +96,16 @@ def test_short_path_has_no_error_over_a_metre(tmp_path):
     assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
+def test_frames_more_than_a_metre_apart_have_an_error_per_metre(tmp_path):
+    # 1.5 m from frame to frame; 1.02 times as long, and a milliradian more of yaw with each.
+    longer = se3_exp(np.arange(21)[:, None] * [0, 0, 0, 0, 0, 0.001])
+    longer[:, 0, 3] = np.arange(21) * 1.53
+    result = score(tmp_path, longer, drive(21, 1.5))
+    assert result.rpe_rotation_rad == pytest.approx(0.001 / 1.5)
+    # Sideways the yaw adds 1.53 m times up to 0.02.
+    assert 0.02 <= result.rpe_translation_m < np.hypot(0.02, 0.0204)
+
+
 def test_kitti_and_tum_agree(tmp_path):
     poses = se3_exp(np.random.default_rng(0).normal(size=(20, 6)) * 0.3)
     np.savetxt(tmp_path / 'poses.txt', poses[:, :3].reshape(-1, 12))
