@@ -1,14 +1,37 @@
+"""The pages of the nodes: as generated, and what they say against the running nodes."""
+
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
 import pytest
+from ros_graph import fresh_graph
+from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.messages.topics import NODES
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
+from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
+MAKERS = (StereoCameraNode, StereoSlamNode, FloorSegmentationNode, CloudLabellingNode,
+          OccupancyGridNode)  # fmt: skip
+ALTERNATIVES = (
+    (),
+    ('-p', 'image_transport:=compressed'),
+    ('-p', 'rectified_input:=true'),
+    ('-p', 'rectified_input:=true', '-p', 'image_transport:=compressed'),
+)
+OF_ROS = ('/parameter_events', '/rosout', '/clock', '/transition_event', '/tf', '/tf_static')
+SERVICES_OF_ROS = re.compile(
+    r'/(describe|get|list|set)_parameter(s|_types|s_atomically)$|/get_type_description$'
+    r'|/(change|get)_state$|/get_available_(states|transitions)$|/get_transition_graph$'
+)
 
 
 @pytest.mark.parametrize('node', NODES)
@@ -20,3 +43,40 @@ def test_the_page_of_a_node_is_as_generated(node) -> None:
     spec.loader.exec_module(generate)
     committed = (DOCS / 'nodes' / f'{node}.md').read_text()
     assert committed == generate.page(node), 'run: python docs/generate.py'
+
+
+def documented(node: str, title: str) -> dict[str, str]:
+    """Return the names in the tables of a section of a page, with what their second column says."""
+    page = (DOCS / 'nodes' / f'{node}.md').read_text()
+    (section,) = re.findall(rf'^## {title}\n(.*?)(?=^## |\Z)', page, re.M | re.S)
+    return dict(re.findall(r'^\| `([^`]+)` \| `([^`]*)`', section, re.M))
+
+
+@pytest.mark.parametrize(('node', 'make'), zip(NODES, MAKERS, strict=True), ids=NODES)
+def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node, make) -> None:
+    drive = write_kitti(tmp_path / 'drive', room_drive(1)[0])
+    source = ('-p', f'input:={drive}') if node == 'stereo_camera' else ()
+    published, subscribed, services = {}, {}, {}
+    parameters: set[str] = set()
+    for alternative in ALTERNATIVES if node in ('stereo_camera', 'stereo_slam') else ((),):
+        with fresh_graph('-r', '__ns:=/robot', *source, *alternative) as graph:
+            made = graph.add(make())
+            published |= made.get_publisher_names_and_types_by_node(node, '/robot')
+            subscribed |= made.get_subscriber_names_and_types_by_node(node, '/robot')
+            services |= made.get_service_names_and_types_by_node(node, '/robot')
+            parameters |= set(made.get_parameters_by_prefix(''))
+    assert relative(published) == documented(node, 'Publishes')
+    assert relative(subscribed) == documented(node, 'Subscribes to')
+    own = {name: kinds for name, kinds in services.items() if not SERVICES_OF_ROS.search(name)}
+    assert relative(own, node) == documented(node, 'Services')
+    of_ros = {'use_sim_time', 'start_type_description_service'}
+    assert parameters - of_ros == set(documented(node, 'Parameters'))
+
+
+def relative(found, node: str = '') -> dict[str, str]:
+    """Return names and types as the pages have them, without what every ROS node has."""
+    return {
+        name.replace(f'/robot/{node}/', '~/').removeprefix('/robot/'): kind
+        for name, (kind, *_) in found.items()
+        if not name.endswith(OF_ROS)
+    }
