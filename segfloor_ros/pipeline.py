@@ -86,7 +86,9 @@ class Pipeline:
                 keyframe.left, keyframe.right, self.mount, keyframe.T_map_base
             )
         with self.times.measure('cloud_labelling'):
-            self.labelled = self._labelling.update(keyframe.cloud, keyframe.features, floor.mask)
+            self.labelled = self._labelling.update(
+                keyframe.cloud, keyframe.features, floor.mask, keyframe.T_map_base
+            )
         with self.times.measure('occupancy_grid'):
             self._mapper.update(
                 keyframe.stamp_ns, self.labelled, keyframe.features, keyframe.path, floor.scan

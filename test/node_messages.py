@@ -38,6 +38,7 @@ def cloud_messages(stamp_ns: int) -> dict[str, Any]:
     return {
         'map_points': sparse_cloud_message(stamp_ns, 'map', POINTS),
         'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
+        'keyframe/odometry': pose_message_at(stamp_ns),
         'keyframe/floor_mask': image_message(stamp_ns, 'left', MASK),
     }
 

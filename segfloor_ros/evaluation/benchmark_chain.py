@@ -49,7 +49,9 @@ class MapChain:
     def update(self, keyframe: MapInput) -> None:
         """Take in one keyframe and make the map."""
         with self.times.measure('cloud_labelling'):
-            labelled = self._labelling.update(keyframe.cloud, keyframe.features, keyframe.mask)
+            labelled = self._labelling.update(
+                keyframe.cloud, keyframe.features, keyframe.mask, keyframe.path.T_map_base[-1]
+            )
         with self.times.measure('occupancy_grid'):
             self._mapper.update(
                 keyframe.stamp_ns, labelled, keyframe.features, keyframe.path, keyframe.scan

@@ -27,6 +27,7 @@ POINTS_PER_M = 400
 SIGHT_M = 6.0
 POINT_NOISE_M = 0.01
 SCAN_STEP_RAD = 0.01
+SCAN_RANGE_MAX_M = 8.0
 CORRECTION_EVERY = 100
 CORRECTION_RAD = 0.002
 """Every so many keyframes the whole map turns by so much, as after the closing of a loop."""
@@ -88,6 +89,7 @@ class Corridor:
             SCAN_STEP_RAD,
             np.minimum(wall_m, SIGHT_M).astype(np.float32),
             np.where(in_sight, wall_m, np.nan).astype(np.float32),
+            SCAN_RANGE_MAX_M,
         )
 
 

@@ -25,6 +25,7 @@ from segfloor_ros.floor.observation import (
     FloorObservation,
     FloorScan,
 )
+from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
 from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
@@ -52,6 +53,7 @@ class FloorSegmentation:
         self._memory = FloorMemory()
         self._mount: Mount | None = None
         self._matcher: DisparityMatcher
+        self._overhead: OverheadMatcher
         self._scanner: FloorScanner
 
     def process(
@@ -88,7 +90,8 @@ class FloorSegmentation:
         seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
         evidence = Evidence(seen, evidence.height_m)
         mask = self._fill(view, profile, seen, left_rows, textured, compared, T_map_base)
-        scan = self._scan(view, profile, below, evidence, mask, T_map_base)
+        overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
+        scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
         rows = np.arange(self._camera.height, dtype=np.float64)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
         whole[first_row:] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
@@ -106,6 +109,7 @@ class FloorSegmentation:
             return
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)
         self._matcher = DisparityMatcher(-(-searched // 16) * 16, self._settings)
+        self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
         self._memory = FloorMemory()
         self._mount = mount
@@ -195,9 +199,12 @@ class FloorSegmentation:
         disparity: NDArray[np.float32],
         evidence: Evidence,
         mask: NDArray[np.uint8],
+        overhead_xy: NDArray[np.float32],
         T_map_base: Array | None,
     ) -> FloorScan:
-        """Return the scan, and let the memory learn what was seen."""
+        """Return the scan, and let the memory learn what was seen. overhead_xy: (2, N), what is in
+        the way above the horizon.
+        """
         standing = (evidence.mask[::2] == NOT_FLOOR) & (evidence.height_m[::2] > 0)
         rows, columns = np.nonzero(standing)
         rows *= 2
@@ -208,6 +215,8 @@ class FloorSegmentation:
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
         floor[floor] = mask[v[floor], u[floor]] == FLOOR
         shared = u * view.step >= floor_px
+        # At half the resolution a pixel tells of four, here of two or, in every other column, four.
+        upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
 
 

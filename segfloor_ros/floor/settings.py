@@ -19,6 +19,14 @@ class FloorSegmentationSettings(StageSettings):
         maximum=0.5,
         live=True,
     )
+    robot_height_m: float = setting(
+        1.0,
+        'What hangs higher than this above the floor does not end the scan.',
+        unit='m',
+        minimum=0.05,
+        maximum=10.0,
+        live=True,
+    )
     drop_height_m: float = setting(
         0.04,
         'What lies deeper than this below the floor is not floor.',

@@ -113,7 +113,7 @@ _ALL = [
         Odometry,
         qos.KEYFRAMES,
         SLAM,
-        (FLOOR, GRID),
+        (FLOOR, CLOUD, GRID),
         'base_link in map at the keyframe.',
     ),
     *_keyframe_images(),

@@ -15,11 +15,13 @@ from segfloor_ros.messages.clouds import (
     sparse_cloud_arrays,
 )
 from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
 from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.stage_node import StageNode, run_node
 
-MAP_POINTS, FEATURES, MASK = 'map_points', 'keyframe/features', 'keyframe/floor_mask'
+MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
+POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
 
 
 class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
@@ -35,7 +37,7 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
             FLOOR: self.output('floor_points'),
             OBSTACLE: self.output('obstacle_points'),
         }
-        self.join((MAP_POINTS, FEATURES, MASK), self._take)
+        self.join((MAP_POINTS, FEATURES, POSE, MASK), self._take)
 
     def start_anew(self) -> None:
         """Begin without points."""
@@ -58,7 +60,8 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         cloud = sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
         features = features_arrays(parts[FEATURES], FEATURES)
         mask = grey8_image(parts[MASK], MASK)
-        labelled = self._stage.update(cloud, features, mask)
+        T_map_base = pose_array(parts[POSE].pose.pose)
+        labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
         self._labelled.publish(labelled_message(stamp_ns, frame_id, labelled))
         for label, output in self._by_label.items():

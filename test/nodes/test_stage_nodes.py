@@ -251,7 +251,7 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
 
 
 def test_cloud_labelling_is_the_stage(make_graph) -> None:
-    expected = CloudLabelling(CloudLabellingSettings()).update(POINTS, FEATURES, MASK)
+    expected = CloudLabelling(CloudLabellingSettings()).update(POINTS, FEATURES, MASK, np.eye(4))
     graph = make_graph()
     labelled, floor = graph.collect('labelled_points'), graph.collect('floor_points')
     graph.add(CloudLabellingNode())
