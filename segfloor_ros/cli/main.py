@@ -8,6 +8,7 @@ import sys
 import typer
 
 from segfloor_ros.cli.benchmark import benchmark
+from segfloor_ros.cli.benchmark_nodes import benchmark_nodes
 from segfloor_ros.cli.calibrate import calibrate
 from segfloor_ros.cli.convert import convert
 from segfloor_ros.cli.demo import demo
@@ -24,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
+for command in (run, replay, simulate, calibrate, convert, benchmark, benchmark_nodes, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')
 

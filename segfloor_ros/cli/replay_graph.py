@@ -50,7 +50,9 @@ def free_domain() -> int:
     raise SegfloorError('every ROS domain id is in use on this machine; set ROS_DOMAIN_ID')
 
 
-def unconnected(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+def unconnected(
+    counts: Mapping[str, Mapping[str, int]], status_listeners: int = STATUS_LISTENERS
+) -> list[str]:
     """Return what is missing before the first frame can be sent without loss, in words.
 
     counts: subscribers by node and topic, as each publisher sees them.
@@ -66,7 +68,7 @@ def unconnected(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
             if not topic.instead_of or topic.name in counts[node]
         }
         needed = {topic: _listeners_of(topic) for topic in names.values()}
-        needed[DIAGNOSTICS.name] = STATUS_LISTENERS
+        needed[DIAGNOSTICS.name] = status_listeners
         missing += [
             f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'
             for topic, number in needed.items()

@@ -78,6 +78,11 @@ class NodeProcesses:
             if status is not None:
                 raise ReplayError(f'node {node} died ({_cause(status)}){self._last_words(node)}')
 
+    @property
+    def process_ids(self) -> dict[str, int]:
+        """The process of every node."""
+        return {node: process.pid for node, process in self._processes.items()}
+
     def rss_mb(self) -> float:
         """Return the resident memory of all processes together in MB."""
         return sum(rss_mb(process.pid) for process in self._processes.values())

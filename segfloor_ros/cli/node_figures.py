@@ -1,0 +1,152 @@
+"""What the five node processes cost and how long an image takes to the map, measured outside."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
+
+from segfloor_ros.cli.replay_graph import isolated_environment
+from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
+from segfloor_ros.cli.replay_recorder import ReplayRecorder
+from segfloor_ros.cli.replay_session import ProgressListener, ReplayGraph
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.memory import rss_mb
+from segfloor_ros.messages.diagnostics import Status
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, TOPICS
+
+MEMORY_PERIOD_S = 2.0
+TICKS_PER_S = os.sysconf('SC_CLK_TCK')
+
+
+@dataclass(frozen=True)
+class NodeFigures:
+    """latency_s: (K,) from a keyframe's images to the map that holds it, in the order of the
+    keyframes. cpu_share: seconds of CPU per second, by node. memory_mb: (T, 1 + nodes), the number
+    of frames so far and the resident memory of every node, over time.
+    """
+
+    frames_sent: int
+    frames_answered: int
+    keyframes: int
+    mapped: int
+    wall_s: float
+    latency_s: NDArray[np.float64]
+    cpu_share: dict[str, float]
+    memory_mb: NDArray[np.float64]
+    shutdown_s: float
+
+
+class FigureRecorder(ReplayRecorder):
+    """Notes when an image was sent, when its map came, and the memory of the nodes."""
+
+    def __init__(self, context: Context, processes: NodeProcesses) -> None:
+        super().__init__(context, lambda: 0.0, None)
+        self._processes = processes
+        self._sent_s: dict[int, float] = {}
+        self._arrived_s: dict[int, float] = {}
+        self.memory_rows: list[list[float]] = []
+        topic = TOPICS['map']
+        self.create_subscription(topic.type, topic.name, self._take_map, topic.profile)
+        self.create_timer(MEMORY_PERIOD_S, self._note_memory)
+
+    def latency_s(self) -> NDArray[np.float64]:
+        """Return the latency of every keyframe whose map came, in order."""
+        both = sorted(self._sent_s.keys() & self._arrived_s.keys())
+        return np.array([self._arrived_s[stamp] - self._sent_s[stamp] for stamp in both])
+
+    def _take_status(self, status: Status) -> None:
+        if status.node == CAMERA:
+            self._sent_s[status.stamp_ns] = time.monotonic()
+        super()._take_status(status)
+
+    def _take_map(self, message: OccupancyGrid) -> None:
+        self._arrived_s.setdefault(to_ns(message.header.stamp), time.monotonic())
+
+    def _note_memory(self) -> None:
+        memory = [rss_mb(process_id) for process_id in self._processes.process_ids.values()]
+        self.memory_rows.append([len(self.answers), *memory])
+
+
+def measure_nodes(
+    configuration: Configuration, rate: float, lossless: bool, on_progress: ProgressListener
+) -> NodeFigures:
+    """Play the recording of the configuration through the nodes. Raises ReplayError."""
+    environment = isolated_environment()
+    os.environ.update(environment)
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with tempfile.TemporaryDirectory(prefix='segfloor-figures-') as folder:
+            arguments = _node_arguments(configuration, rate, lossless, Path(folder))
+            with NodeProcesses(NODES, arguments, environment, Path(folder)) as processes:
+                recorder = FigureRecorder(context, processes)
+                graph = ReplayGraph(recorder, processes)
+                # A camera that keeps to the clock does not listen to the nodes.
+                graph.connect(status_listeners=1 + lossless)
+                return _follow(graph, recorder, on_progress)
+    finally:
+        rclpy.try_shutdown(context=context)
+
+
+def _node_arguments(
+    configuration: Configuration, rate: float, lossless: bool, folder: Path
+) -> list[str]:
+    parameters: dict[str, Any] = configuration.as_ros_parameters()
+    own = {'rate': float(rate), 'lossless': lossless, 'start_paused': True}
+    parameters[CAMERA]['ros__parameters'].update(own)
+    # Else it is this period that is measured.
+    parameters[GRID]['ros__parameters'].update(publish_period_s=0.0)
+    file = folder / 'parameters.yaml'
+    file.write_text(yaml.safe_dump(parameters))
+    return ['--ros-args', '--disable-external-lib-logs', '--params-file', str(file)]
+
+
+def _follow(
+    graph: ReplayGraph, recorder: FigureRecorder, on_progress: ProgressListener
+) -> NodeFigures:
+    start_s, cpu_s = time.monotonic(), _cpu_s(graph.processes)
+    graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+    try:
+        graph.play(on_progress, threading.Event())
+    except ReplayError:
+        # Frames that were lost never come; that is a figure, unless a node has died.
+        graph.processes.check()
+    wall_s = time.monotonic() - start_s
+    spent_s = {node: s - cpu_s[node] for node, s in _cpu_s(graph.processes).items()}
+    stop_s = time.monotonic()
+    graph.processes.stop()
+    return NodeFigures(
+        frames_sent=len(recorder.frame_index),
+        frames_answered=len(recorder.answers),
+        keyframes=len(recorder.keyframes),
+        mapped=len(recorder.updated & recorder.keyframes),
+        wall_s=wall_s,
+        latency_s=recorder.latency_s(),
+        cpu_share={node: seconds / wall_s for node, seconds in spent_s.items()},
+        memory_mb=np.array(recorder.memory_rows),
+        shutdown_s=time.monotonic() - stop_s,
+    )
+
+
+def _cpu_s(processes: NodeProcesses) -> dict[str, float]:
+    """Return the CPU time every node has used, all threads, user and system (proc(5))."""
+    used = {}
+    for node, process_id in processes.process_ids.items():
+        fields = Path(f'/proc/{process_id}/stat').read_text().rpartition(')')[2].split()
+        used[node] = (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+    return used

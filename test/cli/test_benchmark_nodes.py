@@ -1,0 +1,77 @@
+"""`segfloor benchmark-nodes`: its drive to and fro, its sums by hand, the command for real."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from stereo_drive import room_drive, write_kitti
+from stereo_room import CAMERA
+
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.endless_drive import write_endless_drive
+
+pytest.importorskip('rclpy')
+
+from segfloor_ros.cli.benchmark_nodes import figure_rows
+from segfloor_ros.cli.node_figures import NodeFigures
+
+
+def open_recording(folder):
+    return open_source(StereoCameraSettings(input=str(folder)))
+
+
+def test_the_endless_drive_goes_to_and_fro_at_the_pace_of_the_recording(tmp_path) -> None:
+    frames, _ = room_drive(4)
+    source = open_recording(write_kitti(tmp_path / 'drive', frames))
+    endless = open_recording(write_endless_drive(source, tmp_path / 'endless', 1.0))
+    found = list(endless.frames())
+    assert [frame.stamp_ns for frame in found] == [i * 100_000_000 for i in range(10)]
+    for frame, place in zip(found, (0, 1, 2, 3, 2, 1, 0, 1, 2, 3), strict=True):
+        np.testing.assert_array_equal(frame.left, frames[place].left)
+        np.testing.assert_array_equal(frame.right, frames[place].right)
+    assert endless.camera.baseline_m == pytest.approx(CAMERA.baseline_m)
+    assert (endless.camera.fx, endless.camera.cy) == pytest.approx((CAMERA.fx, CAMERA.cy))
+
+
+def test_a_single_frame_is_no_drive(tmp_path) -> None:
+    source = open_recording(write_kitti(tmp_path / 'drive', room_drive(1)[0]))
+    with pytest.raises(InputError, match='two frames'):
+        write_endless_drive(source, tmp_path / 'endless', 1.0)
+
+
+def test_the_figures_are_of_the_quarters_after_the_first() -> None:
+    figures = NodeFigures(
+        frames_sent=20,
+        frames_answered=18,
+        keyframes=8,
+        mapped=7,
+        wall_s=2.0,
+        latency_s=np.array([9.0, 9.0, 0.1, 0.3, 0.2, 0.2, 0.4, 0.6]),
+        cpu_share={'a': 0.5},
+        memory_mb=np.array([[0, 90.0], [5, 100.0], [10, 101.0], [20, 102.0]]),
+        shutdown_s=0.5,
+    )
+    rows = dict(figure_rows(figures))
+    assert rows['frames sent, answered'] == '20, 18'
+    assert rows['keyframes, in the map'] == '8, 7'
+    assert rows['frames per second'] == '9.0'
+    assert rows['image to map, median and p95'] == '350 ms, 9000 ms'
+    assert rows['image to map, 2nd and last quarter'] == '200 ms, 500 ms'
+    assert rows['a: CPU'] == '50 % of a core'
+    assert rows['a: memory, 2nd and last quarter'] == '100.0 MB, 102.0 MB'
+
+
+def test_a_soak_loses_nothing(tmp_path) -> None:
+    drive = write_kitti(tmp_path / 'drive', room_drive(5, step_m=0.04)[0])
+    command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'benchmark-nodes', str(drive),
+               '--rate', '10', '--soak-minutes', '0.03']  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert '18, 18' in done.stdout
+    for node in ('stereo_camera', 'stereo_slam', 'occupancy_grid'):
+        assert f'{node}: CPU' in done.stdout
