@@ -157,8 +157,15 @@ class ManagedNode(LifecycleNode):
 
         self._openers.append((subscribe, self._unsubscribe))
 
+    def publishing_nodes(self, name: str) -> int:
+        """Return how many nodes publish a topic that the node listens to now. One that was killed
+        and started again is one, though for a while both its lives are seen.
+        """
+        infos = self.get_publishers_info_by_topic(name) if name in self._heard else []
+        return len({(info.node_namespace, info.node_name) for info in infos})
+
     def publisher_count(self, name: str) -> int:
-        """Return how many publish a topic that the node listens to now."""
+        """Return how many publishers of a topic that the node listens to now are seen."""
         return self._heard[name].get_publisher_count() if name in self._heard else 0
 
     @property

@@ -107,9 +107,9 @@ class ReportingNode(ManagedNode):
         """Warn about sets that were given up, naming the topics of the missing parts."""
         for dropped in joiner.take_dropped():
             names = ', '.join(dropped.missing)
-            counts = {name: self.publisher_count(name) for name in joiner.parts}
+            counts = {name: self.publishing_nodes(name) for name in joiner.parts}
             crowded = ''.join(
-                f'; {name} has {count} publishers, stop or remap one'
+                f'; {name} is published by {count} nodes, stop or remap one'
                 for name, count in counts.items()
                 if count > 1
             )

@@ -22,7 +22,7 @@ from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.poses import path_arrays, pose_array
-from segfloor_ros.messages.topics import CAMERA, GRID
+from segfloor_ros.messages.topics import CAMERA, GRID, SLAM
 from segfloor_ros.nodes.kept_state import KeptState
 
 PLACES = 24
@@ -155,6 +155,22 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
     path = path_arrays(journey.latest('keyframe/path'))
     assert path.stamp_ns[0] == 0, 'the map was begun anew'
     assert journey.odometry_error_m() < 0.03
+
+
+def test_a_slam_that_does_not_find_its_place_again_begins_a_new_map(journey) -> None:
+    chain = journey.chain
+    chain.kill(SLAM)
+    chain.start(SLAM)
+    dark = np.zeros_like(journey.next().left)
+    for _ in range(2):
+        chain.drive([replace(journey.next(), left=dark, right=dark)])
+        journey.miss(51)
+    begun = journey.next()
+    assert chain.drive([begun])[0].level is Level.OK
+    chain.mapped(begun.stamp_ns)
+    path = path_arrays(journey.latest('keyframe/path'))
+    assert path.stamp_ns.tolist() == [begun.stamp_ns]
+    assert 'is not found' in chain.log(SLAM)
 
 
 def known_cells(grid: OccupancyGrid) -> dict[tuple[int, int], bool]:
