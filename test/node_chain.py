@@ -48,7 +48,7 @@ class NodeChain:
 
     def start(self, *nodes: str, **parameters: Any) -> None:
         """Start nodes and wait until all that run are connected with each other."""
-        begun = len(self.graph.statuses)
+        begun, known = len(self.graph.statuses), self._listeners()
         for node in nodes:
             words = [f'{name}:={value}' for name, value in {**PARAMETERS, **parameters}.items()]
             options = [word for pair in words for word in ('-p', pair)]
@@ -59,7 +59,13 @@ class NodeChain:
                     stdout=log,
                     stderr=log,
                 )
-        self.graph.until(lambda: not self._unconnected(begun, nodes), f'{nodes} to be connected')
+        self.graph.until(lambda: not self._unconnected(begun), f'{nodes} to be connected')
+        if SLAM in nodes:
+            # One that was killed stays visible for a while: the new one must be there, too.
+            self.graph.until(
+                lambda: all(len(now - known[n]) for n, now in self._listeners().items()),
+                'the new stereo_slam to listen',
+            )
 
     def kill(self, node: str) -> None:
         """End a node as a crash does: without a chance to say goodbye."""
@@ -124,7 +130,12 @@ class NodeChain:
             if s.node == node and s.stamp_ns == stamp_ns and not s.kind
         ]
 
-    def _unconnected(self, since: int, started: Iterable[str]) -> list[str]:
+    def _listeners(self) -> dict[str, set[bytes]]:
+        """Return the endpoints that listen to each of the inputs."""
+        infos = {n: self.graph.tester.get_subscriptions_info_by_topic(n) for n in self.inputs}
+        return {n: {bytes(info.endpoint_gid) for info in found} for n, found in infos.items()}
+
+    def _unconnected(self, since: int) -> list[str]:
         """Return the topics that the latest signs of life say to lack listeners."""
         running = [node for node in self._processes if self.lives(node)]
         latest = {s.node: s for s in self.graph.statuses[since:] if s.kind == CONNECTIONS}
