@@ -1,4 +1,4 @@
-"""Images that cannot be tracked: black, white, or only half delivered."""
+"""Images that cannot be tracked: black, white, only half delivered, or the same as before."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 MIN_CONTRAST = 3.0
 MIN_LIVE_ROWS = 0.7
+MIN_EXPECTED_SHIFT = 0.004
+"""Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
 
 
 def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
@@ -21,3 +23,22 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if live.mean() < MIN_LIVE_ROWS:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
+
+
+class FrozenCheck:
+    """Tells a camera that delivers its last image again and again from a robot that stands still:
+    the robot would have had to stop at once, and noise differs from image to image.
+    """
+
+    def __init__(self) -> None:
+        self._last: NDArray[np.uint8] | None = None
+        self._frozen = False
+
+    def frozen(self, left: NDArray[np.uint8], expected_shift: float) -> bool:
+        """Return whether the image (H, W) is the one before although it was to move by
+        expected_shift, a share of its width.
+        """
+        same = self._last is not None and np.array_equal(left, self._last)
+        self._last = left
+        self._frozen = same and (self._frozen or expected_shift > MIN_EXPECTED_SHIFT)
+        return self._frozen

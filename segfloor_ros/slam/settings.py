@@ -86,6 +86,12 @@ class StereoSlamSettings(StageSettings):
     min_tracked: int = setting(
         20, 'Fewest inlier matches for a pose to be believed.', minimum=6, maximum=500
     )
+    recovery_ratio: float = setting(
+        0.15,
+        'After tracking was lost, share of the points expected in view that must be found.',
+        minimum=0.0,
+        maximum=1.0,
+    )
     tracked_points: int = setting(
         400,
         'Map points, spread over the image, that are measured in a frame between keyframes.',

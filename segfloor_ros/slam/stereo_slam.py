@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
@@ -22,11 +22,12 @@ from segfloor_ros.geometry import (
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.following import Follower, Sighting, Track
-from segfloor_ros.slam.image_check import image_fault
+from segfloor_ros.slam.image_check import FrozenCheck, image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
 from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map, take_snapshot
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import (
@@ -46,19 +47,6 @@ MAX_HELD_KEYFRAMES = 50
 
 RIGHT_FEATURES = 2
 """Right features per left feature: what the left image has must be found among them."""
-
-
-class MountMeter(Protocol):
-    """Measures the camera's mount from the floor it sees."""
-
-    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
-        """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
-        frame.
-        """
-
-    @property
-    def mount(self) -> Mount | None:
-        """The mount at the first frame, once it is known."""
 
 
 class StereoSlam:
@@ -90,6 +78,7 @@ class StereoSlam:
         self._right_extractor = FeatureExtractor(
             settings.replaced(num_features=RIGHT_FEATURES * settings.num_features)
         )
+        self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
         self._tracker = Tracker(camera, settings)
         self._follower = Follower(camera, settings)
@@ -115,7 +104,7 @@ class StereoSlam:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
-            fault = image_fault(frame.left, frame.right)
+            fault = self._fault(frame)
             images = Images.of(frame)
             track = None
             if not fault and self.map.keyframes:
@@ -132,6 +121,27 @@ class StereoSlam:
     def close(self) -> None:
         """End the background thread, if there is one."""
         self._adjusting.close()
+
+    def _fault(self, frame: StereoFrame) -> str:
+        """Return why a pair of images cannot be tracked, or ''."""
+        frozen = self._frozen.frozen(frame.left, self._expected_shift(frame.stamp_ns))
+        fault = image_fault(frame.left, frame.right)
+        if frozen and not fault:
+            return 'the image is the one before although the camera was moving'
+        return fault
+
+    def _expected_shift(self, stamp_ns: int) -> float:
+        """Return how far the picture should have moved since the last pose, in image widths."""
+        if self._sighting is None or len(self._sighting.ids) == 0:
+            return 0.0
+        dt_s = (stamp_ns - self._last_stamp_ns) * 1e-9
+        steady = se3_exp(self._velocity * dt_s) @ self._T_camera_world
+        points = self.map.xyz_world[self._sighting.ids]
+        now, then = (
+            self._camera.project(transform_points(T, points))[:, :2]
+            for T in (steady, self._T_camera_world)
+        )
+        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def _track(self, frame: StereoFrame, images: Images) -> Track | None:
         dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
@@ -182,9 +192,11 @@ class StereoSlam:
             [steady, turned],
             self.disparity_offset_px,
         )
-        if track is None and self._lost:
+        if not self._lost:
+            return track
+        if track is None or not self._recognised(track):
             track = self._recover(images, features)
-        return track
+        return track if track and self._recognised(track) else None
 
     def _recover(self, images: Images, features: Features) -> FeatureTrack | None:
         """Look for the view among the keyframes, a few per frame, the latest ones first."""
@@ -195,7 +207,8 @@ class StereoSlam:
         turn = count - 1 - (first + np.arange(min(RECOVERY_KEYFRAMES, count))) % count
         ids = self.map.points_of(np.array(views)[turn])
         observations = self._tracker.pixel_observations(features)
-        estimate = self._tracker.locate(features, observations, self.map, ids)
+        tree = cKDTree(features.uv_px)
+        estimate = self._tracker.locate(features, tree, observations, self.map, ids)
         if estimate is None:
             return None
         return self._tracker.track_at(
@@ -206,6 +219,12 @@ class StereoSlam:
             estimate.T_camera_world,
             self.disparity_offset_px,
         )
+
+    def _recognised(self, track: Track) -> bool:
+        """Whether a camera that was lost sees enough of what it should see there: far points alone
+        fit many places.
+        """
+        return len(track.point_ids) >= self._settings.recovery_ratio * len(track.visible_ids)
 
     def _plausible(self, track: Track, dt_s: float) -> bool:
         motion = track.T_camera_world @ invert(self._T_camera_world)

@@ -36,6 +36,9 @@ MAX_CORNER_NOISE_FACTOR = 2.0
 WIDE_SEARCH = 3.0
 """Factor on the search radius when the first search finds too little."""
 
+MIN_PNP_INLIERS = 10
+"""Fewest matches behind a first guess of the pose; chance gives five or six."""
+
 NARROW_SEARCH = 0.4
 """Factor on the search radius once a pose is known from this very frame."""
 
@@ -159,27 +162,28 @@ class Tracker:
             )
             if estimate is not None:
                 return estimate
-        return self.locate(features, observations, sparse_map, local_ids)
+        return self.locate(features, tree, observations, sparse_map, local_ids)
 
     def locate(
         self,
         features: Features,
+        tree: cKDTree,
         observations: Observations,
         sparse_map: SparseMap,
         ids: NDArray[np.int32],
     ) -> PoseEstimate | None:
-        """Find the pose among map points without a prediction: descriptors alone, then PnP-
-        RANSAC.
+        """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
+        a first guess, which then has to find more points where they should be.
         """
         points, rows = match_unguided(
             sparse_map.descriptor[ids], features.descriptor, self._settings.max_hamming
         )
         found = solve_pnp(self._camera, sparse_map.xyz_world[ids[points]], features.uv_px[rows])
-        if found is None:
+        if found is None or found[1].sum() < MIN_PNP_INLIERS:
             return None
-        T_camera_world, inliers = found
-        points, rows = points[inliers], rows[inliers]
-        return self._believable(observations, sparse_map, ids[points], rows, T_camera_world)
+        seen = self._predict(sparse_map, ids, found[0])
+        points, rows = self._search(features, tree, sparse_map, seen, 1.0)
+        return self._believable(observations, sparse_map, seen.ids[points], rows, found[0])
 
     def _believable(
         self,

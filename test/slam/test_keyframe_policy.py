@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.image_check import image_fault
+from segfloor_ros.slam.image_check import FrozenCheck, image_fault
 from segfloor_ros.slam.keyframe_policy import View, is_keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
 
@@ -54,3 +54,13 @@ def test_image_faults_are_named():
     half = good.copy()
     half[24:] = 128
     assert 'left image incomplete' in image_fault(half, good)
+
+
+def test_an_image_is_frozen_when_it_repeats_although_the_camera_was_moving():
+    one, two = np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
+    check = FrozenCheck()
+    assert not check.frozen(one, 0.05)  # nothing came before
+    assert check.frozen(one.copy(), 0.05)
+    assert check.frozen(one.copy(), 0.0)  # still the same one
+    assert not check.frozen(two, 0.05)
+    assert not check.frozen(two.copy(), 0.0005)  # it stands still

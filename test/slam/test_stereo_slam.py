@@ -155,6 +155,43 @@ def test_black_frames_are_lost_and_tracking_returns(frames):
         assert np.linalg.norm((invert(truth) @ pose_of(result))[:3, 3]) < 0.02
 
 
+def test_a_frozen_camera_is_lost_and_tracking_returns(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    results = []
+    for frame in frames[:18]:
+        if 10 <= frame.index < 13:
+            frame = StereoFrame(frame.index, frame.stamp_ns, frames[9].left, frames[9].right)
+        results += slam.process(frame)
+    assert [r.index for r in results if not r.tracked] == [10, 11, 12]
+    assert 'although the camera was moving' in results[10].state
+    for result, truth in zip(results[13:], drive()[13:18], strict=True):
+        assert np.linalg.norm((invert(truth) @ pose_of(result))[:3, 3]) < 0.02
+
+
+def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    room = StereoRoom()
+    slam.process(room.frame(0, planar_pose(0, 0, 0)))
+    far = planar_pose(0.5, 0.2, 0.3)  # 17 degrees: 50 of 320 pixels
+    result = slam.process(room.frame(1, far))[0]
+    assert result.tracked
+    assert np.linalg.norm((invert(far) @ pose_of(result))[:3, 3]) < 0.02
+
+
+def test_who_was_lost_must_find_what_should_be_there(frames):
+    slam = StereoSlam(CAMERA, SETTINGS.replaced(recovery_ratio=1.0), MOUNT)
+    black = np.zeros_like(frames[0].left)
+    tracked = []
+    for frame in frames[:8]:
+        if frame.index == 4:  # a picture of somewhere else: lost
+            frame = StereoRoom(seed=99).frame(4, planar_pose(1.0, 1.0, 2.0))
+        if frame.index == 5:
+            frame = StereoFrame(5, frame.stamp_ns, black, black)
+        tracked += [result.tracked for result in slam.process(frame)]
+    # With the ratio at 1 not even the right view is enough.
+    assert tracked == [True] * 4 + [False] * 4
+
+
 def test_teleported_camera_is_lost_not_wrong(frames):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     other = StereoRoom(seed=99)

@@ -1,0 +1,24 @@
+"""What SLAM asks of whoever measures the camera's mount."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.geometry import Array
+
+
+class MountMeter(Protocol):
+    """Measures the camera's mount from the floor it sees."""
+
+    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
+        """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
+        frame.
+        """
+
+    @property
+    def mount(self) -> Mount | None:
+        """The mount at the first frame, once it is known."""
