@@ -19,6 +19,8 @@ from segfloor_ros.slam.results import KeyframeFeatures
 QUARTILE = 0.675
 """Quartiles of a normal distribution lie this many sigmas from its mean."""
 
+_SURE_SHARE = 0.4
+"""An obstacle is placed within its cell where this share of a cell's side is one sigma."""
 _FREE_ERROR_M = 0.12
 """Where the end of the floor is less certain than this, one sigma, it is not mapped by default."""
 
@@ -33,7 +35,7 @@ class KeyframeEvidence:
     that reach farther than the fan. Then come lines along what the floor ends at, num_contacts
     ends and as many starts; the others are obstacle points at any height that concerns the robot.
     thickness_m: (num_contacts,) float16, how deep the things behind these lines are taken to be.
-    hit_range_m: up to where an obstacle would have been placed well enough.
+    sure_range_m: up to where an obstacle is placed within its cell.
     """
 
     first_rad: float
@@ -43,7 +45,7 @@ class KeyframeEvidence:
     num_rays: int
     num_contacts: int
     thickness_m: NDArray[np.float16]
-    hit_range_m: float
+    sure_range_m: float
 
 
 def gather_evidence(
@@ -73,16 +75,24 @@ def gather_evidence(
         num_rays=len(rays),
         num_contacts=len(starts),
         thickness_m=_thickness_m(starts, scan, settings),
-        hit_range_m=hit_m,
+        sure_range_m=_sure_range_m(scan, settings),
     )
 
 
 def hit_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
-    """Return up to which distance an obstacle is placed well enough to mark a cell."""
+    """Return up to which distance an obstacle is placed well enough to mark cells."""
     limit_m = free_range_m(scan, settings)
     if scan.error_per_m == 0:
         return limit_m
     return min(limit_m, math.sqrt(settings.max_hit_error_m / scan.error_per_m))
+
+
+def _sure_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
+    """Return up to which distance the end of the floor is placed within its cell."""
+    limit_m = hit_range_m(scan, settings)
+    if scan.error_per_m == 0:
+        return limit_m
+    return min(limit_m, math.sqrt(_SURE_SHARE * settings.resolution_m / scan.error_per_m))
 
 
 def free_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:

@@ -36,12 +36,14 @@ class EvidenceFolder:
         most = ZERO + steps(settings.max_log_odds)
         self._raised = np.minimum(value + hit, most).astype(np.uint8)
         self._lowered = np.maximum(value - free, self._least).astype(np.uint8)
-        # Floor seen from farther than an obstacle could have been placed from, or in a part of a
-        # cell, is free as long as nothing says otherwise: it clears no obstacle, and counts no
-        # more than one look.
-        tentative = np.minimum(value, np.maximum(value - free, ZERO - free))
-        tentative = np.where(value >= self._occupied, value, tentative)
-        self._lowered_tentatively = tentative.astype(np.uint8)
+        # What is seen from too far to be placed within its cell, or in a part of a cell, counts as
+        # long as nothing was seen from nearer: it does not count for much, and changes nothing that
+        # does.
+        sure = self._occupied + hit
+        lowered = np.minimum(value, np.maximum(value - free, ZERO - free))
+        self._lowered_tentatively = np.where(value > sure, value, lowered).astype(np.uint8)
+        raised = np.maximum(value, np.minimum(value + hit, sure))
+        self._raised_tentatively = np.where(value < ZERO - 2 * free, value, raised).astype(np.uint8)
 
     def place(
         self, evidence: KeyframeEvidence, pose: Pose2d, previous: Pose2d | None
@@ -64,10 +66,11 @@ class EvidenceFolder:
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible
         partly &= visible
-        near = self._draw_near(free, placed)
-        _replace(cells, near, self._lowered)
-        _replace(cells, partly - near, self._lowered_tentatively)
-        _replace(cells, hits, self._raised)
+        near = self._draw_near(cells.shape, placed)
+        _replace(cells, free & near, self._lowered)
+        _replace(cells, partly & ~(free & near), self._lowered_tentatively)
+        _replace(cells, hits & near, self._raised)
+        _replace(cells, hits & ~near, self._raised_tentatively)
         self._drive(cells, placed)
 
     def _draw_partly_free(
@@ -96,15 +99,12 @@ class EvidenceFolder:
         horizon = nearest_cells(column, row, fan)
         return fan.shadow(cells.shape, horizon + max(2.0, _BODY_M / self._resolution_m))
 
-    def _draw_near(self, free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
-        """Return the free cells that are near enough for an obstacle there to be placed, 1."""
-        if placed.reach <= placed.hit_range:
-            return free
-        near = np.zeros_like(free)
+    def _draw_near(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
+        """Return the cells that are near enough for an obstacle to be placed in one of them, 1."""
+        near = np.zeros(shape, np.uint8)
         centre = fixed_point(placed.fan.centre[:, None])[0].tolist()
-        radius = round(placed.hit_range * (1 << SUBPIXEL_BITS))
+        radius = round(min(placed.sure_range, sum(shape)) * (1 << SUBPIXEL_BITS))
         cv2.circle(near, centre, radius, 1, cv2.FILLED, shift=SUBPIXEL_BITS)
-        near &= free
         return near
 
     def _drive(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:

@@ -22,7 +22,8 @@ class PlacedEvidence:
     touches. previous: (2,), where the base came from. rays: (2, R), ends of single rays. faces:
     (2, C + P), starts of the lines along contacts, then obstacle points; outward: (2, C + P), unit
     vectors from the base to them. ends: (2, C), where these lines end; thickness: (C,), how deep
-    is what stands behind them. hit_range: how far obstacles are placed well enough.
+    is what stands behind them. sure_range: how far obstacles are placed within a
+    cell.
     """
 
     low: tuple[int, int]
@@ -34,16 +35,7 @@ class PlacedEvidence:
     faces: Array
     outward: Array
     thickness: Array
-    hit_range: float
-
-    @property
-    def reach(self) -> float:
-        """How far free floor was seen at most, in cells."""
-        reach = self.fan.lengths.max(initial=0.0)
-        if self.rays.size:
-            offset = self.rays - self.fan.centre[:, None]
-            reach = max(reach, np.sqrt((offset**2).sum(axis=0).max()))
-        return float(reach)
+    sure_range: float
 
     @property
     def base(self) -> Array:
@@ -89,5 +81,5 @@ def place(
         faces=positions[:, faces:],
         outward=outward,
         thickness=thickness,
-        hit_range=evidence.hit_range_m * scale,
+        sure_range=evidence.sure_range_m * scale,
     )

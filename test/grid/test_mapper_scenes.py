@@ -203,3 +203,24 @@ def test_opening_removes_single_rays(
     drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.02, 0.0)], FLOOR))
     assert cells_at(drive.grid(), np.array([[1.5, 0.02]])) == expected
     assert cells_at(drive.grid(), np.array([[0.0, 0.0]])) == 0
+
+
+def test_what_was_seen_from_near_outweighs_what_is_seen_from_afar(make_drive: MakeDrive) -> None:
+    # A wall, seen from 1 m, and from 3 m 12 cm nearer than it is: twenty times as often.
+    settings = OccupancyGridSettings(footprint_radius_m=0.0)
+    near, far = (World(walls=((x, -3, x, 3),)) for x in (4.02, 3.9))
+    drive = make_drive(settings, error_per_m=0.0)
+    for _ in range(5):
+        drive.look(near, (3.0, 0.0, 0.0))
+    for _ in range(100):
+        drive.look(far, (1.0, 0.0, 0.0))
+    grid = drive.grid()
+    assert (cells_at(grid, centres((3.8, 4.0), (-0.4, 0.4))) == 0).all()
+    assert (cells_at(grid, centres((4.0, 4.05), (-0.4, 0.4))) == 100).all()
+
+
+def test_a_wall_seen_from_afar_alone_is_marked(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings(), error_per_m=0.0)
+    for _ in range(5):
+        drive.look(World(walls=((4.02, -3, 4.02, 3),)), (1.0, 0.0, 0.0))
+    assert (cells_at(drive.grid(), centres((4.0, 4.05), (-1.0, 1.0))) == 100).all()
