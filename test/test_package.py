@@ -41,6 +41,15 @@ def test_the_manifest_is_of_format_3_and_says_ament_python() -> None:
     assert (REPOSITORY / 'resource' / 'segfloor_ros').exists()
 
 
+def test_the_manifest_is_what_the_build_tools_accept() -> None:
+    package = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg comes with colcon')
+    warnings: list[str] = []
+    parsed = package.parse_package(str(REPOSITORY / 'package.xml'), warnings=warnings)
+    parsed.validate(warnings=warnings)
+    assert warnings == []
+    assert {d.name for d in parsed.test_depends} >= {'python3-pytest', 'python3-pytest-timeout'}
+
+
 def test_one_version_everywhere() -> None:
     from segfloor_ros import __version__
 
@@ -124,6 +133,19 @@ def test_the_install_has_what_ros_looks_for(workspace) -> None:
         names = {path.name for path in (REPOSITORY / folder).iterdir() if path.is_file()}
         assert {path.name for path in (share / 'segfloor_ros' / folder).iterdir()} == names
     assert os.access(prefix / 'bin' / 'segfloor', os.X_OK)
+
+
+def test_colcon_runs_the_tests(workspace) -> None:
+    some = ['--pytest-args', 'test/test_geometry.py']
+    colcon = ['colcon', '--log-base', 'log', 'test', '--return-code-on-test-failure', *some]
+    tested = subprocess.run(
+        colcon, cwd=workspace, env=_environment(), capture_output=True, text=True, timeout=240
+    )
+    assert tested.returncode == 0, tested.stdout + tested.stderr
+    report = ET.parse(workspace / 'build' / 'segfloor_ros' / 'pytest.xml').getroot()
+    (suite,) = report.iter('testsuite')
+    assert int(suite.attrib['tests']) > 5
+    assert (suite.attrib['failures'], suite.attrib['errors']) == ('0', '0')
 
 
 def test_the_installed_command_runs_from_the_install(workspace) -> None:
