@@ -68,6 +68,13 @@ class Graph:
             assert time.monotonic() < end_s, f'waited in vain for {what}'
             self._executor.spin_once(timeout_sec=0.05)
 
+    def comes(self, condition: Callable[[], Any], patience_s: float) -> bool:
+        """Handle messages for a while; returns whether the condition came to hold."""
+        end_s = time.monotonic() + patience_s
+        while not condition() and time.monotonic() < end_s:
+            self._executor.spin_once(timeout_sec=0.05)
+        return bool(condition())
+
     def reports(self, node: str) -> list[Status]:
         """Return the statuses of a node about frames and keyframes."""
         return [s for s in self.statuses if s.node == node and not s.kind]

@@ -16,6 +16,7 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry, Path
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, invert, se3_log, transform_from_quaternion
@@ -90,7 +91,13 @@ def path_arrays(message: Path) -> KeyframePath:
     for stamped in message.poses:
         p, q = stamped.pose.position, stamped.pose.orientation
         values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-    numbers = np.frombuffer(values, np.float64).reshape(-1, 7)
+    return path_of_numbers(stamps, np.frombuffer(values, np.float64).reshape(-1, 7))
+
+
+def path_of_numbers(stamp_ns: NDArray[np.int64], numbers: Array) -> KeyframePath:
+    """Return the path of stamps (N,) and numbers (N, 7), x y z qx qy qz qw. Raises MessageError for
+    impossible poses.
+    """
     if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
         raise MessageError('a path holds poses that are impossible')
     T_map_base = np.zeros((len(numbers), 4, 4))
@@ -98,7 +105,7 @@ def path_arrays(message: Path) -> KeyframePath:
         T_map_base[:, :3, :3] = Rotation.from_quat(numbers[:, 3:]).as_matrix()
     T_map_base[:, :3, 3] = numbers[:, :3]
     T_map_base[:, 3, 3] = 1.0
-    return KeyframePath(stamps, T_map_base)
+    return KeyframePath(stamp_ns, T_map_base)
 
 
 def transform_message(
@@ -120,14 +127,17 @@ def transform_array(message: TransformStamped) -> Array:
     return pose_array(Pose(position=Point(x=t.x, y=t.y, z=t.z), orientation=q))
 
 
-def _pose_messages(T_a_b: Array) -> list[Pose]:
+def pose_numbers(T_a_b: Array) -> Array:
+    """Return transforms (N, 4, 4) as numbers (N, 7): x y z qx qy qz qw, with qw >= 0."""
     if len(T_a_b) == 0:
-        return []
+        return np.zeros((0, 7))
     quaternions = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat()
     quaternions *= np.where(quaternions[:, 3:] < 0, -1.0, 1.0)
+    return np.concatenate([T_a_b[:, :3, 3], quaternions], axis=1)
+
+
+def _pose_messages(T_a_b: Array) -> list[Pose]:
     return [
         Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-        for (x, y, z), (qx, qy, qz, qw) in zip(
-            T_a_b[:, :3, 3].tolist(), quaternions.tolist(), strict=True
-        )
+        for x, y, z, qx, qy, qz, qw in pose_numbers(T_a_b).tolist()
     ]

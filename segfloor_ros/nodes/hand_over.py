@@ -120,11 +120,11 @@ class LocalSubscription:
 
 
 class Message:
-    """A message under way, serialised at most once."""
+    """A message under way, serialised at most once; it may be published in that form."""
 
     def __init__(self, content: Any) -> None:
         self.content = content
-        self._serialized: bytes | None = None
+        self._serialized: bytes | None = content if isinstance(content, bytes) else None
 
     def serialized(self) -> bytes:
         """Return the message as it would travel."""

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Any
 
-from nav_msgs.msg import Path
-from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
@@ -19,7 +17,7 @@ from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.messages.clouds import features_arrays, labelled_arrays
 from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_message
-from segfloor_ros.messages.poses import path_arrays
+from segfloor_ros.messages.path_bytes import path_of_bytes
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
 from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.stage_node import PATH, StageNode, run_node
@@ -78,7 +76,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
     def _update(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         points = labelled_arrays(parts[POINTS], POINTS)
         features = features_arrays(parts[FEATURES], FEATURES)
-        path = path_arrays(deserialize_message(parts[PATH], Path))
+        path = path_of_bytes(parts[PATH])
         scan = scan_arrays(parts[SCAN], SCAN)
         self._stage.update(stamp_ns, points, features, path, scan)
         self._stamp_ns, self._frame_id = stamp_ns, parts[POSE].header.frame_id

@@ -10,10 +10,10 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.clouds import features_message, sparse_cloud_message
 from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.path_bytes import path_bytes
 from segfloor_ros.messages.poses import (
     body_twist,
     odometry_message,
-    path_message,
     transform_message,
 )
 from segfloor_ros.node_settings import StereoSlamNodeSettings
@@ -105,5 +105,5 @@ class SlamOutputs:
         )
         features = features_message(stamp_ns, own.map_frame, keyframe.features)
         self._features.publish(features)
-        self._path.publish(path_message(stamp_ns, own.map_frame, keyframe.path))
+        self._path.publish(path_bytes(stamp_ns, own.map_frame, keyframe.path))
         self._map_points.publish(sparse_cloud_message(stamp_ns, own.map_frame, keyframe.cloud))

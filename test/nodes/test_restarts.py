@@ -126,6 +126,7 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     chain.kill(node)
     journey.miss(2)
     chain.start(node)
+    chain.wake(journey.next)
     journey.rejoin()
     grid_after, cloud_after = journey.keyframes(2)
     assert journey.odometry_error_m() < 0.03
@@ -162,9 +163,9 @@ def test_a_slam_that_does_not_find_its_place_again_begins_a_new_map(journey) -> 
     chain.kill(SLAM)
     chain.start(SLAM)
     dark = np.zeros_like(journey.next().left)
-    for _ in range(2):
-        chain.drive([replace(journey.next(), left=dark, right=dark)])
-        journey.miss(51)
+    chain.wake(lambda: replace(journey.next(), left=dark, right=dark))
+    journey.miss(51)
+    chain.drive([replace(journey.next(), left=dark, right=dark)])
     begun = journey.next()
     assert chain.drive([begun])[0].level is Level.OK
     chain.mapped(begun.stamp_ns)
