@@ -89,6 +89,10 @@ clean it up. By default it does the first two itself (`autostart`). Deactivated 
 receives nothing; cleaned up it has no topics and no map. It makes no bond: give Nav2's lifecycle
 manager `bond_timeout: 0.0`."""
 
+ON_DEMAND = """\
+While nobody listens to what it publishes, its status included, it receives nothing (state `idle` in
+its health)."""
+
 STATUS = {
     CAMERA: 'One status per pair sent (`frame_index`), and `stereo_camera: recording` at its end '
     '(`frames`, `skipped`).',
@@ -122,6 +126,8 @@ def page(node: str) -> str:
     ]
     sections += ['## Services', _table(('service', 'type', 'what it does'), SERVICES[node])]
     sections += [MANAGED]
+    if node in (SLAM, FLOOR, CLOUD):
+        sections += [ON_DEMAND]
     sections += ['## Parameters', _parameters(stage)]
     if own:
         sections += ['Only the node has these; `segfloor run` passes over them:', _parameters(own)]

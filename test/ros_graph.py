@@ -47,6 +47,11 @@ class Graph:
         self._executor.remove_node(node)
         node.destroy_node()
 
+    def be_deaf(self) -> None:
+        """Listen to no statuses any more."""
+        for subscription in list(self.tester.subscriptions):
+            self.tester.destroy_subscription(subscription)
+
     def collect(self, name: str) -> list[Any]:
         """Subscribe to a topic; the list grows with its messages."""
         topic, received = TOPICS[name], []

@@ -27,6 +27,8 @@ POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
 class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
     """Labels the sparse map at every keyframe."""
 
+    works_on_demand = True
+
     def __init__(self, hand_over: HandOver | None = None) -> None:
         super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings, hand_over)
 

@@ -30,6 +30,8 @@ MAX_WAITING_FOR_MOUNT = 100
 class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentationNodeSettings]):
     """Segments the floor of every keyframe."""
 
+    works_on_demand = True
+
     def __init__(self, hand_over: HandOver | None = None) -> None:
         super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings, hand_over)
 

@@ -8,12 +8,14 @@ import traceback
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
@@ -26,9 +28,9 @@ class ManagedNode(LifecycleNode):
     """The states of a node (REP-2002 in rclpy's form), and the services `~/pause` and `~/reset`.
 
     Configured, it has its topics and services and an empty map (`set_up`, `start_anew`); while it
-    is active and not paused, its inputs are open: subscriptions and timers made with `listen` and
-    `every`. Deactivated or paused it receives nothing and keeps its map, and what it has latched
-    stays to be had; cleaned up it has neither.
+    is active, needed and not paused, its inputs are open: subscriptions and timers made with
+    `listen` and `every`. Deactivated, idle or paused it receives nothing and keeps its map, and
+    what it has latched stays to be had; cleaned up it has neither.
     """
 
     def __init__(self, name: str, hand_over: HandOver | None = None) -> None:
@@ -37,22 +39,26 @@ class ManagedNode(LifecycleNode):
         self._openers: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = []
         self._open: list[tuple[Any, Callable[[Any], Any]]] = []
         self._kept: list[tuple[Any, Callable[[Any], Any]]] = []
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._heard: dict[str, Subscription | LocalSubscription] = {}
-        self._is_set_up = self._is_active = self._is_paused = False
+        self._is_set_up = self.is_active = self._is_paused = False
+        self._is_needed = True
         self._fault: Exception | None = None
         self._answer_impossible_transitions()
 
     @property
     def state_in_words(self) -> str:
-        """The state of the node: unconfigured, inactive, active, paused or finalized."""
-        if self._is_active and self._is_paused:
+        """The state of the node: unconfigured, inactive, active, paused, idle or finalized."""
+        if self.is_active and self._is_paused:
             return 'paused'
+        if self.is_active and not self._is_needed:
+            return 'idle'
         return str(self._state_machine.current_state[1])
 
     @property
     def is_open(self) -> bool:
-        """Whether the inputs are open: the node is active and not paused."""
-        return self._is_active and not self._is_paused
+        """Whether the inputs are open: the node is active, needed and not paused."""
+        return self.is_active and self._is_needed and not self._is_paused
 
     def set_up(self) -> None:
         """Make the topics and services. Raises SegfloorError when that cannot be."""
@@ -95,6 +101,11 @@ class ManagedNode(LifecycleNode):
     def pause(self, paused: bool) -> None:
         """Close the inputs until further notice, or open them again."""
         self._is_paused = paused
+        self._open_or_close()
+
+    def note_need(self, needed: bool) -> None:
+        """Close the inputs while nobody needs what is made of them."""
+        self._is_needed = needed
         self._open_or_close()
 
     def keep_publisher(
@@ -179,7 +190,11 @@ class ManagedNode(LifecycleNode):
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""
-        self._openers.append((lambda: self.create_timer(period_s, callback), self.destroy_timer))
+        self._openers.append((lambda: self.steady_timer(period_s, callback), self.destroy_timer))
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
+        """Make a timer that also runs while the time of a recording stands still."""
+        return self.create_timer(period_s, callback, clock=self._steady_clock)
 
     def destroy_node(self) -> None:
         """End the node and what works for it."""
@@ -192,14 +207,14 @@ class ManagedNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the inputs."""
-        self._is_active = True
+        self.is_active = True
         result = self._try(self._open_or_close)
-        self._is_active = result == DONE
+        self.is_active = result == DONE
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the inputs and keep the map."""
-        self._is_active = False
+        self.is_active = False
         return self._try(self._open_or_close)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -239,7 +254,7 @@ class ManagedNode(LifecycleNode):
             raise
 
     def _clean_up(self) -> None:
-        self._is_active = self._is_paused = False
+        self.is_active = self._is_paused = False
         self._open_or_close()
         self._openers.clear()
         if self._is_set_up:

@@ -92,7 +92,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         if wait_s <= 0:
             self._publish()
         else:
-            self._later = self.create_timer(wait_s, self._publish)
+            self._later = self.steady_timer(wait_s, self._publish)
 
     def _publish(self) -> None:
         if self._later is not None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
+import yaml
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -90,9 +93,19 @@ class NodeParameters(Generic[Stage, Own]):
         ]
         given = {name: node.get_parameter(name).value for name in names}
         self._refuse_unknown(given)
+        given.update(self._command_line())
         self.stage, self.own = _changed(self.stage, given), _changed(self.own, given)
         for name in given:
             node.undeclare_parameter(name)
+
+    def _command_line(self) -> dict[str, Any]:
+        """Return what the command line says of this node's parameters. It wins over files: rcl
+        lets a file's section for the node win over a plain `-p name:=value` once any file has a
+        section for all nodes.
+        """
+        specs = {spec.name: spec for spec in (*self.stage.specs(), *self.own.specs())}
+        assigned = command_line_parameters(sys.argv)
+        return {name: _parsed(assigned[name], specs[name]) for name in assigned & specs.keys()}
 
     def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
         known = [spec.name for spec in (*self.stage.specs(), *self.own.specs())]
@@ -106,6 +119,30 @@ class NodeParameters(Generic[Stage, Own]):
             if name not in known and name not in elsewhere:
                 node = self.stage.stage_name()
                 raise SettingsError(f'unknown parameter {node}.{name}{suggestion(name, known)}')
+
+
+def command_line_parameters(arguments: Sequence[str]) -> dict[str, str]:
+    """Return the parameters for any node that a command line assigns: `-p name:=value` between
+    `--ros-args` and `--`.
+    """
+    assigned: dict[str, str] = {}
+    is_for_ros = False
+    for word, following in itertools.pairwise((*arguments, '')):
+        if word in ('--ros-args', '--'):
+            is_for_ros = word == '--ros-args'
+        name, separator, value = following.partition(':=')
+        if is_for_ros and word in ('-p', '--param') and separator and ':' not in name:
+            assigned[name] = value
+    return assigned
+
+
+def _parsed(text: str, spec: SettingSpec) -> Any:
+    value = yaml.safe_load(text)
+    if spec.type is float and isinstance(value, str):
+        # YAML 1.1 takes 1e-3 for text, rcl for a number.
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return '' if value is None and spec.type is str else value
 
 
 def _changed(settings: Settings, values: Mapping[str, Any]) -> Settings:

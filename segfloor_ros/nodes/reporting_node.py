@@ -28,6 +28,7 @@ from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.qos_check import incompatible_topics
 
 CONNECTION_CHECK_S = 0.1
+NEED_LASTS_S = 5.0
 PATH = 'keyframe/path'
 PROBLEM_LASTS_S = 3.0
 REPEAT_FAULT_S = 5.0
@@ -38,18 +39,22 @@ class ReportingNode(ManagedNode):
     a while.
     """
 
+    works_on_demand = False
+    """Whether messages that nobody needs the results of may be missed."""
+
     def __init__(self, name: str, hand_over: HandOver | None = None) -> None:
         super().__init__(name, hand_over)
         self._diagnostics = self.create_publisher(
             DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
         )
+        self._last_needed_s = time.monotonic()
         self._outputs: dict[str, Publisher | LocalPublisher] = {}
         self._health = Health()
         self._connections: dict[str, str] = {}
         self._last_heartbeat_s = 0.0
         self._faults: dict[str, float] = {}
         self._said: dict[str, float] = {}
-        self.create_timer(CONNECTION_CHECK_S, self._report_connections)
+        self.steady_timer(CONNECTION_CHECK_S, self._report_connections)
 
     def forget(self) -> None:
         """The outputs go with the topics."""
@@ -144,6 +149,7 @@ class ReportingNode(ManagedNode):
             name: str(output.get_subscription_count()) for name, output in self._outputs.items()
         }
         counts[DIAGNOSTICS.name] = str(self._diagnostics.get_subscription_count())
+        self._judge_need(counts)
         now = time.monotonic()
         is_due = now - self._last_heartbeat_s >= HEALTH_PERIOD_S
         if counts != self._connections or is_due:
@@ -153,6 +159,20 @@ class ReportingNode(ManagedNode):
         if is_due:
             self._last_heartbeat_s = now
             self._report_health()
+
+    def listener_count(self) -> int:
+        """Return how many listen to what the node publishes, its topics and status aside."""
+        return 0
+
+    def _judge_need(self, counts: Mapping[str, str]) -> None:
+        """Receive nothing while nobody listens to anything that is made of it, for a node that
+        works on demand.
+        """
+        now_s = time.monotonic()
+        always = not self.works_on_demand or not self.is_active
+        if always or any(int(count) for count in counts.values()) or self.listener_count():
+            self._last_needed_s = now_s
+        self.note_need(now_s - self._last_needed_s < NEED_LASTS_S)
 
     def _report_health(self) -> None:
         if self.is_open:

@@ -42,6 +42,8 @@ WORK_OFF_EVERY_S = 0.2
 class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     """Tracks every stereo pair and publishes what comes of it."""
 
+    works_on_demand = True
+
     def __init__(self, hand_over: HandOver | None = None) -> None:
         super().__init__(StereoSlamSettings, StereoSlamNodeSettings, hand_over)
 
@@ -89,6 +91,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         """Drop the map."""
         super().forget()
         self._end_stage()
+
+    def listener_count(self) -> int:
+        """Return how many listen to tf."""
+        return self._transforms.listener_count()
 
     def on_inputs_opened(self) -> None:
         """Give tf time to tell the mount, from now on."""

@@ -37,6 +37,9 @@ class TfLink(Protocol):
     def send_fixed(self, transform: TransformStamped) -> None:
         """Broadcast a transform that holds from now on."""
 
+    def listener_count(self) -> int:
+        """Return how many others listen to moving frames."""
+
     def stop_listening(self) -> None:
         """Read no more."""
 
@@ -89,6 +92,10 @@ class Tf2Ros:
         """Broadcast a transform that holds from now on."""
         self._fixed.sendTransform(transform)
 
+    def listener_count(self) -> int:
+        """Return how many others listen to moving frames."""
+        return int(self._moving.pub_tf.get_subscription_count()) - (self._listener is not None)
+
     def stop_listening(self) -> None:
         """Read no more."""
         if self._listener is not None:
@@ -134,6 +141,10 @@ class TfMessages:
     def send_fixed(self, transform: TransformStamped) -> None:
         """Broadcast a transform that holds from now on."""
         self._fixed.publish(self._type(transforms=[transform]))
+
+    def listener_count(self) -> int:
+        """Return how many others listen to moving frames."""
+        return self._moving.get_subscription_count() - bool(self._stop)
 
     def stop_listening(self) -> None:
         """Read no more."""

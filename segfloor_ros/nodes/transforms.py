@@ -43,6 +43,10 @@ class Transforms:
         else:
             node.every(TICK_S, self._advance)
 
+    def listener_count(self) -> int:
+        """Return how many other nodes listen to tf."""
+        return self._link.listener_count() if self._link is not None and self._own.publish_tf else 0
+
     def start_waiting(self) -> None:
         """From now on tf has some time to tell the mount."""
         self._deadline_s = time.monotonic() + self._own.tf_wait_s
