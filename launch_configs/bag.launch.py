@@ -1,11 +1,8 @@
 """A rosbag2 recording, played by `ros2 bag play` in its own time, through the nodes."""
 
 from launch import LaunchDescription
-from launch.actions import (
-    DeclareLaunchArgument,
-    ExecuteProcess,
-    IncludeLaunchDescription,
-)
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
@@ -23,6 +20,11 @@ def generate_launch_description() -> LaunchDescription:
                 'rate', default_value='1.0', description='Speed against real time.'
             ),
             DeclareLaunchArgument(
+                'delay',
+                default_value='5.0',
+                description='Seconds until the player begins, so that the nodes are connected.',
+            ),
+            DeclareLaunchArgument(
                 'namespace', default_value='', description='Namespace of all nodes and topics.'
             ),
             DeclareLaunchArgument(
@@ -30,11 +32,22 @@ def generate_launch_description() -> LaunchDescription:
                 default_value=PathJoinSubstitution([share, 'params', 'default.yaml']),
                 description='Parameter file for all nodes.',
             ),
+            DeclareLaunchArgument(
+                'composed',
+                default_value='false',
+                description='Run all nodes in one process, for small machines: true or false.',
+            ),
+            DeclareLaunchArgument(
+                'rviz', default_value='false', description='Show the map in RViz: true or false.'
+            ),
             IncludeLaunchDescription(
-                nodes,
+                PythonLaunchDescriptionSource(nodes),
                 launch_arguments={
                     'namespace': LaunchConfiguration('namespace'),
                     'params_file': LaunchConfiguration('params_file'),
+                    'composed': LaunchConfiguration('composed'),
+                    'rviz': LaunchConfiguration('rviz'),
+                    'camera': 'false',
                     'use_sim_time': 'true',
                 }.items(),
             ),
@@ -42,6 +55,7 @@ def generate_launch_description() -> LaunchDescription:
                 cmd=[
                     *('ros2', 'bag', 'play', LaunchConfiguration('bag')),
                     *('--clock', '--rate', LaunchConfiguration('rate')),
+                    *('--delay', LaunchConfiguration('delay')),
                 ],
                 output='screen',
             ),

@@ -2,27 +2,20 @@
 driver.
 """
 
-from launch import Condition, LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition, UnlessCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
 STAGES = ('stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes and the arguments."""
-    defaults = PathJoinSubstitution([FindPackageShare(PACKAGE), 'params', 'default.yaml'])
-    source = LaunchConfiguration('input')
-    composed = LaunchConfiguration('composed')
-    has_source = PythonExpression([repr(''), ' != ', "'", source, "'"])
-    plays = IfCondition(
-        PythonExpression([has_source, " and '", composed, "'.lower() in ('false', '0')"])
-    )
+    """Return the arguments and the nodes."""
+    share = FindPackageShare(PACKAGE)
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -30,7 +23,7 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 'params_file',
-                default_value=defaults,
+                default_value=PathJoinSubstitution([share, 'params', 'default.yaml']),
                 description='Parameter file for all nodes; arguments win over it.',
             ),
             DeclareLaunchArgument(
@@ -45,47 +38,87 @@ def generate_launch_description() -> LaunchDescription:
                 'left/image_raw, right/image_raw and their camera_info.',
             ),
             DeclareLaunchArgument(
+                'camera',
+                default_value='auto',
+                description='Start the node stereo_camera: true, false, or auto, which does so '
+                'where input is given; with true the input may stand in params_file.',
+            ),
+            DeclareLaunchArgument(
                 'composed',
                 default_value='false',
                 description='Run all nodes in one process, for small machines: true or false.',
             ),
-            all_in_one(source, IfCondition(composed)),
-            stage('stereo_camera', plays, input=ParameterValue(source, value_type=str)),
-            *(stage(name, UnlessCondition(composed)) for name in STAGES),
+            DeclareLaunchArgument(
+                'autostart',
+                default_value='true',
+                description='Nodes begin to work by themselves: true, or false, with which they '
+                'wait for a lifecycle manager.',
+            ),
+            DeclareLaunchArgument(
+                'rviz', default_value='false', description='Show the map in RViz: true or false.'
+            ),
+            DeclareLaunchArgument(
+                'rviz_config',
+                default_value=PathJoinSubstitution([share, 'launch_configs', 'segfloor.rviz']),
+                description='Layout of RViz.',
+            ),
+            OpaqueFunction(function=make_nodes),
         ]
     )
 
 
-def stage(name: str, condition: Condition, **parameters: ParameterValue) -> Node:
-    """Return one node with the parameter file and what the arguments say beside it."""
+def make_nodes(context: LaunchContext) -> list[Node]:
+    """Return the processes that the arguments ask for."""
+    source = LaunchConfiguration('input').perform(context)
+    camera = LaunchConfiguration('camera').perform(context)
+    composed = truth('composed', LaunchConfiguration('composed').perform(context))
+    autostart = truth('autostart', LaunchConfiguration('autostart').perform(context))
+    sim_time = truth('use_sim_time', LaunchConfiguration('use_sim_time').perform(context))
+    with_camera = bool(source) if camera.lower() == 'auto' else truth('camera', camera)
+    with_rviz = truth('rviz', LaunchConfiguration('rviz').perform(context))
+
+    def node(executable: str, *arguments: str, name: str | None = None) -> Node:
+        # Plain command-line parameters win over every section of the file.
+        return Node(
+            package=PACKAGE,
+            executable=executable,
+            name=name,
+            namespace=LaunchConfiguration('namespace'),
+            parameters=[LaunchConfiguration('params_file'), {'use_sim_time': sim_time}],
+            ros_arguments=['-p', f'autostart:={str(autostart).lower()}', *arguments],
+            output='screen',
+        )
+
+    # Without a word on the input, that of the parameter file holds.
+    given = () if with_camera and not source else ('-p', as_text('input', source, with_camera))
+    if composed:
+        nodes = [node('segfloor_pipeline', *given)]
+    else:
+        nodes = [node('stereo_camera', *given, name='stereo_camera')] if with_camera else []
+        nodes += [node(stage, name=stage) for stage in STAGES]
+    return [*nodes, rviz(sim_time)] if with_rviz else nodes
+
+
+def rviz(sim_time: bool) -> Node:
+    """Return RViz with the package's layout."""
     return Node(
-        package=PACKAGE,
-        executable=name,
-        name=name,
+        package='rviz2',
+        executable='rviz2',
         namespace=LaunchConfiguration('namespace'),
-        parameters=[
-            ParameterFile(LaunchConfiguration('params_file')),
-            {**sim_time(), **parameters},
-        ],
-        condition=condition,
+        arguments=['-d', LaunchConfiguration('rviz_config')],
+        parameters=[{'use_sim_time': sim_time}],
         output='screen',
     )
 
 
-def all_in_one(source: LaunchConfiguration, condition: Condition) -> Node:
-    """Return the process of all nodes; they name themselves."""
-    return Node(
-        package=PACKAGE,
-        executable='segfloor_pipeline',
-        namespace=LaunchConfiguration('namespace'),
-        parameters=[ParameterFile(LaunchConfiguration('params_file')), sim_time()],
-        # Of parameters for all nodes, only those of the command line win over the file's sections.
-        ros_arguments=['-p', ["input:='", source, "'"]],
-        condition=condition,
-        output='screen',
-    )
+def as_text(name: str, text: str, is_wanted: bool) -> str:
+    """Return an assignment of a text as YAML, or of the empty text where it is not wanted."""
+    quoted = text.replace("'", "''") if is_wanted else ''
+    return f"{name}:='{quoted}'"
 
 
-def sim_time() -> dict[str, ParameterValue]:
-    """Return the parameter that says whose time it is."""
-    return {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+def truth(name: str, text: str) -> bool:
+    """Return the truth value of an argument. Raises ValueError naming it."""
+    if text.strip().lower() not in (*YES, *NO):
+        raise ValueError(f'{name}:={text}: expected true or false')
+    return text.strip().lower() in YES
