@@ -135,7 +135,7 @@ def test_a_deactivated_node_keeps_its_map_and_a_cleaned_up_one_does_not(make_gra
     publish(graph, cloud_messages(STAMP_NS + 2), publishers)
     graph.until(lambda: len(labelled) == 3, 'the third keyframe')
     stage = CloudLabelling(CloudLabellingSettings())
-    once, twice = (stage.update(POINTS, FEATURES, MASK).confidence for _ in range(2))
+    once, twice = (stage.update(POINTS, FEATURES, MASK, np.eye(4)).confidence for _ in range(2))
     assert not np.array_equal(once, twice)
     found = [labelled_arrays(message, '').confidence for message in labelled]
     for confidence, expected in zip(found, (once, twice, once), strict=True):
