@@ -70,9 +70,9 @@ def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
     """Return names and values of the figures, with units."""
     latency_ms = 1e3 * figures.latency_s
     rows = [
-        ('frames sent, answered', f'{figures.frames_sent}, {figures.frames_answered}'),
+        ('frames sent, processed', f'{figures.frames_sent}, {figures.frames_processed}'),
         ('keyframes, in the map', f'{figures.keyframes}, {figures.mapped}'),
-        ('frames per second', f'{figures.frames_answered / figures.wall_s:.1f}'),
+        ('frames per second', f'{figures.frames_processed / figures.wall_s:.1f}'),
         ('interrupt to all ended', f'{figures.shutdown_s:.2f} s'),
     ]
     if len(latency_ms):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.context import Context
@@ -25,9 +26,9 @@ from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.cli.replay_session import ProgressListener, ReplayGraph
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.memory import rss_mb
-from segfloor_ros.messages.diagnostics import Status
+from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Status, statuses
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, TOPICS
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, TOPICS
 
 MEMORY_PERIOD_S = 2.0
 TICKS_PER_S = os.sysconf('SC_CLK_TCK')
@@ -41,7 +42,7 @@ class NodeFigures:
     """
 
     frames_sent: int
-    frames_answered: int
+    frames_processed: int
     keyframes: int
     mapped: int
     wall_s: float
@@ -57,6 +58,7 @@ class FigureRecorder(ReplayRecorder):
     def __init__(self, context: Context, processes: NodeProcesses) -> None:
         super().__init__(context, lambda: 0.0, None)
         self._processes = processes
+        self._health: dict[str, Status] = {}
         self._sent_s: dict[int, float] = {}
         self._arrived_s: dict[int, float] = {}
         self.memory_rows: list[list[float]] = []
@@ -68,6 +70,16 @@ class FigureRecorder(ReplayRecorder):
         """Return the latency of every keyframe whose map came, in order."""
         both = sorted(self._sent_s.keys() & self._arrived_s.keys())
         return np.array([self._arrived_s[stamp] - self._sent_s[stamp] for stamp in both])
+
+    def processed(self, node: str) -> int:
+        """Return how much a node says to have processed: it knows best, also where this process
+        was too slow to hear it all.
+        """
+        return int(self._health[node].values['processed']) if node in self._health else 0
+
+    def _take_statuses(self, message: DiagnosticArray) -> None:
+        self._health.update({s.node: s for s in statuses(message) if s.kind == HEALTH})
+        super()._take_statuses(message)
 
     def _take_status(self, status: Status) -> None:
         if status.node == CAMERA:
@@ -128,13 +140,15 @@ def _follow(
         graph.processes.check()
     wall_s = time.monotonic() - start_s
     spent_s = {node: s - cpu_s[node] for node, s in _cpu_s(graph.processes).items()}
+    graph.spin(2 * HEALTH_PERIOD_S)
     stop_s = time.monotonic()
     graph.processes.stop()
+    finished, path = recorder.finished, recorder.path
     return NodeFigures(
-        frames_sent=len(recorder.frame_index),
-        frames_answered=len(recorder.answers),
-        keyframes=len(recorder.keyframes),
-        mapped=len(recorder.updated & recorder.keyframes),
+        frames_sent=int(finished.values['frames']) if finished is not None else 0,
+        frames_processed=recorder.processed(SLAM),
+        keyframes=len(path.stamp_ns) if path is not None else 0,
+        mapped=recorder.processed(GRID),
         wall_s=wall_s,
         latency_s=recorder.latency_s(),
         cpu_share={node: seconds / wall_s for node, seconds in spent_s.items()},

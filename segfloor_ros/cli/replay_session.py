@@ -206,7 +206,7 @@ class ReplayGraph:
                     f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '
                     'the loopback interface up, and does a firewall block UDP?'
                 )
-            self._spin()
+            self.spin()
         return time.monotonic() - start_s
 
     def call(self, kind: Any, name: str, request: Any) -> None:
@@ -214,10 +214,10 @@ class ReplayGraph:
         client = self.recorder.create_client(kind, name)
         deadline_s = time.monotonic() + SERVICE_S
         while not client.service_is_ready() and time.monotonic() < deadline_s:
-            self._spin()
+            self.spin()
         future = client.call_async(request)
         while not future.done() and time.monotonic() < deadline_s:
-            self._spin()
+            self.spin()
         if not future.done():
             raise ReplayError(f'the service {name} does not answer')
         response = future.result()
@@ -233,7 +233,7 @@ class ReplayGraph:
         while not recorder.is_drained():
             if interrupted.is_set():
                 return False
-            self._spin()
+            self.spin()
             last = recorder.answers.get(max(recorder.answers, default=0))
             on_progress(len(recorder.answers), last.message if last else '')
             quiet_s = time.monotonic() - recorder.last_sign_s
@@ -249,13 +249,13 @@ class ReplayGraph:
         recorder = self.recorder
         recorder.last_sign_s = time.monotonic()
         while not recorder.has_caught_up():
-            self._spin()
+            self.spin()
             if time.monotonic() - recorder.last_sign_s > CATCH_UP_S:
                 return
 
-    def _spin(self) -> None:
+    def spin(self, duration_s: float = SPIN_S) -> None:
         """Handle what arrives within a moment, then see that all nodes live."""
-        end_s = time.monotonic() + SPIN_S
+        end_s = time.monotonic() + duration_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left_s)
         self.processes.check()

@@ -47,7 +47,7 @@ def test_a_single_frame_is_no_drive(tmp_path) -> None:
 def test_the_figures_are_of_the_quarters_after_the_first() -> None:
     figures = NodeFigures(
         frames_sent=20,
-        frames_answered=18,
+        frames_processed=18,
         keyframes=8,
         mapped=7,
         wall_s=2.0,
@@ -57,7 +57,7 @@ def test_the_figures_are_of_the_quarters_after_the_first() -> None:
         shutdown_s=0.5,
     )
     rows = dict(figure_rows(figures))
-    assert rows['frames sent, answered'] == '20, 18'
+    assert rows['frames sent, processed'] == '20, 18'
     assert rows['keyframes, in the map'] == '8, 7'
     assert rows['frames per second'] == '9.0'
     assert rows['image to map, median and p95'] == '350 ms, 9000 ms'
