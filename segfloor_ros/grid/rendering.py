@@ -10,6 +10,8 @@ from segfloor_ros.grid.log_odds import CHUNK, QUANTUM, ZERO, LogOddsRaster, step
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
+_UNREACHED, _REACHED = 1, 2
+
 
 def render(
     raster: LogOddsRaster, path_xy_m: NDArray[np.float64], settings: OccupancyGridSettings
@@ -61,13 +63,16 @@ def _unreached(
     Floor is seen from the path along lines of floor, so an area without a link to it was seen
     through something, e.g. a wall.
     """
-    free = (state == FREE).astype(np.uint8)
-    num, part = cv2.connectedComponents(free, connectivity=4, ltype=cv2.CV_32S)
+    part = (state == FREE).astype(np.uint8)
     inside = (rows >= 0) & (rows < state.shape[0]) & (columns >= 0) & (columns < state.shape[1])
-    unreached = np.ones(num, np.bool_)
-    unreached[part[rows[inside], columns[inside]]] = False
-    unreached[0] = False
-    return unreached.take(part)
+    rows, columns = rows[inside], columns[inside]
+    # One byte a cell, and as many rounds as there are separate areas that the path touches.
+    while True:
+        waiting = np.flatnonzero(part[rows, columns] == _UNREACHED)
+        if len(waiting) == 0:
+            return part == _UNREACHED
+        seed = (int(columns[waiting[0]]), int(rows[waiting[0]]))
+        cv2.floodFill(part, None, seed, _REACHED, flags=4)
 
 
 def _narrow(state: NDArray[np.int8], size: int) -> NDArray[np.bool_]:
