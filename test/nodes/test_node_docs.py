@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,8 @@ def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node,
     for alternative in ALTERNATIVES if node in ('stereo_camera', 'stereo_slam') else ((),):
         with fresh_graph('-r', '__ns:=/robot', *source, *alternative) as graph:
             made = graph.add(make())
+            # The graph takes a moment to know of a node; its first sign of life comes last.
+            graph.until(partial(graph.reports_any, node), 'a sign of life')
             published |= made.get_publisher_names_and_types_by_node(node, '/robot')
             subscribed |= made.get_subscriber_names_and_types_by_node(node, '/robot')
             services |= made.get_service_names_and_types_by_node(node, '/robot')
