@@ -53,7 +53,8 @@ def published_table(results: list[SceneResult]) -> Table:
             f'{workload.update_s["mean"]:.3f}',
             f'{workload.memory_mb["slope_per_update"]:.3f}',
         )
-        table.add_row(f'[bold]{result.scene}, {score.area_m2:.1f} m²')
+        cell_cm = 100 * result.cell_m
+        table.add_row(f'[bold]{result.scene}, {score.area_m2:.1f} m², {cell_cm:g} cm')
         table.add_row('  here, after opening', *_percent(score.opened), *costs)
         table.add_row('  here, raw', *_percent(score.raw))
         for figures in result.published.figures:

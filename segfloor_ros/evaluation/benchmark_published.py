@@ -24,12 +24,14 @@ class PublishedFigures:
 @dataclass(frozen=True)
 class PublishedScene:
     """A scene of the published evaluation. nodes: of a road map, 0 for one per 1.5 m² where nobody
-    said. area_m2: of the original.
+    said. area_m2: of the original. cell_m: of the true map and, unless it is set, of ours; the
+    published maps have cells of 1 and 5 cm.
     """
 
     nodes: int
     area_m2: float | None
     figures: tuple[PublishedFigures, ...]
+    cell_m: float = 0.01
 
 
 def _segfloor(precision_percent: float, recall_percent: float) -> PublishedFigures:
@@ -61,7 +63,7 @@ PUBLISHED: dict[str, PublishedScene] = {
     ),
     'complex_room': PublishedScene(0, None, ()),
     'large_loop': PublishedScene(
-        100, 682.7, (_segfloor(99.41, 98.52), _rtabmap('ray tracing', 98.44, 31.67))
+        100, 682.7, (_segfloor(99.41, 98.52), _rtabmap('ray tracing', 98.44, 31.67)), 0.05
     ),
 }
 """By name of the shipped scene that follows the original. Of the complex room no figures were

@@ -27,6 +27,7 @@ from segfloor_ros.evaluation.prm import RoadMapPlan
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.simulation.recording import RecordingOptions, record
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.simulation import Simulation
@@ -34,12 +35,15 @@ from segfloor_ros.simulation.simulation import Simulation
 
 @dataclasses.dataclass(frozen=True)
 class SceneResult:
-    """A scene mapped here: what it cost, how good the map is, and what was published."""
+    """A scene mapped here: what it cost, how good the map is, what was published, and the side of
+    a cell.
+    """
 
     scene: str
     workload: Workload
     score: MapScore
     published: PublishedScene
+    cell_m: float
 
 
 def run_scene(
@@ -53,8 +57,17 @@ def run_scene(
     """Render a scene into `folder` unless it is there, map it in a process of its own, score the
     map, and leave map.yaml and overlay.png in the folder.
 
+    The cells of truth and map are of the same size, so that their rasters do not blur the score:
+    of the size set for the map where that is not the default, else as in the published maps.
+
     Raises RenderingError where nothing can be rendered and MapError when no map came of it.
     """
+    published = PUBLISHED[name]
+    cell_m = configuration.occupancy_grid.resolution_m
+    if cell_m == OccupancyGridSettings.resolution_m:
+        cell_m = published.cell_m
+    configuration = with_cells(configuration, cell_m)
+    scene = dataclasses.replace(scene, resolution_m=cell_m)
     recording = folder / 'recording'
     _render(name, scene, recording, folder / 'rendered_from.txt', announce)
     source = open_source(StereoCameraSettings(input=str(recording)))
@@ -62,12 +75,18 @@ def run_scene(
     workload, grid = run_apart(
         map_recording, name, recording, configuration, threads, on_progress=report
     )
-    truth, published = load_truth(recording), PUBLISHED[name]
+    truth = load_truth(recording)
     pose = truth.start_pose or (0.0, 0.0, 0.0)
     save_map(grid, folder / 'map.yaml')
     save_overlay(compare(grid, truth, pose), folder / 'overlay.png')
     score = score_map(grid, truth, pose, RoadMapPlan(nodes=published.nodes))
-    return SceneResult(name, workload, score, published)
+    return SceneResult(name, workload, score, published, cell_m)
+
+
+def with_cells(configuration: Configuration, cell_m: float) -> Configuration:
+    """Return the configuration for a map with cells of this size."""
+    grid = dataclasses.replace(configuration.occupancy_grid, resolution_m=cell_m)
+    return dataclasses.replace(configuration, occupancy_grid=grid)
 
 
 def map_recording(

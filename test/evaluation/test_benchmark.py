@@ -308,6 +308,8 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     assert steps == [('rendering corridor2', frames), ('mapping corridor2', frames)]
     assert first.workload.tracked == frames
     assert first.score.nodes == 20
+    assert first.cell_m == read_map(tmp_path / 'map.yaml').resolution_m == 0.01
+    assert read_map(tmp_path / 'recording' / 'map.yaml').resolution_m == 0.01
     assert first.score.observable_only
     assert first.score.raw.precision.mean > 0.8
     assert read_map(tmp_path / 'map.yaml').cells.size == first.workload.cells
