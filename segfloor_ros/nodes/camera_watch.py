@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.row_check import rows_apart_px
 from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.headers import NS_PER_S
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.stage_node import AnyStageNode
 
 RECENT = 10
 SILENT_S = 3.0
+LIVE_NS = 60 * NS_PER_S
 ROWS_APART_PX = 1.5
 CHECK_ROWS_EVERY = 100
 PLAUSIBLE_ROLL_DEG = 20.0
@@ -36,12 +38,15 @@ class CameraWatch:
         self._own = own
         self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
         self._last_image_s: dict[str, float] = {}
+        self._is_live = False
         self._pairs_until_check = 0
 
     def saw_image(self, topic: str, stamp_ns: int) -> None:
         """Note an image."""
         self._stamps[topic].append(stamp_ns)
         self._last_image_s[topic] = time.monotonic()
+        age_ns = self._node.get_clock().now().nanoseconds - stamp_ns
+        self._is_live = abs(age_ns) < LIVE_NS
 
     def find_problems(self, missing_infos: list[str]) -> None:
         """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
@@ -94,7 +99,8 @@ class CameraWatch:
     def _find_silence(self) -> None:
         now_s = time.monotonic()
         for topic, last_s in self._last_image_s.items():
-            if now_s - last_s > SILENT_S:
+            # A recording may end or wait for the nodes; a camera may not.
+            if self._is_live and now_s - last_s > SILENT_S:
                 self._node.diagnose(
                     f'silence of {topic}',
                     f'no image on {topic} for a while; is the camera connected and its driver '

@@ -148,8 +148,9 @@ def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
     driver = Driver(graph)
     graph.add(StereoSlamNode())
     driver.connect()
+    now_ns = graph.tester.get_clock().now().nanoseconds
     for side in ('left', 'right'):
-        driver.send(side, 0, getattr(frames[0], side))
+        driver.send(side, now_ns, getattr(frames[0], side))
     says(graph, 'stereo_slam', 'no image on left/image_raw for a while', 'connected')
 
 
