@@ -21,6 +21,7 @@ from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.triangulation import triangulate_between
 
 DISPARITY_REACH_PX = 4
 MIN_DISPARITY_PX = 1.0
@@ -81,12 +82,32 @@ class LocalMapper:
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
     ) -> None:
-        """Add a keyframe and new points from its stereo features; points that turn out to be
+        """Add a keyframe, new points from its stereo features, and from the parallax to others
+        where the right image shows none; points that turn out to be
         known already are fused with the older ones.
         """
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
+        for other in self._partners(sparse_map, keyframe):
+            new = triangulate_between(
+                self._camera, self._settings, keyframe, other, self.offset.value_px
+            )
+            sparse_map.add_points_between(
+                keyframe, new.rows, other, new.other_rows, new.xyz_world, patches
+            )
         fuse_duplicates(self._camera, self._settings, sparse_map, keyframe)
+
+    def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
+        """Return the covisible keyframes with which rays cross best: the farthest away of them, and
+        one in the middle.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        views = [sparse_map.keyframes[k] for k in near[: self._settings.local_keyframes]]
+        centre = keyframe.T_world_camera[:3, 3]
+        views.sort(key=lambda k: float(np.linalg.norm(k.T_world_camera[:3, 3] - centre)))
+        return [views[-1], views[len(views) // 2]][: len(views)] if views else []
 
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""

@@ -185,7 +185,24 @@ class SparseMap:
         """
         self.keyframes.append(keyframe)
         keyframe.point_id[new_rows] = self._add_points(new_xyz_world, keyframe.index)
-        self._link(keyframe, patches)
+        self._link(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT), patches)
+
+    def add_points_between(
+        self,
+        keyframe: KeyframeRecord,
+        rows: NDArray[np.intp],
+        other: KeyframeRecord,
+        other_rows: NDArray[np.intp],
+        xyz_world: Array,
+        patches: NDArray[np.uint8],
+    ) -> None:
+        """Add points (N, 3) that two keyframes of the map see with their features `rows`,
+        `other_rows` (N,). patches: as in `add_keyframe`, of the first.
+        """
+        ids = self._add_points(xyz_world, keyframe.index)
+        keyframe.point_id[rows] = other.point_id[other_rows] = ids
+        self._link(keyframe, rows, patches)
+        self._add_edges(other, other_rows)
 
     def _add_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
         count = len(xyz_world)
@@ -213,13 +230,18 @@ class SparseMap:
         self._num_ever += count
         return rows
 
-    def _link(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
-        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+    def _add_edges(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
         ids = keyframe.point_id[rows]
         self._edge_point.extend(ids)
         self._edge_keyframe.extend(np.full(len(ids), keyframe.index, np.int32))
         self._edge_row.extend(rows)
         self.observer_count[ids] += 1
+
+    def _link(
+        self, keyframe: KeyframeRecord, rows: NDArray[np.intp], patches: NDArray[np.uint8]
+    ) -> None:
+        self._add_edges(keyframe, rows)
+        ids = keyframe.point_id[rows]
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
         self.descriptor[ids] = keyframe.features.descriptor[rows]
