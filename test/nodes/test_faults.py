@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from node_chain import CALIBRATION, CHAIN, NodeChain
+from node_chain import CALIBRATION, CHAIN, NodeChain, seen_again
 from rclpy.node import Node
 from ros_graph import fresh_graph
 from stereo_drive import room_drive
@@ -46,7 +46,7 @@ class Drive:
         self.stamp_ns += FRAME_NS
         self._count += 1
         self._truth[self.stamp_ns] = self._poses[place]
-        return replace(self._views[place], index=self._count, stamp_ns=self.stamp_ns)
+        return seen_again(self._views[place], self._count, self.stamp_ns)
 
     def go_on(self, count: int = 3) -> None:
         """Drive on undisturbed: every frame must be tracked, at its true place."""

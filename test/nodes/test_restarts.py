@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from node_chain import CHAIN, NodeChain
+from node_chain import CHAIN, NodeChain, seen_again
 from ros_graph import fresh_graph
 from stereo_drive import room_drive, write_kitti
 
@@ -55,7 +55,7 @@ class Journey:
         turn = 2 * (PLACES - 1)
         place = self._count % turn
         place = min(place, turn - place)
-        frame = replace(self._views[place], index=self._count, stamp_ns=self._count * FRAME_NS)
+        frame = seen_again(self._views[place], self._count, self._count * FRAME_NS)
         self._count += 1
         self._truth[frame.stamp_ns] = invert(self._poses[0]) @ self._poses[place]
         return frame
