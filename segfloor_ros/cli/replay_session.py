@@ -33,7 +33,6 @@ from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 DISCOVERY_S = 30.0
 STALL_S = 60.0
 DRAIN_S = 10.0
-CATCH_UP_S = 3.0
 SERVICE_S = 10.0
 SPIN_S = 0.1
 
@@ -250,7 +249,7 @@ class ReplayGraph:
         recorder.last_sign_s = time.monotonic()
         while not recorder.has_caught_up():
             self.spin()
-            if time.monotonic() - recorder.last_sign_s > CATCH_UP_S:
+            if time.monotonic() - recorder.last_sign_s > DRAIN_S:
                 return
 
     def spin(self, duration_s: float = SPIN_S) -> None:
