@@ -26,12 +26,13 @@ _CONTACT_HEIGHT_M = 0.12
 class Comparison:
     """What the images say of each pixel of a view, (R, W) bool.
 
-    against: clearly more like the matched disparity than like floor. unlike: unlike floor,
-    whatever it is. distinct: like floor, and less so a little off the floor.
-    consistent: may be floor.
+    against: clearly more like the matched disparity than like floor. denied: the same of the
+    surroundings taken together. unlike: unlike floor, whatever it is. distinct: like floor, and
+    less so a little off the floor. consistent: may be floor.
     """
 
     against: NDArray[np.bool_]
+    denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
     distinct: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
@@ -97,7 +98,8 @@ def judge(
     height = table.offset[index] - table.scale[index] * view.derolled
     above = height > table.up[index]
     off = above | (height < -table.down[index])
-    sure = textured & compared.against
+    # What seems to lie below the floor may be what the floor mirrors.
+    sure = (textured & compared.against) | (compared.denied & above)
     near = disparity >= np.float32(settings.min_disparity_px)
     # On a sill the images contradict the floor, and show that it is a sill.
     sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))

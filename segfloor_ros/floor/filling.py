@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.contact import fill_to_contact
+from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.view import FloorView
@@ -17,6 +19,8 @@ _THREAD_PX = 3
 _BORDER_PX = 12
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
+_STRONG_SLOPE = 10.0
+"""Stronger edges than this are the border of something."""
 _TEXTURE_MARGIN = 7
 _EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
@@ -26,7 +30,9 @@ def fill_regions(
     view: FloorView,
     mask: NDArray[np.uint8],
     image: NDArray[np.uint8],
-    consistent: NDArray[np.bool_],
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    compared: Comparison,
     textured: NDArray[np.bool_],
     min_share: float,
 ) -> NDArray[np.uint8]:
@@ -46,7 +52,7 @@ def fill_regions(
         return mask
     slope = _slope(image)
     limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
-    alike = (small != NOT_FLOOR) & consistent[part] & (slope < limit)
+    alike = (small != NOT_FLOOR) & compared.consistent[part] & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
     top = _top_of_supported(region, count, floor, min_share)
@@ -59,7 +65,10 @@ def fill_regions(
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
     nearer = (rows >= highest) & (not_blank > 0)
     fill = inside & (nearer | _under_floor(small) | _between_floor(small))
-    return _with_floor(mask, fill)
+    mask = _with_floor(mask, fill)
+    # Light on the floor is no border, where both ends of a stretch are known.
+    plain = compared.consistent[part] & ~compared.denied[part] & (slope < _STRONG_SLOPE)
+    return _with_floor(mask, fill_to_contact(view, profile, mask, plain, disparity, compared))
 
 
 def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView
 
+_RISE_PX = 1.0
+"""Disparities are compared over as many rows as it takes a floor to rise by this."""
+_RISE_TOLERANCE = 0.75
+
 
 def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:
     """Return how often each disparity bin occurs per column, (num_bins, W).
@@ -55,6 +59,18 @@ def v_disparity(
     return np.bincount(index, minlength=shape[0] * shape[1])[: shape[0] * shape[1]].reshape(shape)
 
 
+def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
+    """Tell where disparities (R, W) rise down the image as those of a floor do, (R, W).
+
+    slope: of a level floor, in pixels per row. Upright surfaces do not rise; nor does floor of
+    little texture, where semi-global matching prefers level steps.
+    """
+    half = math.ceil(_RISE_PX / slope / 2)
+    rise = np.zeros_like(disparity)
+    rise[half:-half] = disparity[2 * half :] - disparity[: -2 * half]
+    return np.abs(rise / np.float32(2 * half * slope) - 1) < _RISE_TOLERANCE
+
+
 def filtered_v_disparity(
     view: FloorView,
     disparity: NDArray[np.float32],
@@ -79,6 +95,7 @@ def filtered_v_disparity(
     )
     upright = u_disparity(bins, num) > limit[:, None]
     keep = (disparity > 0) & textured & ~upright[bins, np.arange(bins.shape[1])]
+    keep &= rising(disparity, view.line.slope)
     first, last = math.floor(float(derolled.min())), math.ceil(float(derolled.max()))
     rows = (derolled[keep] - np.float32(first - 0.5)).astype(np.intp)
     fine = (disparity[keep] * bins_per_px + 0.5).astype(np.intp)

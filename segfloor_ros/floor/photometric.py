@@ -20,6 +20,11 @@ from segfloor_ros.floor.view import FloorView
 _STEP_PX = 2
 """Every so many pixels of the image are compared, in rows and in columns."""
 _WINDOW = 5
+_WIDE_WINDOW = 15
+"""What too little texture leaves open in a small window a larger one often tells."""
+_WIDE_RATIO = 1.15
+_WIDE_MARGIN_GREY = 0.05
+_WIDE_SHARE = 0.65
 _SHIFT_PX = 2.0
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
@@ -56,13 +61,19 @@ def compare(
     margin = settings.against_grey + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
     unlike = floor > settings.likeness_grey + _NOISE_SHARE * noise_grey
+    wide = (_WIDE_WINDOW, _WIDE_WINDOW)
+    denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
+    worse = floor > 1.1 * matched
+    denied &= (matched_px > 0) & worse
+    denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
     contrary = against | (floor > 2 * settings.likeness_grey + _NOISE_SHARE * noise_grey)
     closer = shifted - floor > 0.4 * settings.against_grey + 0.1 * noise_grey
     closer &= (floor < 1.1 * matched) | (matched_px <= 0)
     closer &= floor_px >= settings.min_disparity_px
     reached = columns >= floor_px + 2 * _SHIFT_PX
     distinct = closer & reached & ~against & ~unlike
-    masks = (against & reached, unlike & reached, distinct, ~(contrary & reached))
+    contradicted = (against, denied, unlike)
+    masks = (*(mask & reached for mask in contradicted), distinct, ~(contrary & reached))
     return Comparison(*(_enlarged(mask, disparity.shape) for mask in masks))
 
 

@@ -17,7 +17,7 @@ from segfloor_ros.floor.filling import (
     fill_regions,
     trim_to_edges,
 )
-from segfloor_ros.floor.histograms import filtered_v_disparity
+from segfloor_ros.floor.histograms import filtered_v_disparity, rising
 from segfloor_ros.floor.memory import FloorMemory
 from segfloor_ros.floor.observation import (
     FLOOR,
@@ -42,6 +42,10 @@ _PLANE_SAMPLES = 4000
 _PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 _FAITH = 2.0
 """So much more must speak for the second expectation than for the first."""
+_SWING_RAD = math.radians(3.0)
+"""So far robots swing on their wheels; what the map says beyond that is drift."""
+_FLAT_WEIGHT = 0.1
+"""Of samples whose disparity does not rise down the image as a floor's does."""
 
 
 class FloorSegmentation:
@@ -70,7 +74,7 @@ class FloorSegmentation:
         """
         settings = self._settings
         self._prepare(mount)
-        expected = _expectations(mount, T_map_base)
+        expected = self._expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         right = equal_exposure(left, right)
         columns = np.s_[first_row:, :: column_step(self._camera)]
@@ -89,7 +93,7 @@ class FloorSegmentation:
         evidence = judge(view, profile, below, textured, compared, table, settings)
         seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
         evidence = Evidence(seen, evidence.height_m)
-        mask = self._fill(view, profile, seen, left_rows, textured, compared, T_map_base)
+        mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
         overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
         scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
         rows = np.arange(self._camera.height, dtype=np.float64)
@@ -113,6 +117,19 @@ class FloorSegmentation:
         self._scanner = FloorScanner(self._camera, mount, self._settings)
         self._memory = FloorMemory()
         self._mount = mount
+
+    def _expectations(self, mount: Mount, T_map_base: Array | None) -> Array:
+        """Return what pitch, roll and height to expect, (P, 3), the likeliest first.
+
+        As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the
+        map.
+        """
+        mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
+        if T_map_base is None:
+            return mounted[None]
+        T_map_left = T_map_base @ mount.T_base_left
+        level = angles_height_of(T_map_left[2, :3] / mount.height_m)
+        return np.stack([mounted, level])
 
     def _first_row(self, expected: Mount) -> int:
         camera = self._camera
@@ -145,16 +162,20 @@ class FloorSegmentation:
         rows, columns = np.nonzero(disparity[::step, ::step] > 0)
         across = step * column_step(camera)
         grey = texture[::step, ::step][rows, columns].astype(np.float64) / (4 * enough)
+        slope = FloorLine.of(camera, Mount(height_m=expected[0, 2], pitch_rad=expected[0, 0])).slope
+        inclined = rising(disparity, slope)[::step, ::step][rows, columns]
         found = disparity[::step, ::step][rows, columns].astype(np.float64)
         uv = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
         samples = Samples(
             rays=camera.back_project(uv, np.ones(len(uv))),
             position_m=np.zeros(3),
             disparity_px=found,
-            weight=grey**4 / (grey**4 + 1),
+            weight=grey**4 / (grey**4 + 1) * np.where(inclined, 1.0, _FLAT_WEIGHT),
             disparity_m=camera.disparity_times_depth,
         )
         likelihood = scores(samples, expected)
+        swing = np.hypot(*(expected - expected[0])[:, :2].T)
+        likelihood = likelihood * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
         likelihood[0] *= _FAITH
         start = expected[int(np.argmax(likelihood))]
         settings = self._settings
@@ -177,6 +198,7 @@ class FloorSegmentation:
         self,
         view: FloorView,
         profile: FloorProfile,
+        disparity: NDArray[np.float32],
         mask: NDArray[np.uint8],
         left_rows: NDArray[np.uint8],
         textured: NDArray[np.bool_],
@@ -188,7 +210,9 @@ class FloorSegmentation:
         if T_map_base is not None:
             mask = self._memory.fill(view, mask, T_map_base)
         consistent = compared.consistent
-        mask = fill_regions(view, mask, left_rows, consistent, textured, settings.fill_support)
+        mask = fill_regions(
+            view, mask, left_rows, profile, disparity, compared, textured, settings.fill_support
+        )
         mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
         return drop_islands(mask, settings.island_share)
 
@@ -218,18 +242,6 @@ class FloorSegmentation:
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
-
-
-def _expectations(mount: Mount, T_map_base: Array | None) -> Array:
-    """Return what pitch, roll and height to expect, (P, 3), the likeliest first.
-
-    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map.
-    """
-    mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
-    if T_map_base is None:
-        return mounted[None]
-    R_map_left = T_map_base[:3, :3] @ mount.T_base_left[:3, :3]
-    return np.stack([mounted, angles_height_of(R_map_left[2] / mount.height_m)])
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segfloor_ros.floor.histograms import obstacle_rows, u_disparity, v_disparity
+from segfloor_ros.floor.histograms import obstacle_rows, rising, u_disparity, v_disparity
 
 
 def test_u_disparity_counts_per_column_and_ignores_no_match():
@@ -20,3 +20,15 @@ def test_an_obstacle_must_cover_the_rows_its_height_covers():
     # 0.2 f / (0.02 f) = 10 rows. The floor puts 2 rows in a bin: below 2 * 2 + 2 nothing counts.
     rows = obstacle_rows(np.array([1.0, 6.0, 12.0]), 0.2, 1 / 0.12, 2.0)
     assert np.allclose(rows, [6.0, 10.0, 20.0])
+
+
+def test_only_what_rises_as_a_floor_does_is_kept():
+    slope = 0.25  # px per row: compared over 4 rows
+    rows = np.arange(40, dtype=np.float32)[:, None]
+    floor = np.tile(5 + slope * rows, (1, 3))
+    upright = np.full_like(floor, 9.0)
+    steps = np.floor(floor / 4) * 4  # as the matcher draws floor without texture
+    assert rising(floor, slope)[2:-2].all()
+    assert rising(floor / 2, slope)[2:-2].all()  # the lower end of a ramp
+    assert not rising(upright, slope).any()
+    assert rising(steps, slope)[2:-2].mean() < 0.3
