@@ -19,7 +19,7 @@ from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.endless_drive import write_endless_drive
 
 if TYPE_CHECKING:
-    from segfloor_ros.cli.node_figures import NodeFigures
+    from segfloor_ros.cli.replay_figures import NodeFigures
 
 
 def benchmark_nodes(
@@ -38,7 +38,7 @@ def benchmark_nodes(
 ) -> None:
     """Measure the nodes on a recording: image to map, CPU and memory of each, what is lost."""
     try:
-        from segfloor_ros.cli.node_figures import measure_nodes
+        from segfloor_ros.cli.replay_figures import measure_nodes
     except ImportError as error:
         raise SettingsError(f'benchmark-nodes needs ROS 2 ({error})') from None
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})

@@ -18,7 +18,7 @@ from segfloor_ros.evaluation.endless_drive import write_endless_drive
 pytest.importorskip('rclpy')
 
 from segfloor_ros.cli.benchmark_nodes import figure_rows
-from segfloor_ros.cli.node_figures import NodeFigures
+from segfloor_ros.cli.replay_figures import NodeFigures
 
 
 def open_recording(folder):
