@@ -64,7 +64,7 @@ def benchmark(
         _write_json(json_file, published.as_document(results))
         return
     plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
-    with _announcing() as announce:
+    with announcing() as announce:
         workloads = generated.run_benchmark(plan, configuration, announce)
     console.print(stage_table(workloads))
     console.print(workload_table(workloads))
@@ -76,7 +76,7 @@ def _run_published(
 ) -> list[SceneResult]:
     with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary:
         folder = workdir or Path(temporary)
-        with _announcing() as announce:
+        with announcing() as announce:
             results = [
                 published.run_scene(
                     name, open_scene(name), folder / name, configuration, threads, announce
@@ -92,7 +92,7 @@ def _run_published(
 
 
 @contextmanager
-def _announcing() -> Iterator[Announce]:
+def announcing() -> Iterator[Announce]:
     """Show a progress bar whose task is replaced by the next announced one."""
     with progress_bar('starting', None) as bar:
         yield lambda description, total: _next_task(bar, description, total)

@@ -9,6 +9,7 @@ import typer
 
 from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.cli.benchmark_nodes import benchmark_nodes
+from segfloor_ros.cli.benchmark_slam import benchmark_slam
 from segfloor_ros.cli.calibrate import calibrate
 from segfloor_ros.cli.convert import convert
 from segfloor_ros.cli.demo import demo
@@ -25,7 +26,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, simulate, calibrate, convert, benchmark, benchmark_nodes, demo):
+benchmarks = (benchmark, benchmark_slam, benchmark_nodes)
+for command in (run, replay, simulate, calibrate, convert, *benchmarks, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')
 

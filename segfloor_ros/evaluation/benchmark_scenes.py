@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from segfloor_ros.evaluation.benchmark_chain import ImageChain
 from segfloor_ros.evaluation.benchmark_figures import Workload
 from segfloor_ros.evaluation.benchmark_published import PUBLISHED, SOURCE, PublishedScene
 from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
+from segfloor_ros.evaluation.benchmark_rendering import render_once
 from segfloor_ros.evaluation.map_score import MapScore, compare, score_map
 from segfloor_ros.evaluation.overlay import save_overlay
 from segfloor_ros.evaluation.prm import RoadMapPlan
@@ -28,9 +27,7 @@ from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.simulation.recording import RecordingOptions, record
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.simulation import Simulation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +66,7 @@ def run_scene(
     configuration = with_cells(configuration, cell_m)
     scene = dataclasses.replace(scene, resolution_m=cell_m)
     recording = folder / 'recording'
-    _render(name, scene, recording, folder / 'rendered_from.txt', announce)
+    render_once(name, scene, recording, folder / 'rendered_from.txt', announce)
     source = open_source(StereoCameraSettings(input=str(recording)))
     report = announce(f'mapping {name}', source.frame_count or 0)
     workload, grid = run_apart(
@@ -117,17 +114,3 @@ def as_document(results: list[SceneResult]) -> dict[str, Any]:
         'published_source': SOURCE,
         'scenes': [dataclasses.asdict(result) for result in results],
     }
-
-
-def _render(name: str, scene: Scene, recording: Path, stamp: Path, announce: Announce) -> None:
-    """Render a drive unless the folder holds this very scene already."""
-    wanted = hashlib.sha256(repr(scene).encode()).hexdigest() + '\n'
-    if recording.is_dir() and stamp.is_file() and stamp.read_text() == wanted:
-        return
-    with Simulation(scene) as simulation:
-        stamp.unlink(missing_ok=True)
-        if recording.is_dir():
-            shutil.rmtree(recording)
-        report = announce(f'rendering {name}', simulation.frame_count)
-        record(simulation, recording, RecordingOptions(floor_every=0), report)
-    stamp.write_text(wanted)

@@ -1,0 +1,89 @@
+"""`segfloor benchmark-slam`: the error of the path and the cost of a frame, over several drives."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Annotated, Optional
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from segfloor_ros.cli.benchmark import announcing
+from segfloor_ros.cli.options import ParamsOption, SetOption
+from segfloor_ros.cli.output import console
+from segfloor_ros.configuration import resolve
+from segfloor_ros.evaluation.benchmark import Announce
+from segfloor_ros.evaluation.benchmark_rendering import render_once
+from segfloor_ros.evaluation.benchmark_slam import DRIVES, DriveResult, measure_drive
+from segfloor_ros.simulation.any_scene import open_scene
+
+
+def benchmark_slam(
+    drives: Annotated[
+        Optional[list[str]],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        typer.Argument(
+            help='Recordings with poses.txt, and scenes to simulate. [default: '
+            + ' '.join(DRIVES)
+            + ']'
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help='Drives of each scene, seeds 1, 2, ...')] = 2,
+    workdir: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help='Keep renderings here; what is there is used again.'),
+    ] = None,
+    params: ParamsOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Track drives whose path is known: error of the path, time per frame and keyframe."""
+    configuration = resolve(params, assignments or ())
+    results = []
+    with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary:
+        folder = workdir or Path(temporary)
+        with announcing() as announce:
+            for drive in drives or DRIVES:
+                for name, recording in _recordings(drive, seeds, folder, announce):
+                    report = announce(f'tracking {name}', len(list(recording.glob('image_0/*'))))
+                    results.append(measure_drive(name, recording, configuration, report))
+    console.print(drives_table(results))
+
+
+def _recordings(drive: str, seeds: int, folder: Path, announce: Announce) -> list[tuple[str, Path]]:
+    """Return the drive's recordings by name: itself, or the scene rendered once for each seed."""
+    if (Path(drive) / 'poses.txt').is_file():
+        return [(Path(drive).name, Path(drive))]
+    scene, found = open_scene(drive), []
+    for seed in range(1, seeds + 1):
+        name = f'{Path(drive).stem}-{seed}'
+        recording, stamp = folder / name / 'recording', folder / name / 'rendered_from.txt'
+        render_once(name, dataclasses.replace(scene, seed=seed), recording, stamp, announce)
+        found.append((name, recording))
+    return found
+
+
+def drives_table(results: list[DriveResult]) -> Table:
+    """Return a row for each drive, then the median and the worst error of the path."""
+    names = ('tracked', 'path m', 'error m', 'tracking ms', 'p95', 'mapping ms')
+    table = Table('drive', *names, padding=0)
+    for column in table.columns[1:]:
+        column.justify, column.no_wrap = 'right', True
+    for result in results:
+        score, tracking = result.score, result.stages['tracking']
+        table.add_row(
+            result.name,
+            f'{round(score.tracked * score.frames)}/{score.frames}',
+            f'{score.path_length_m:.1f}',
+            f'{score.ate_rmse_m:.4f}',
+            f'{tracking["mean_ms"]:.1f}',
+            f'{tracking["p95_ms"]:.1f}',
+            f'{result.stages["mapping"]["mean_ms"]:.1f}',
+        )
+    errors_m = [result.score.ate_rmse_m for result in results]
+    table.caption = (
+        f'error: RMSE of the camera path after rigid alignment; of {len(errors_m)} drives median '
+        f'{np.median(errors_m):.4f} m, worst {max(errors_m):.4f} m; times: means'
+    )
+    return table

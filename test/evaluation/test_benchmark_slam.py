@@ -1,0 +1,78 @@
+"""`segfloor benchmark-slam`: recordings with a known path, and scenes rendered once per seed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
+from typer.testing import CliRunner
+
+from segfloor_ros.cli.benchmark_slam import drives_table
+from segfloor_ros.cli.main import app
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.benchmark_slam import measure_drive
+from segfloor_ros.geometry import invert
+from segfloor_ros.simulation.renderer import RenderingError
+
+FRAMES = 12
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory) -> Path:
+    """A recording in a generated room, with the true path of its camera."""
+    frames, T_world_base = room_drive(FRAMES)
+    folder = write_kitti(tmp_path_factory.mktemp('drives') / 'room', frames)
+    T_world_left = np.array(T_world_base) @ MOUNT.T_base_left
+    relative = invert(T_world_left[0]) @ T_world_left
+    np.savetxt(folder / 'poses.txt', relative[:, :3].reshape(-1, 12))
+    return folder
+
+
+def test_a_drive_is_scored_against_its_true_path(drive) -> None:
+    told: list[int] = []
+    result = measure_drive('room', drive, Configuration(), told.append)
+    assert told == list(range(1, FRAMES + 1))
+    assert (result.score.frames, result.score.tracked) == (FRAMES, 1.0)
+    assert result.score.ate_rmse_m < 0.01 < result.score.path_length_m
+    assert result.stages['tracking']['count'] == FRAMES
+    assert result.stages['mapping']['count'] == result.keyframes
+    console = Console(record=True, width=80)
+    console.print(drives_table([result, result]))
+    text = console.export_text()
+    assert '…' not in text
+    assert f'{FRAMES}/{FRAMES}' in text
+    assert 'of 2 drives' in ' '.join(text.split())
+
+
+def test_a_recording_without_its_true_path_is_refused(drive, tmp_path) -> None:
+    with pytest.raises(InputError, match=r'poses\.txt'):
+        measure_drive('room', tmp_path, Configuration(), lambda done: None)
+    result = CliRunner().invoke(app, ['benchmark-slam', 'corridr1'])
+    assert isinstance(result.exception, InputError)
+    assert 'corridor1' in str(result.exception)
+
+
+def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
+    scene = tmp_path / 'short.yaml'
+    scene.write_text(
+        'like: corridor2\ncamera: {width: 320, height: 240}\n'
+        'path: {waypoints: [[0.1, 0.0], [0.5, 0.0]]}\n'
+    )
+    arguments = ['benchmark-slam', str(scene), '--seeds', '2', '--workdir', str(tmp_path / 'work')]
+    result = CliRunner().invoke(app, arguments)
+    if isinstance(result.exception, RenderingError):
+        pytest.skip(str(result.exception))
+    assert result.exit_code == 0, result.output
+    assert re.findall(r'short-\d', result.output) == ['short-1', 'short-2']
+    recordings = [tmp_path / 'work' / f'short-{seed}' / 'recording' for seed in (1, 2)]
+    images = [(folder / 'image_0' / '000000.png').read_bytes() for folder in recordings]
+    assert images[0] != images[1]
+    rendered = (recordings[0] / 'poses.txt').stat().st_mtime_ns
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert (recordings[0] / 'poses.txt').stat().st_mtime_ns == rendered
