@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from rclpy.node import Node
 from ros_graph import fresh_graph
 from stereo_drive import room_drive, write_kitti
 
@@ -53,7 +54,7 @@ def documented(node: str, title: str) -> dict[str, str]:
     return dict(re.findall(r'^\| `([^`]+)` \| `([^`]*)`', section, re.M))
 
 
-@pytest.mark.parametrize(('node', 'make'), zip(NODES, MAKERS, strict=True), ids=NODES)
+@pytest.mark.parametrize(('node', 'make'), [*zip(NODES, MAKERS, strict=True)], ids=NODES)
 def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node, make) -> None:
     drive = write_kitti(tmp_path / 'drive', room_drive(1)[0])
     source = ('-p', f'input:={drive}') if node == 'stereo_camera' else ()
@@ -62,8 +63,9 @@ def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node,
     for alternative in ALTERNATIVES if node in ('stereo_camera', 'stereo_slam') else ((),):
         with fresh_graph('-r', '__ns:=/robot', *source, *alternative) as graph:
             made = graph.add(make())
-            # The graph takes a moment to know of a node; its first sign of life comes last.
+            # The graph takes a moment to know of a node and of everything it has.
             graph.until(partial(graph.reports_any, node), 'a sign of life')
+            graph.until(partial(knows_all_of, made), 'all topics and services in the graph')
             published |= made.get_publisher_names_and_types_by_node(node, '/robot')
             subscribed |= made.get_subscriber_names_and_types_by_node(node, '/robot')
             services |= made.get_service_names_and_types_by_node(node, '/robot')
@@ -74,6 +76,17 @@ def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node,
     assert relative(own, node) == documented(node, 'Services')
     of_ros = {'use_sim_time', 'start_type_description_service'}
     assert parameters - of_ros == set(documented(node, 'Parameters'))
+
+
+def knows_all_of(node: Node) -> bool:
+    """Whether the ROS graph knows all that a node of this process has made."""
+    name, namespace = node.get_name(), node.get_namespace()
+    pairs = (
+        ((p.topic_name for p in node.publishers), node.get_publisher_names_and_types_by_node),
+        ((s.topic_name for s in node.subscriptions), node.get_subscriber_names_and_types_by_node),
+        ((s.service_name for s in node.services), node.get_service_names_and_types_by_node),
+    )
+    return all(set(made) <= {n for n, _ in known(name, namespace)} for made, known in pairs)
 
 
 def relative(found, node: str = '') -> dict[str, str]:
