@@ -27,6 +27,9 @@ from segfloor_ros.slam.residuals import (
 
 SMALLEST_PIVOT = 1e-12
 
+CONVERGED = 1e-3
+"""Stop at this relative decrease of the cost; the next keyframe goes on from there."""
+
 
 @dataclass(frozen=True)
 class BundleProblem:
@@ -76,7 +79,7 @@ def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> Bun
         predicted = system.predicted_decrease(step, damping)
         gain = (state.cost - trial.cost) / max(predicted, 1e-12)
         if gain > 0:
-            converged = state.cost - trial.cost < 1e-4 * state.cost
+            converged = state.cost - trial.cost < CONVERGED * state.cost
             problem, state = candidate, trial
             damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
             growth = 2.0
