@@ -16,7 +16,7 @@ from segfloor_ros.cli.replay_graph import free_domain
 from segfloor_ros.messages.diagnostics import Status, statuses
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 class Graph:
