@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -108,6 +109,8 @@ class Graph:
 def fresh_graph(*arguments: str) -> Iterator[Graph]:
     """A graph whose nodes get the given ROS arguments, in a domain that nobody else uses."""
     os.environ['ROS_DOMAIN_ID'] = str(free_domain())
+    # The middleware of an earlier graph ends with the last reference to it, and is seen until then.
+    gc.collect()
     rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
     graph = Graph()
     try:
