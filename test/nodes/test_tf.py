@@ -152,7 +152,11 @@ def test_a_mount_on_tf_is_that_of_the_parameters(start, drive) -> None:
         chain.graph.until(lambda m=mounts: m, 'the mount')
         found = Mount.from_transform(transform_array(mounts[0]))
         assert (found.height_m, found.pitch_rad) == pytest.approx((MOUNT.height_m, MOUNT.pitch_rad))
-        poses.append([pose_array(message.pose.pose) for message in odometry])
+        chain.graph.until(
+            lambda o=odometry: frames[3].stamp_ns in {to_ns(m.header.stamp) for m in o},
+            'the pose of the last frame',
+        )
+        poses.append(pose_array(odometry[-1].pose.pose))
         chain.stop()
         chain.graph.close()
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
