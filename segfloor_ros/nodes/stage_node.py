@@ -31,6 +31,8 @@ from segfloor_ros.settings import StageSettings
 Stage = TypeVar('Stage', bound=StageSettings)
 Own = TypeVar('Own', bound=NodeSettings)
 
+INTERRUPT_HEARD_S = 0.2
+
 
 class StageNode(ReportingNode, Generic[Stage, Own]):
     """A node around one stage. Subclasses create the topics in `set_up`, the stage in `start_anew`,
@@ -201,7 +203,9 @@ def run_nodes(make_nodes: Callable[[Executor], Sequence[ManagedNode]]) -> None:
         print(f'segfloor: {error}', file=sys.stderr)
         status = 2
     except Exception:
-        # An interrupt takes the middleware away under whatever is being done at that moment.
+        # An interrupt takes the middleware away under whatever is being done at that moment, and
+        # may be heard of a little later than what it broke.
+        time.sleep(INTERRUPT_HEARD_S)
         if rclpy.ok():
             raise
     finally:
