@@ -117,6 +117,14 @@ class StereoSlamNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=0.5,
     )
+    max_waiting_frames: int = setting(
+        3,
+        'When more pairs than these wait, the oldest are skipped, so that poses stay fresh where '
+        'tracking is slower than the camera. A lossless stereo_camera sends no more at a time.',
+        minimum=3,
+        maximum=100,
+        live=True,
+    )
     bit_depth: int = setting(
         0,
         'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',

@@ -19,10 +19,14 @@ ORDER = (Level.OK, Level.WARN, Level.ERROR)
 
 @dataclass
 class InputMeter:
-    """Counts the messages of one topic. delays_s: age of the recent ones on arrival."""
+    """Counts the messages of one topic. delays_s: age of the recent ones on arrival.
+    longest_wait_s: that one of them waited in the queue since the last summary.
+    """
 
     count: int = 0
     counted_before: int = 0
+    lost: int = 0
+    longest_wait_s: float = 0.0
     delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
@@ -42,17 +46,36 @@ class Health:
         self._clock_s = clock_s
         self._inputs: dict[str, InputMeter] = {}
         self._problems: dict[str, Problem] = {}
-        self._counts = {'processed': 0, 'failed': 0, 'dropped': 0}
+        self._counts = {'processed': 0, 'failed': 0, 'dropped': 0, 'skipped': 0}
         self._milliseconds: deque[float] = deque(maxlen=RECENT)
         self._state = ''
         self._measured_s = clock_s()
 
-    def received(self, topic: str, delay_s: float | None) -> None:
-        """Count a message; delay_s: age of its stamp, None where it has none."""
+    def received(self, topic: str, delay_s: float | None, waited_s: float = 0.0) -> None:
+        """Count a message; delay_s: age of its stamp, None where it has none. waited_s: since it
+        came, in the queue.
+        """
         meter = self._inputs.setdefault(topic, InputMeter())
         meter.count += 1
+        meter.longest_wait_s = max(meter.longest_wait_s, waited_s)
         if delay_s is not None and abs(delay_s) < STALE_DELAY_S:
             meter.delays_s.append(delay_s)
+
+    def lost(self, topic: str, count: int) -> None:
+        """Count messages that never came."""
+        self._inputs.setdefault(topic, InputMeter()).lost += count
+
+    def longest_wait(self) -> tuple[str, float]:
+        """Return the topic whose messages waited longest since the last summary, and how long in
+        s.
+        """
+        waits = {topic: meter.longest_wait_s for topic, meter in self._inputs.items()}
+        topic = max(waits, key=lambda name: waits[name], default='')
+        return topic, waits.get(topic, 0.0)
+
+    def skipped(self) -> None:
+        """Note that something was left out because newer things waited."""
+        self._counts['skipped'] += 1
 
     def processed(self, milliseconds: float, state: str) -> None:
         """Note that something was processed, and the words for how it is."""
@@ -100,6 +123,9 @@ class Health:
             rate_hz = (meter.count - meter.counted_before) / duration_s
             meter.counted_before = meter.count
             values[f'rate_hz {topic}'] = f'{rate_hz:.1f}'
+            values[f'queue_s {topic}'] = f'{meter.longest_wait_s:.3f}'
+            values[f'lost {topic}'] = str(meter.lost)
+            meter.longest_wait_s = 0.0
             if meter.delays_s:
                 values[f'delay_s {topic}'] = f'{median(meter.delays_s):.3f}'
         return values

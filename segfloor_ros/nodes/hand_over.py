@@ -7,14 +7,18 @@ receiver's callback runs later, in the executor, as it does for a message from D
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.executors import Executor
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
+
+TopicCallback = Callable[[Any, Mapping[str, Any]], None]
+"""Takes a message and what the middleware tells of it, as rclpy hands them on."""
 
 
 class HandOver:
@@ -33,7 +37,7 @@ class HandOver:
         return made
 
     def subscribe(
-        self, topic: str, callback: Callable[[Any], None], profile: QoSProfile, raw: bool
+        self, topic: str, callback: TopicCallback, profile: QoSProfile, raw: bool
     ) -> LocalSubscription | None:
         """Subscribe to a topic of this process; None where no node of it publishes the topic."""
         publisher = self._publishers.get(topic)
@@ -67,6 +71,7 @@ class LocalPublisher:
         self.latched: Message | None = None
         self._subscriptions = subscriptions
         self._is_latched = is_latched
+        self._count = 0
 
     @property
     def topic_name(self) -> str:
@@ -79,7 +84,8 @@ class LocalPublisher:
 
     def publish(self, content: Any) -> None:
         """Hand a message over. It must not be changed any more."""
-        message = Message(content)
+        self._count += 1
+        message = Message(content, self._count)
         if self._is_latched:
             self.latched = message
         for subscription in self._subscriptions:
@@ -92,13 +98,11 @@ class LocalPublisher:
 class LocalSubscription:
     """Keeps the last messages until the executor gets to them, as the depth of a topic says."""
 
-    def __init__(
-        self, executor: Executor, callback: Callable[[Any], None], depth: int, raw: bool
-    ) -> None:
+    def __init__(self, executor: Executor, callback: TopicCallback, depth: int, raw: bool) -> None:
         self._executor = executor
         self._callback = callback
         self._raw = raw
-        self._waiting: deque[Message] = deque(maxlen=depth)
+        self._waiting: deque[tuple[Message, int]] = deque(maxlen=depth)
 
     def get_publisher_count(self) -> int:
         """Return how many publish the topic: the one in this process."""
@@ -106,7 +110,7 @@ class LocalSubscription:
 
     def take(self, message: Message) -> None:
         """Have the callback called with a message."""
-        self._waiting.append(message)
+        self._waiting.append((message, time.time_ns()))
         self._executor.create_task(self._process)
 
     def close(self) -> None:
@@ -115,15 +119,17 @@ class LocalSubscription:
 
     def _process(self) -> None:
         if self._waiting:
-            message = self._waiting.popleft()
-            self._callback(message.serialized() if self._raw else message.content)
+            message, taken_ns = self._waiting.popleft()
+            info = {'publication_sequence_number': message.number, 'received_timestamp': taken_ns}
+            self._callback(message.serialized() if self._raw else message.content, info)
 
 
 class Message:
     """A message under way, serialised at most once; it may be published in that form."""
 
-    def __init__(self, content: Any) -> None:
+    def __init__(self, content: Any, number: int) -> None:
         self.content = content
+        self.number = number
         self._serialized: bytes | None = content if isinstance(content, bytes) else None
 
     def serialized(self) -> bytes:

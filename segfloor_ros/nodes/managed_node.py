@@ -19,8 +19,15 @@ from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher, LocalSubscription
+from segfloor_ros.nodes.hand_over import (
+    HandOver,
+    LocalPublisher,
+    LocalSubscription,
+    TopicCallback,
+)
+from segfloor_ros.nodes.when_idle import WhenIdle
 
+LEAST_PERIOD_S = 0.001
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -148,7 +155,7 @@ class ManagedNode(LifecycleNode):
         self,
         kind: Any,
         name: str,
-        callback: Callable[[Any], None],
+        callback: TopicCallback,
         profile: QoSProfile,
         raw: bool = False,
     ) -> None:
@@ -160,8 +167,10 @@ class ManagedNode(LifecycleNode):
                 topic = self.resolve_topic_name(name)
                 local = self._hand_over.subscribe(topic, callback, profile, raw)
             quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+            # rclpy's annotation knows callbacks of one argument only.
+            take: Any = callback
             made = local or self.create_subscription(
-                kind, name, callback, profile, raw=raw, event_callbacks=quiet
+                kind, name, take, profile, raw=raw, event_callbacks=quiet
             )
             self._heard[name] = made
             return made
@@ -188,9 +197,32 @@ class ManagedNode(LifecycleNode):
         """Whether anybody publishes a topic that the node listens to now."""
         return self.publisher_count(name) > 0
 
+    def when_idle(self, callback: Callable[[], None]) -> WhenIdle:
+        """Return what calls something once the messages that have come are taken. It lives until
+        the node is cleaned up.
+        """
+        made = WhenIdle(self, callback)
+        self._kept.append((made.guard, self.destroy_guard_condition))
+        return made
+
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""
         self._openers.append((lambda: self.steady_timer(period_s, callback), self.destroy_timer))
+
+    def repeat(self, step: Callable[[], float]) -> None:
+        """Call something while the inputs are open, each time after as many seconds as it has
+        returned the time before.
+        """
+
+        def start() -> Timer:
+            def run() -> None:
+                timer.timer_period_ns = round(1e9 * max(step(), LEAST_PERIOD_S))
+                timer.reset()
+
+            timer = self.steady_timer(LEAST_PERIOD_S, run)
+            return timer
+
+        self._openers.append((start, self.destroy_timer))
 
     def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Make a timer that also runs while the time of a recording stands still."""

@@ -5,11 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-MAX_FRAMES_UNDER_WAY = 8
-"""Frames that may be between the camera and SLAM; less than the depth of the image topics."""
+MAX_FRAMES_UNDER_WAY = 3
+"""Frames that may be between the camera and SLAM: no more than SLAM lets wait before it skips any
+(`max_waiting_frames`), and enough for it to find the next one when it has done with one.
+"""
 
 MAX_KEYFRAMES_UNDER_WAY = 4
 """Keyframes that may be between SLAM and the grid while the next frame is sent."""
+
+PATIENCE_S = 10.0
+"""Seconds without any sign of progress after which what is under way is taken for lost."""
 
 
 class ClockPace:
@@ -20,12 +25,13 @@ class ClockPace:
         self._clock_s = clock_s
         self._start: tuple[float, int] | None = None
 
-    def ready(self, stamp_ns: int) -> bool:
-        """Whether the frame is due."""
+    def wait_s(self, stamp_ns: int) -> float:
+        """Return in how many seconds the frame is due; 0 when it is."""
         if self._start is None:
-            return True
+            return 0.0
         start_s, start_ns = self._start
-        return self._clock_s() >= start_s + (stamp_ns - start_ns) * 1e-9 / self._rate
+        due_s = start_s + (stamp_ns - start_ns) * 1e-9 / self._rate
+        return max(due_s - self._clock_s(), 0.0)
 
     def sent(self, stamp_ns: int) -> None:
         """Start the clock with the first frame."""
@@ -40,9 +46,14 @@ class ClockPace:
 class ChainPace:
     """Lets few frames and keyframes be under way at a time, so that no queue between the nodes
     can run over, however fast the frames come.
+
+    What a node had in its queue is lost when it is paused, deactivated or killed: when nothing
+    at all has happened for some seconds, what is under way is given up.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._last_sign_s = clock_s()
         self._unanswered: set[int] = set()
         self._keyframes: set[int] = set()
         self._ended_early: set[int] = set()
@@ -56,11 +67,13 @@ class ChainPace:
 
     def sent(self, stamp_ns: int) -> None:
         """Wait for the answer to this frame from now on."""
+        self._last_sign_s = self._clock_s()
         self._unanswered.add(stamp_ns)
 
     def answered(self, stamp_ns: int) -> None:
-        """SLAM has processed a frame."""
-        self._unanswered.discard(stamp_ns)
+        """SLAM has processed a frame; it takes them in order, so earlier ones are done or lost."""
+        self._last_sign_s = self._clock_s()
+        self._unanswered = {t for t in self._unanswered if t > stamp_ns}
 
     def keyframe_began(self, stamp_ns: int) -> None:
         """SLAM has published a keyframe."""
@@ -70,12 +83,37 @@ class ChainPace:
         else:
             self._keyframes.add(stamp_ns)
 
+    def keyframe_mapped(self, stamp_ns: int) -> None:
+        """A keyframe has reached the end of the chain; earlier ones are done or lost."""
+        self._keyframes = {t for t in self._keyframes if t >= stamp_ns}
+        self.keyframe_ended(stamp_ns)
+
     def keyframe_ended(self, stamp_ns: int) -> None:
         """A keyframe has reached the end of the chain, or failed on the way."""
+        self._last_sign_s = self._clock_s()
         if stamp_ns in self._keyframes:
             self._keyframes.discard(stamp_ns)
         else:
             self._ended_early.add(stamp_ns)
+
+    def restart(self) -> None:
+        """Be patient anew, e.g. after a pause."""
+        self._last_sign_s = self._clock_s()
+
+    def forget_frames(self) -> None:
+        """Wait for no frame any more: whoever had them listens no longer."""
+        self._unanswered.clear()
+
+    def give_up(self) -> str:
+        """Where nothing has happened for too long, wait for nothing that is under way any more and
+        return in words what it was; else ''.
+        """
+        if self.ready() or self._clock_s() - self._last_sign_s < PATIENCE_S:
+            return ''
+        words = f'{len(self._unanswered)} frames and {len(self._keyframes)} keyframes'
+        self._unanswered.clear()
+        self._keyframes.clear()
+        return words
 
     def waits_for(self) -> str:
         """Return what is being waited for, in words."""

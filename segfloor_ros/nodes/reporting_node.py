@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from segfloor_ros.errors import SegfloorError
@@ -22,12 +23,15 @@ from segfloor_ros.messages.diagnostics import (
 )
 from segfloor_ros.messages.health import Health
 from segfloor_ros.messages.join import StampJoiner
-from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.messages.losses import LossCounter, loss_in_words
+from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic
 from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher
 from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.qos_check import incompatible_topics
 
 CONNECTION_CHECK_S = 0.1
+FALLS_BEHIND_S = 2.0
+LOSS_LASTS_S = 10.0
 NEED_LASTS_S = 5.0
 PATH = 'keyframe/path'
 PROBLEM_LASTS_S = 3.0
@@ -52,6 +56,7 @@ class ReportingNode(ManagedNode):
         self._health = Health()
         self._connections: dict[str, str] = {}
         self._last_heartbeat_s = 0.0
+        self._losses: dict[str, LossCounter] = {}
         self._faults: dict[str, float] = {}
         self._said: dict[str, float] = {}
         self.steady_timer(CONNECTION_CHECK_S, self._report_connections)
@@ -66,10 +71,38 @@ class ReportingNode(ManagedNode):
         self._outputs[name] = self.keep_publisher(topic.type, name, topic.profile)
         return self._outputs[name]
 
-    def note_received(self, topic: str, stamp_ns: int | None) -> None:
-        """Count a message of a topic, and its age where its stamp is known."""
+    def on_inputs_closed(self) -> None:
+        """What comes from now on is not missed."""
+        for losses in self._losses.values():
+            losses.skip()
+
+    def note_received(self, topic: Topic, stamp_ns: int | None, info: Mapping[str, Any]) -> None:
+        """Count a message of a topic, its age where its stamp is known, and the messages that are
+        missing before it. info: what the middleware tells of it.
+        """
         now_ns = self.get_clock().now().nanoseconds
-        self._health.received(topic, None if stamp_ns is None else 1e-9 * (now_ns - stamp_ns))
+        delay_s = None if stamp_ns is None else 1e-9 * (now_ns - stamp_ns)
+        waited_s = 1e-9 * (time.time_ns() - int(info.get('received_timestamp') or time.time_ns()))
+        self._health.received(topic.name, delay_s, waited_s)
+        # Of a latched topic only the last message counts.
+        if topic.profile.durability != DurabilityPolicy.TRANSIENT_LOCAL:
+            self._note_losses(topic, info.get('publication_sequence_number'))
+
+    def _note_losses(self, topic: Topic, number: int | None) -> None:
+        losses = self._losses.setdefault(topic.name, LossCounter())
+        lost = losses.note(number)
+        # The numbers of several publishers run side by side.
+        if not lost or self.publisher_count(topic.name) != 1:
+            return
+        self._health.lost(topic.name, lost)
+        found = self.subscriptions_by_topic[topic.name]
+        profile = found.qos_profile if isinstance(found, Subscription) else topic.profile
+        text = loss_in_words(topic.name, lost, self.get_name(), profile)
+        self.diagnose(f'loss on {topic.name}', text, Level.ERROR, LOSS_LASTS_S)
+
+    def note_skipped(self) -> None:
+        """Count something that was left out because newer things waited."""
+        self._health.skipped()
 
     def report_processed(
         self, stamp_ns: int, level: Level, message: str, milliseconds: float, **values: Any
@@ -177,10 +210,20 @@ class ReportingNode(ManagedNode):
     def _report_health(self) -> None:
         if self.is_open:
             self._find_unconnected()
+            self._find_queues()
             self.find_problems()
         level, words, values = self._health.summary(self.state_in_words)
         values['rss_mb'] = f'{rss_mb():.1f}'
         self.publish_status(HEALTH, self.get_clock().now().nanoseconds, level, words, values)
+
+    def _find_queues(self) -> None:
+        topic, waited_s = self._health.longest_wait()
+        if waited_s > FALLS_BEHIND_S:
+            text = (
+                f'{self.get_name()} falls behind: messages on {topic} wait {waited_s:.1f} s; lower '
+                'the rate or the size of the images, or let stereo_slam make fewer keyframes'
+            )
+            self.diagnose('queues', text)
 
     def _find_unconnected(self) -> None:
         heard = self.subscriptions_by_topic

@@ -60,6 +60,7 @@ class StageNode(ReportingNode, Generic[Stage, Own]):
 
     def on_inputs_closed(self) -> None:
         """Give up the sets that are not complete."""
+        super().on_inputs_closed()
         for joiner in self._joiners:
             joiner.clear()
 
@@ -108,8 +109,8 @@ class StageNode(ReportingNode, Generic[Stage, Own]):
         """
         topic = TOPICS[name]
 
-        def guarded(message: Any) -> None:
-            self.note_received(name, None if raw else to_ns(message.header.stamp))
+        def guarded(message: Any, info: Mapping[str, Any]) -> None:
+            self.note_received(topic, None if raw else to_ns(message.header.stamp), info)
             try:
                 callback(message)
             except Exception as error:

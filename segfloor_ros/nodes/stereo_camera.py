@@ -21,7 +21,9 @@ from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
 from segfloor_ros.nodes.stage_node import StageNode, run_node
 
-TICK_S = 0.004
+LOOK_AGAIN_S = 0.05
+"""How often is looked for subscribers, and whether the chain has room: its answers say so too."""
+AFTER_THE_END_S = 1.0
 SAY_WAITING_S = 5.0
 
 
@@ -47,7 +49,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             self.keep_subscription(
                 DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
             )
-        self.every(TICK_S, self._advance)
+        self.repeat(self._advance)
         self.pause(own.start_paused)
 
     def start_anew(self) -> None:
@@ -69,39 +71,55 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
     def on_inputs_opened(self) -> None:
         """Keep the recording's pace from here on."""
         self._said_waiting_s = time.monotonic()
-        if self._clock_pace is not None:
-            self._clock_pace.restart()
+        for pace in (self._clock_pace, self._chain_pace):
+            if pace is not None:
+                pace.restart()
 
-    def _advance(self) -> None:
-        """Send the next pairs as far as they may go now."""
+    def _advance(self) -> float:
+        """Send the next pairs as far as they may go now; returns when to look again, in s."""
         try:
             while self._may_play() and self._fetch() and self._next is not None:
-                if not self._is_due(self._next):
-                    return
+                wait_s = self._wait_s(self._next)
+                if wait_s > 0:
+                    return wait_s
                 self._send(self._next)
                 self._next = None
         except SegfloorError as error:
             self.say_fault(self._source.name, error)
             self._finish(Level.ERROR, str(error))
+        return AFTER_THE_END_S if self._finished else LOOK_AGAIN_S
 
     def _may_play(self) -> bool:
+        """Whether somebody listens; a recording that must lose nothing waits whenever nobody
+        does.
+        """
         if self._finished:
             return False
-        if not self._connected:
+        if not self._connected or self._chain_pace is not None:
             outputs = (*self._images.values(), *self._infos.values())
             silent = [out.topic_name for out in outputs if not out.get_subscription_count()]
-            self._connected = not silent
             if silent:
                 self._say_waiting_for('subscribers of ' + ', '.join(silent))
+            if silent and self._connected and self._chain_pace is not None:
+                self._chain_pace.forget_frames()
+                self._chain_pace.restart()
+            self._connected = not silent
         return self._connected
 
-    def _is_due(self, pair: RawPair) -> bool:
-        if self._clock_pace is not None and not self._clock_pace.ready(pair.stamp_ns):
-            return False
-        if self._chain_pace is not None and not self._chain_pace.ready():
-            self._say_waiting_for(self._chain_pace.waits_for())
-            return False
-        return True
+    def _wait_s(self, pair: RawPair) -> float:
+        wait_s = 0.0 if self._clock_pace is None else self._clock_pace.wait_s(pair.stamp_ns)
+        if wait_s > 0 or self._chain_pace is None or self._chain_pace.ready():
+            return wait_s
+        given_up = self._chain_pace.give_up()
+        if given_up:
+            self.diagnose(
+                'lost',
+                f'{given_up} under way have not come to their end and are given up: a node was '
+                'paused, deactivated or killed; look at its status',
+            )
+            return 0.0
+        self._say_waiting_for(self._chain_pace.waits_for())
+        return LOOK_AGAIN_S
 
     def _fetch(self) -> bool:
         """Read the next pair if none is at hand; False at the end of the recording."""
@@ -162,7 +180,9 @@ def note_status(pace: ChainPace, status: Status) -> None:
         if status.values.get('keyframe') == '1':
             pace.keyframe_began(status.stamp_ns)
         pace.answered(status.stamp_ns)
-    elif status.node == GRID or (status.node in (FLOOR, CLOUD) and status.level is Level.ERROR):
+    elif status.node == GRID:
+        pace.keyframe_mapped(status.stamp_ns)
+    elif status.node in (FLOOR, CLOUD) and status.level is Level.ERROR:
         pace.keyframe_ended(status.stamp_ns)
 
 

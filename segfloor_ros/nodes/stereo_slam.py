@@ -35,7 +35,6 @@ from segfloor_ros.stages import make_slam
 
 INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
-MAX_WAITING_PAIRS = 100
 WORK_OFF_EVERY_S = 0.2
 
 
@@ -50,7 +49,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def set_up(self) -> None:
         """Make the topics."""
         self._slam: StereoSlam | None = None
-        self._waiting: deque[dict[str, Any]] = deque(maxlen=MAX_WAITING_PAIRS)
+        self._waiting: deque[dict[str, Any]] = deque()
         own = self.parameters.own
         self._outputs_of_slam = SlamOutputs(self, own)
         self._transforms = Transforms(self, own)
@@ -58,7 +57,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._eyes: dict[str, EyeCalibration] = {}
         self._left, self._right = self._subscribe(own)
         self._watch = CameraWatch(self, own, self._left, self._right)
-        self.every(WORK_OFF_EVERY_S, self._work_off)
+        self._work = self.when_idle(self._work_off)
+        self.every(WORK_OFF_EVERY_S, self._work_on)
         tolerance_ns = round(own.sync_tolerance_s * 1e9)
         self._pairs = self.joiner(
             (self._left, self._right), capacity=MAX_UNPAIRED, tolerance_ns=tolerance_ns
@@ -128,7 +128,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._infos[topic] = message
         if self._slam is not None:
             self.say(f'{topic}: the calibration is not the one in use; ~/reset takes it over')
-        self._work_off()
+        self._work_on()
 
     def _take_image(self, topic: str, message: Image | CompressedImage) -> None:
         self._watch.saw_image(topic, to_ns(message.header.stamp))
@@ -136,12 +136,37 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self.say_dropped(self._pairs)
         if pair is not None:
             self._waiting.append(pair)
-            self._work_off()
+            self._work.request()
+
+    def _work_on(self) -> None:
+        if self._waiting:
+            self._work.request()
 
     def _work_off(self) -> None:
-        """Process the pairs that wait, once all is known that the first one needs."""
-        while self._waiting and self._is_ready(self._waiting[0]):
+        """Process the first pair that waits, once all is known that it needs; look for newer ones
+        before the next.
+        """
+        is_ready = bool(self._waiting) and self._is_ready(self._waiting[0])
+        while len(self._waiting) > self.parameters.own.max_waiting_frames:
+            self._skip(to_ns(self._waiting.popleft()[self._left].header.stamp), is_ready)
+        if is_ready:
             self._take_pair(self._waiting.popleft())
+            self._work_on()
+
+    def _skip(self, stamp_ns: int, is_ready: bool) -> None:
+        """Leave out a pair that newer ones have overtaken: a late pose is of no use to a robot."""
+        self.note_skipped()
+        if not is_ready:
+            words = 'skipped: calibration or mount of the camera are not known yet'
+            self.report(stamp_ns, Level.WARN, words)
+            return
+        self.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
+        self.diagnose(
+            'skipped',
+            f'{self._left} comes faster than it is tracked, so that frames are skipped; lower the '
+            'rate or the size of the images or num_features of stereo_slam, or play a recording '
+            'with lossless set on stereo_camera',
+        )
 
     def find_problems(self) -> None:
         """Say what is wrong with the camera."""

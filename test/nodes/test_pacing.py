@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import pytest
+
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.pacing import (
     MAX_FRAMES_UNDER_WAY,
     MAX_KEYFRAMES_UNDER_WAY,
+    PATIENCE_S,
     ChainPace,
     ClockPace,
 )
@@ -15,15 +18,15 @@ S = 1_000_000_000
 def test_the_clock_starts_with_the_first_frame_and_runs_at_the_rate() -> None:
     now = [100.0]
     pace = ClockPace(2.0, clock_s=lambda: now[0])
-    assert pace.ready(7 * S)
+    assert pace.wait_s(7 * S) == 0
     pace.sent(7 * S)
-    assert not pace.ready(8 * S)
+    assert pace.wait_s(8 * S) == pytest.approx(0.5)
     now[0] = 100.49
-    assert not pace.ready(8 * S)
+    assert pace.wait_s(8 * S) == pytest.approx(0.01)
     now[0] = 100.51
-    assert pace.ready(8 * S)
+    assert pace.wait_s(8 * S) == 0
     pace.restart()
-    assert pace.ready(1000 * S)
+    assert pace.wait_s(1000 * S) == 0
 
 
 def test_few_frames_are_under_way_at_a_time() -> None:
@@ -33,9 +36,45 @@ def test_few_frames_are_under_way_at_a_time() -> None:
         pace.sent(stamp)
     assert not pace.ready()
     assert 'stamp 0' in pace.waits_for()
-    pace.answered(12345)
+    pace.answered(-1)
     assert not pace.ready()
     pace.answered(0)
+    assert pace.ready()
+
+
+def test_the_answer_to_a_frame_is_the_end_of_those_before_it() -> None:
+    """They are answered in order: what has none yet never had one."""
+    pace = ChainPace()
+    for stamp in range(MAX_FRAMES_UNDER_WAY):
+        pace.sent(stamp)
+    pace.answered(MAX_FRAMES_UNDER_WAY - 1)
+    for stamp in range(MAX_FRAMES_UNDER_WAY - 1):
+        pace.sent(100 + stamp)
+        assert pace.ready()
+    for stamp in range(MAX_KEYFRAMES_UNDER_WAY):
+        note_status(pace, _status('stereo_slam', 200 + stamp, keyframe='1'))
+    note_status(pace, _status('occupancy_grid', 200 + MAX_KEYFRAMES_UNDER_WAY - 1))
+    assert pace.ready()
+
+
+def test_what_is_lost_under_way_is_given_up_after_a_while_without_any_sign() -> None:
+    now = [100.0]
+    pace = ChainPace(lambda: now[0])
+    for stamp in range(MAX_FRAMES_UNDER_WAY):
+        pace.sent(stamp)
+    now[0] += PATIENCE_S - 1
+    pace.keyframe_began(7)
+    pace.keyframe_mapped(7)
+    now[0] += PATIENCE_S - 1
+    assert pace.give_up() == ''
+    assert not pace.ready()
+    now[0] += 2
+    assert pace.give_up() == f'{MAX_FRAMES_UNDER_WAY} frames and 0 keyframes'
+    assert pace.ready()
+    assert pace.give_up() == ''
+    for stamp in range(MAX_FRAMES_UNDER_WAY):
+        pace.sent(stamp)
+    pace.forget_frames()
     assert pace.ready()
 
 

@@ -96,11 +96,23 @@ def later():
     return SimpleNamespace(create_task=tasks.append, tasks=tasks)
 
 
+class Received(list):
+    """Messages, and the numbers they were handed over with."""
+
+    def __init__(self) -> None:
+        self.numbers = []
+
+    def take(self, message, info) -> None:
+        """Take one, as a node does."""
+        self.append(message)
+        self.numbers.append(info['publication_sequence_number'])
+
+
 def test_messages_wait_for_the_executor_and_the_depth_bounds_them(later) -> None:
-    hand_over, outside, got = HandOver(later), Outside('/path'), []
+    hand_over, outside, got = HandOver(later), Outside('/path'), Received()
     publisher = hand_over.publisher(outside, qos.KEYFRAMES)
-    assert hand_over.subscribe('/other', got.append, qos.KEYFRAMES, False) is None
-    hand_over.subscribe('/path', got.append, QoSProfile(depth=2), False)
+    assert hand_over.subscribe('/other', got.take, qos.KEYFRAMES, False) is None
+    hand_over.subscribe('/path', got.take, QoSProfile(depth=2), False)
     messages = [Path(), Path(), Path()]
     for message in messages:
         publisher.publish(message)
@@ -108,6 +120,7 @@ def test_messages_wait_for_the_executor_and_the_depth_bounds_them(later) -> None
     for task in later.tasks:
         task()
     assert [id(m) for m in got] == [id(m) for m in messages[1:]]
+    assert got.numbers == [2, 3], 'the first one is known to be lost by its number'
     assert outside.sent == []
     outside.listeners = 1
     publisher.publish(messages[0])
@@ -116,18 +129,18 @@ def test_messages_wait_for_the_executor_and_the_depth_bounds_them(later) -> None
 
 
 def test_latched_messages_reach_those_who_come_later_and_raw_ones_are_serialised(later) -> None:
-    hand_over, outside, got = HandOver(later), Outside('/mount'), []
+    hand_over, outside, got = HandOver(later), Outside('/mount'), Received()
     publisher = hand_over.publisher(outside, qos.LATCHED)
     message = Path()
     message.header.frame_id = 'map'
     publisher.publish(message)
     assert outside.sent == [message]
-    late = hand_over.subscribe('/mount', got.append, qos.LATCHED, True)
-    hand_over.subscribe('/mount', got.append, qos.LATCHED, False)
+    late = hand_over.subscribe('/mount', got.take, qos.LATCHED, True)
+    hand_over.subscribe('/mount', got.take, qos.LATCHED, False)
     hand_over.unsubscribe(late)
     for task in later.tasks:
         task()
     assert got == [message]
-    hand_over.subscribe('/mount', got.append, qos.LATCHED, True)
+    hand_over.subscribe('/mount', got.take, qos.LATCHED, True)
     later.tasks[-1]()
     assert deserialize_message(got[1], Path) == message

@@ -1,0 +1,122 @@
+"""What is lost on the way into a node is counted, named with its topic, and said."""
+
+from __future__ import annotations
+
+import time
+
+from node_messages import cloud_messages, publish
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import SetBool
+from stereo_drive import room_drive
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
+from segfloor_ros.messages.diagnostics import HEALTH, Level
+from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.losses import LossCounter, loss_in_words
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+
+GIVEN = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+    '-p', 'camera_roll_rad:=0.0',
+)  # fmt: skip
+CALIBRATION = rectified_calibration(CAMERA)
+
+
+def health(graph, node: str):
+    """Return what a node has said about how it fares."""
+    return [s for s in graph.statuses if s.node == node and s.kind == HEALTH]
+
+
+def test_gaps_in_the_numbers_are_losses_and_a_new_publisher_is_none() -> None:
+    counter = LossCounter()
+    assert [counter.note(n) for n in (7, 8, 11, 12, 1, 2, 4)] == [0, 0, 2, 0, 0, 0, 1]
+    counter.skip()
+    assert [counter.note(n) for n in (100, 101)] == [0, 0]
+    assert [counter.note(n) for n in (None, 500, None, 502)] == [0, 0, 0, 0]
+    assert counter.total == 3
+
+
+def test_a_loss_is_told_with_what_to_do_about_it() -> None:
+    words = loss_in_words('map_points', 3, 'cloud_labelling', QoSProfile(depth=100))
+    assert words.startswith('3 messages lost on map_points: cloud_labelling was too slow')
+    assert 'queue of 100' in words
+    lossy = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    assert 'image_reliability' in loss_in_words('left/image_raw', 1, 'stereo_slam', lossy)
+
+
+def test_a_queue_that_runs_over_is_named_with_its_topic_and_the_node_goes_on(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    publishers = publish(graph, cloud_messages(1))
+    graph.until(lambda: labelled, 'the first keyframe')
+    last = qos.KEYFRAME_DEPTH + 10
+    # Nobody takes a message meanwhile: the graph is not spun.
+    for stamp_ns in range(2, last + 1):
+        for name, message in cloud_messages(stamp_ns).items():
+            publishers[name].publish(message)
+    time.sleep(2.5)
+    graph.until(lambda: len(labelled) > qos.KEYFRAME_DEPTH, 'the keyframes of the queue')
+    lost = last - len(labelled)
+    assert lost == 9
+
+    def said() -> bool:
+        return any(
+            s.values['lost map_points'] == str(lost) for s in health(graph, 'cloud_labelling')
+        )
+
+    graph.until(said, 'the count')
+    status = health(graph, 'cloud_labelling')[-1]
+    assert status.level is Level.ERROR
+    assert f'{lost} messages lost on map_points' in status.message
+    assert 'lossless' in status.message
+    assert any(
+        'cloud_labelling falls behind' in s.message for s in health(graph, 'cloud_labelling')
+    )
+
+
+def test_what_comes_while_a_node_is_paused_is_not_lost(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    publishers = publish(graph, cloud_messages(1))
+    graph.until(lambda: len(labelled) == 1, 'the first keyframe')
+    graph.call(SetBool, 'cloud_labelling/pause', SetBool.Request(data=True))
+    for message in cloud_messages(2).items():
+        publishers[message[0]].publish(message[1])
+    graph.call(SetBool, 'cloud_labelling/pause', SetBool.Request(data=False))
+    publish(graph, cloud_messages(3), publishers)
+    graph.until(lambda: len(labelled) == 2, 'the keyframe after the pause')
+    graph.statuses.clear()
+    graph.until(lambda: health(graph, 'cloud_labelling'), 'a sign of life')
+    assert health(graph, 'cloud_labelling')[-1].values['lost map_points'] == '0'
+
+
+def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(make_graph) -> None:
+    """A camera that floods: the newest frames are tracked, every frame gets its answer."""
+    frames, _ = room_drive(12, step_m=0.01)
+    graph = make_graph(*GIVEN)
+    graph.add(StereoSlamNode())
+    inputs = {
+        name: graph.publisher(name)
+        for name in ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
+    }
+    graph.connected(list(inputs.values()))
+    for frame in frames:
+        for side in ('left', 'right'):
+            info = camera_info_message(frame.stamp_ns, side, getattr(CALIBRATION, side))
+            inputs[f'{side}/camera_info'].publish(info)
+            image = image_message(frame.stamp_ns, side, getattr(frame, side))
+            inputs[f'{side}/image_raw'].publish(image)
+    graph.until(lambda: len(graph.reports('stereo_slam')) == len(frames), 'all answers')
+    by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
+    taken = [f.index for f in frames if 'skipped' not in by_stamp[f.stamp_ns].message]
+    assert taken == [9, 10, 11], 'as many as may wait, the newest ones'
+    assert all(by_stamp[frames[i].stamp_ns].level is Level.OK for i in taken)
+    graph.until(lambda: health(graph, 'stereo_slam')[-1].values['skipped'] == '9', 'the count')
+    assert (
+        'left/image_raw comes faster than it is tracked' in health(graph, 'stereo_slam')[-1].message
+    )
