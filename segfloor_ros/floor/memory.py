@@ -60,6 +60,14 @@ class FloorMemory:
         index, inside = self._index(_in_map(T_map_base, upright_base))
         votes[index[inside]] = _BLOCKED
 
+    def forget_floor(self) -> None:
+        """Forget where floor was, but not what stands up."""
+        np.minimum(self._votes, 0, out=self._votes)
+
+    def forget_blocked(self) -> None:
+        """Forget what stands up, but not where floor was."""
+        np.maximum(self._votes, 0, out=self._votes)
+
     def _index(self, xy_map: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         cell = np.floor(xy_map * np.float32(1 / CELL_M)).astype(np.int32)
         column, row = cell[0] - self._corner[0], cell[1] - self._corner[1]

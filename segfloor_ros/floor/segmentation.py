@@ -108,15 +108,31 @@ class FloorSegmentation:
             max_disparity_px=float(self._matcher.num_disparities),
         )
 
+    def change_settings(self, settings: FloorSegmentationSettings) -> None:
+        """Segment with changed settings from now on. What is remembered stays as far as it holds:
+        floor under a lower step would have been floor under a higher one, but not the reverse.
+        """
+        before, self._settings = self._settings, settings
+        limits = [(s.step_height_m, s.drop_height_m) for s in (before, settings)]
+        if any(new < old for old, new in zip(*limits, strict=True)):
+            self._memory.forget_floor()
+        if any(new > old for old, new in zip(*limits, strict=True)):
+            self._memory.forget_blocked()
+        if self._mount is not None:
+            self._make_tools(self._mount)
+
     def _prepare(self, mount: Mount) -> None:
         if mount == self._mount:
             return
+        self._make_tools(mount)
+        self._memory = FloorMemory()
+        self._mount = mount
+
+    def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)
         self._matcher = DisparityMatcher(-(-searched // 16) * 16, self._settings)
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
-        self._memory = FloorMemory()
-        self._mount = mount
 
     def _expectations(self, mount: Mount, T_map_base: Array | None) -> Array:
         """Return what pitch, roll and height to expect, (P, 3), the likeliest first.

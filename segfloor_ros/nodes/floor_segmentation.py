@@ -59,8 +59,9 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
             self._mount = None
 
     def on_settings_changed(self) -> None:
-        """Segment the next keyframe with the new settings."""
-        self._stage = None
+        """Segment the next keyframe with the new settings, and with what is remembered."""
+        if self._stage is not None:
+            self._stage.change_settings(self.parameters.stage)
 
     def _take_mount(self, message: TransformStamped) -> None:
         self._mount = Mount.from_transform(transform_array(message))

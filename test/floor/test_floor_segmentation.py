@@ -163,3 +163,35 @@ def test_the_left_border_is_known_from_before():
         shares_of_corner.append(np.mean(mask[corner] == FLOOR))
     assert shares_of_corner[0] < 0.3
     assert shares_of_corner[-1] > 0.7
+
+
+def with_blank_patch(image, first_column):
+    """Return the image with a patch of floor that has lost its texture."""
+    image = image.copy()
+    image[300:, first_column : first_column + 200] = 90
+    return image
+
+
+@pytest.mark.parametrize(
+    ('change', 'is_remembered'),
+    [
+        ({'scan_gap_m': 0.2}, True),
+        ({'step_height_m': 0.05}, True),
+        ({'step_height_m': 0.02}, False),
+        ({'drop_height_m': 0.02}, False),
+    ],
+)
+def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_remembered):
+    scene = Scene([floor_patch(), wall(3.0)])
+    left, right, _, _ = scene.render()
+    blank = with_blank_patch(left, 200), with_blank_patch(right, 150)
+    changed = dataclasses.replace(SETTINGS, **change)
+    stage = FloorSegmentation(scene.camera, SETTINGS)
+    for _ in range(3):
+        stage.process(left, right, scene.mount, np.eye(4))
+    stage.change_settings(changed)
+    found = stage.process(*blank, scene.mount, np.eye(4)).mask == FLOOR
+    anew = FloorSegmentation(scene.camera, changed)
+    alone = anew.process(*blank, scene.mount, np.eye(4)).mask == FLOOR
+    more = found.sum() - alone.sum()
+    assert (more > 1000) if is_remembered else (more == 0)

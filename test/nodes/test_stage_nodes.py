@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from node_messages import (
     pose_message_at,
     publish,
 )
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
@@ -225,6 +227,16 @@ class TestStereoSlam:
         graph.until(connected, 'the connection of odometry')
 
 
+def keyframe_messages(stamp_ns: int, left, right) -> dict:
+    """Return what `floor_segmentation` needs of one keyframe."""
+    messages = {'keyframe/odometry': pose_message_at(stamp_ns)}
+    for side, image in (('left', left), ('right', right)):
+        messages[f'keyframe/{side}/image_rect'] = image_message(stamp_ns, side, image)
+        info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
+        messages[f'keyframe/{side}/camera_info'] = info
+    return messages
+
+
 def test_floor_segmentation_is_the_stage(make_graph) -> None:
     frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
     expected = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(
@@ -233,12 +245,7 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
     graph = make_graph()
     masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_scan')
     graph.add(FloorSegmentationNode())
-    messages = {'keyframe/odometry': pose_message_at(STAMP_NS)}
-    for side in ('left', 'right'):
-        image = image_message(STAMP_NS, side, getattr(frame, side))
-        messages[f'keyframe/{side}/image_rect'] = image
-        info = camera_info_message(STAMP_NS, side, getattr(CALIBRATION, side))
-        messages[f'keyframe/{side}/camera_info'] = info
+    messages = keyframe_messages(STAMP_NS, frame.left, frame.right)
     mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
     publish(graph, {**messages, 'camera_mount': mount})
     graph.until(lambda: masks and scans, 'mask and scan')
@@ -248,6 +255,35 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
     assert scans[0].header.frame_id == 'base_link'
     np.testing.assert_array_equal(scan_arrays(scans[0], '').ranges_m, expected.scan.ranges_m)
     assert (expected.mask == 255).mean() > 0.1
+
+
+def test_a_changed_parameter_leaves_the_floor_its_memory(make_graph) -> None:
+    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
+    blank = [image.copy() for image in (frame.left, frame.right)]
+    for image in blank:
+        image[180:, 100:220] = 90
+    settings = FloorSegmentationSettings()
+    changed = replace(settings, scan_gap_m=0.3)
+    stage = FloorSegmentation(CAMERA, settings)
+    for _ in range(3):
+        stage.process(frame.left, frame.right, MOUNT, np.eye(4))
+    stage.change_settings(changed)
+    expected = stage.process(*blank, MOUNT, np.eye(4)).mask
+    anew = FloorSegmentation(CAMERA, changed).process(*blank, MOUNT, np.eye(4)).mask
+    assert (expected != anew).sum() > 100
+    graph = make_graph()
+    masks = graph.collect('keyframe/floor_mask')
+    node = graph.add(FloorSegmentationNode())
+    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
+    publishers = publish(graph, {'camera_mount': mount})
+    for i in range(3):
+        publish(graph, keyframe_messages(STAMP_NS + i, frame.left, frame.right), publishers)
+    graph.until(lambda: len(masks) == 3, 'three masks')
+    (result,) = node.set_parameters([Parameter('scan_gap_m', value=0.3)])
+    assert result.successful
+    publish(graph, keyframe_messages(STAMP_NS + 3, *blank), publishers)
+    graph.until(lambda: len(masks) == 4, 'the mask of the blank image')
+    np.testing.assert_array_equal(grey8_image(masks[3], ''), expected)
 
 
 def test_cloud_labelling_is_the_stage(make_graph) -> None:
