@@ -22,7 +22,10 @@ data_files = [
     ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
     (f'share/{PACKAGE}', ['package.xml']),
     (f'share/{PACKAGE}/launch_configs', files('launch_configs', '*.launch.py', '*.rviz', '*.json')),
-    (f'share/{PACKAGE}/params', files('params', '*.yaml', '*.xml')),
+    (
+        f'share/{PACKAGE}/params',
+        [*files('params', '*.yaml', '*.xml'), f'{PACKAGE}/nodes/fastdds.xml'],
+    ),
 ]
 if 'install' in sys.argv or 'develop' in sys.argv:
     # colcon runs these commands and puts every entry point under lib/<package>, for `ros2 run`;
@@ -39,7 +42,10 @@ setup(
     maintainer='Segfloor maintainers',
     maintainer_email='segfloor@example.org',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*']},
+    package_data={
+        f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*'],
+        f'{PACKAGE}.nodes': ['fastdds.xml'],
+    },
     data_files=data_files,
     python_requires='>=3.10',
     # colcon does not install these: on a ROS install rosdep brings the distribution's own packages,

@@ -131,8 +131,11 @@ def test_the_install_has_what_ros_looks_for(workspace) -> None:
     assert (share / 'segfloor_ros' / 'package.xml').exists()
     for folder in ('launch_configs', 'params'):
         names = {path.name for path in (REPOSITORY / folder).iterdir() if path.is_file()}
+        names |= {'fastdds.xml'} if folder == 'params' else set()
         assert {path.name for path in (share / 'segfloor_ros' / folder).iterdir()} == names
     assert os.access(prefix / 'bin' / 'segfloor', os.X_OK)
+    (profiles,) = prefix.glob('lib/python*/site-packages/segfloor_ros/nodes/fastdds.xml')
+    assert profiles.stat().st_size > 0
 
 
 def test_colcon_runs_the_tests(workspace) -> None:

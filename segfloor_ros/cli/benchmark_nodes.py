@@ -71,6 +71,7 @@ def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
     latency_ms = 1e3 * figures.latency_s
     rows = [
         ('frames sent, processed', f'{figures.frames_sent}, {figures.frames_processed}'),
+        ('frames skipped to stay up to date', f'{figures.frames_skipped}'),
         ('keyframes, in the map', f'{figures.keyframes}, {figures.mapped}'),
         ('frames per second', f'{figures.frames_processed / figures.wall_s:.1f}'),
         ('interrupt to all ended', f'{figures.shutdown_s:.2f} s'),
@@ -80,6 +81,10 @@ def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
         rows.append(('image to map, median and p95', f'{middle:.0f} ms, {high:.0f} ms'))
         early, late = (np.median(part) for part in _second_and_last_quarter(latency_ms))
         rows.append(('image to map, 2nd and last quarter', f'{early:.0f} ms, {late:.0f} ms'))
+    for node, duration_s in figures.steps_s.items():
+        if len(duration_s):
+            middle, high = 1e3 * np.percentile(duration_s, (50, 95))
+            rows.append((f'until {node} had done, median and p95', f'{middle:.0f}, {high:.0f} ms'))
     for column, (node, share) in enumerate(figures.cpu_share.items(), 1):
         rows.append((f'{node}: CPU', f'{100 * share:.0f} % of a core'))
         if len(figures.memory_mb):

@@ -26,7 +26,7 @@ from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.cli.replay_session import ProgressListener, ReplayGraph
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.memory import rss_mb
-from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Status, statuses
+from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, TOPICS
 
@@ -37,16 +37,19 @@ TICKS_PER_S = os.sysconf('SC_CLK_TCK')
 @dataclass(frozen=True)
 class NodeFigures:
     """latency_s: (K,) from a keyframe's images to the map that holds it, in the order of the
-    keyframes. cpu_share: seconds of CPU per second, by node. memory_mb: (T, 1 + nodes), the number
-    of frames so far and the resident memory of every node, over time.
+    keyframes. steps_s: (K,) the part of it until a node had done its work, since the node before
+    had, by node. cpu_share: seconds of CPU per second, by node. memory_mb: (T, 1 + nodes), the
+    number of frames so far and the resident memory of every node, over time.
     """
 
     frames_sent: int
     frames_processed: int
+    frames_skipped: int
     keyframes: int
     mapped: int
     wall_s: float
     latency_s: NDArray[np.float64]
+    steps_s: dict[str, NDArray[np.float64]]
     cpu_share: dict[str, float]
     memory_mb: NDArray[np.float64]
     shutdown_s: float
@@ -59,7 +62,7 @@ class FigureRecorder(ReplayRecorder):
         super().__init__(context, lambda: 0.0, None)
         self._processes = processes
         self._health: dict[str, Status] = {}
-        self._sent_s: dict[int, float] = {}
+        self._done_s: dict[str, dict[int, float]] = {node: {} for node in NODES}
         self._arrived_s: dict[int, float] = {}
         self.memory_rows: list[list[float]] = []
         topic = TOPICS['map']
@@ -68,22 +71,31 @@ class FigureRecorder(ReplayRecorder):
 
     def latency_s(self) -> NDArray[np.float64]:
         """Return the latency of every keyframe whose map came, in order."""
-        both = sorted(self._sent_s.keys() & self._arrived_s.keys())
-        return np.array([self._arrived_s[stamp] - self._sent_s[stamp] for stamp in both])
+        sent_s = self._done_s[CAMERA]
+        both = sorted(sent_s.keys() & self._arrived_s.keys())
+        return np.array([self._arrived_s[stamp] - sent_s[stamp] for stamp in both])
 
-    def processed(self, node: str) -> int:
-        """Return how much a node says to have processed: it knows best, also where this process
-        was too slow to hear it all.
+    def steps_s(self) -> dict[str, NDArray[np.float64]]:
+        """Return how long each node took since the one before had done, for every keyframe whose
+        map came, in order.
         """
-        return int(self._health[node].values['processed']) if node in self._health else 0
+        mapped = sorted(set(self._arrived_s).intersection(*self._done_s.values()))
+        done_s = np.array([[self._done_s[node][stamp] for stamp in mapped] for node in NODES])
+        return dict(zip(NODES[1:], np.diff(done_s, axis=0), strict=True))
+
+    def count(self, node: str, what: str) -> int:
+        """Return how much a node says to have `processed` or `skipped`: it knows best, also where
+        this process was too slow to hear it all.
+        """
+        return int(self._health[node].values[what]) if node in self._health else 0
 
     def _take_statuses(self, message: DiagnosticArray) -> None:
         self._health.update({s.node: s for s in statuses(message) if s.kind == HEALTH})
         super()._take_statuses(message)
 
     def _take_status(self, status: Status) -> None:
-        if status.node == CAMERA:
-            self._sent_s[status.stamp_ns] = time.monotonic()
+        if status.node in self._done_s and status.level is Level.OK:
+            self._done_s[status.node].setdefault(status.stamp_ns, time.monotonic())
         super()._take_status(status)
 
     def _take_map(self, message: OccupancyGrid) -> None:
@@ -146,11 +158,13 @@ def _follow(
     finished, path = recorder.finished, recorder.path
     return NodeFigures(
         frames_sent=int(finished.values['frames']) if finished is not None else 0,
-        frames_processed=recorder.processed(SLAM),
+        frames_processed=recorder.count(SLAM, 'processed'),
+        frames_skipped=recorder.count(SLAM, 'skipped'),
         keyframes=len(path.stamp_ns) if path is not None else 0,
-        mapped=recorder.processed(GRID),
+        mapped=recorder.count(GRID, 'processed'),
         wall_s=wall_s,
         latency_s=recorder.latency_s(),
+        steps_s=recorder.steps_s(),
         cpu_share={node: seconds / wall_s for node, seconds in spent_s.items()},
         memory_mb=np.array(recorder.memory_rows),
         shutdown_s=time.monotonic() - stop_s,

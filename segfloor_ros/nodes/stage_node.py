@@ -24,6 +24,7 @@ from segfloor_ros.node_settings import NodeSettings
 from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.kept_state import KeptState
 from segfloor_ros.nodes.managed_node import ManagedNode
+from segfloor_ros.nodes.middleware import prepare_middleware
 from segfloor_ros.nodes.parameters import NodeParameters
 from segfloor_ros.nodes.reporting_node import PATH, ReportingNode
 from segfloor_ros.settings import StageSettings
@@ -192,6 +193,7 @@ def run_nodes(make_nodes: Callable[[Executor], Sequence[ManagedNode]]) -> None:
     status = 0
     nodes: Sequence[ManagedNode] = ()
     try:
+        prepare_middleware()
         rclpy.init()
         executor = SingleThreadedExecutor()
         nodes = make_nodes(executor)

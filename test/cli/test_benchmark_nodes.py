@@ -48,10 +48,12 @@ def test_the_figures_are_of_the_quarters_after_the_first() -> None:
     figures = NodeFigures(
         frames_sent=20,
         frames_processed=18,
+        frames_skipped=2,
         keyframes=8,
         mapped=7,
         wall_s=2.0,
         latency_s=np.array([9.0, 9.0, 0.1, 0.3, 0.2, 0.2, 0.4, 0.6]),
+        steps_s={'a': np.array([0.3, 0.1, 0.2])},
         cpu_share={'a': 0.5},
         memory_mb=np.array([[0, 90.0], [5, 100.0], [10, 101.0], [20, 102.0]]),
         shutdown_s=0.5,
@@ -62,6 +64,8 @@ def test_the_figures_are_of_the_quarters_after_the_first() -> None:
     assert rows['frames per second'] == '9.0'
     assert rows['image to map, median and p95'] == '350 ms, 9000 ms'
     assert rows['image to map, 2nd and last quarter'] == '200 ms, 500 ms'
+    assert rows['until a had done, median and p95'] == '200, 290 ms'
+    assert rows['frames skipped to stay up to date'] == '2'
     assert rows['a: CPU'] == '50 % of a core'
     assert rows['a: memory, 2nd and last quarter'] == '100.0 MB, 102.0 MB'
 
