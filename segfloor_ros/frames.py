@@ -31,24 +31,35 @@ class FrameTree:
         self._fixed[child] = parent, T_parent_child
 
     def add_moving(self, stamp_ns: int, parent: str, child: str, T_parent_child: Array) -> None:
-        """Take in a transform at one time; one that comes late is passed over."""
+        """Take in a transform at one time; of several at the same time the first counts."""
         known = self._moving.get(child)
         if known is None or known[0] != parent or stamp_ns < known[1][-1] - MAX_DISORDER_NS:
             self._moving[child] = parent, [stamp_ns], [T_parent_child]
             return
         _, stamps, transforms = known
-        if stamp_ns <= stamps[-1]:
+        place = bisect_left(stamps, stamp_ns)
+        if stamps[place : place + 1] == [stamp_ns]:
             return
-        stamps.append(stamp_ns)
-        transforms.append(T_parent_child)
-        old = bisect_left(stamps, stamp_ns - HISTORY_NS)
+        stamps.insert(place, stamp_ns)
+        transforms.insert(place, T_parent_child)
+        old = bisect_left(stamps, stamps[-1] - HISTORY_NS)
         del stamps[:old], transforms[:old]
+
+    def forget_moving(self) -> None:
+        """Keep the fixed transforms alone."""
+        self._moving.clear()
 
     def root_of(self, frame: str) -> str:
         """Return the frame above all others of the tree that a frame is in; itself if unknown."""
         for ancestor, _ in self._upwards(frame, None):
             frame = ancestor
         return frame
+
+    def latest_ns(self, frame: str) -> int | None:
+        """Return up to when it is known where a frame is on its parent; None where that is not
+        known or always.
+        """
+        return self._moving[frame][1][-1] if frame in self._moving else None
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
         """Return T_target_source (4, 4) at a time, or from the latest transforms; None where the

@@ -48,11 +48,13 @@ def odometry_message(
     T_a_b: Array,
     covariance: Array,
     twist: Array | None = None,
+    twist_covariance: Array | None = None,
 ) -> Odometry:
     """Return the odometry of frame b in frame a.
 
     covariance: (6, 6), order x y z roll pitch yaw. twist: (6,) linear and angular velocity in
-    frame b, m/s and rad/s; None is marked as unknown by a large variance.
+    frame b, m/s and rad/s, with its covariance (6, 6); None is marked as unknown by a large
+    variance.
     """
     message = Odometry(header=make_header(stamp_ns, frame_id), child_frame_id=child_frame_id)
     message.pose.pose = pose_message(T_a_b)
@@ -64,12 +66,32 @@ def odometry_message(
         message.twist.twist = Twist(
             linear=Vector3(x=vx, y=vy, z=vz), angular=Vector3(x=wx, y=wy, z=wz)
         )
+        if twist_covariance is not None:
+            message.twist.covariance = np.ascontiguousarray(twist_covariance, np.float64).ravel()
     return message
 
 
 def body_twist(T_a_before: Array, T_a_now: Array, duration_s: float) -> Array:
     """Return the mean velocity (6,) between two poses in the moving frame: m/s, rad/s."""
     return se3_log(invert(T_a_before) @ T_a_now) / duration_s
+
+
+def twist_covariance(
+    covariance_before: Array, T_a_now: Array, covariance_now: Array, duration_s: float
+) -> Array:
+    """Return the covariance (6, 6) of the velocity between two poses, in the moving frame: what is
+    wrong with one has nothing to do with what is wrong with the other.
+
+    covariance_before, covariance_now: (6, 6) of the poses, in the axes of frame a.
+    """
+    axes = np.zeros((6, 6))
+    axes[:3, :3] = axes[3:, 3:] = T_a_now[:3, :3].T
+    return axes @ (covariance_before + covariance_now) @ axes.T / duration_s**2
+
+
+def at_least(covariance: Array, variance: float) -> Array:
+    """Return a covariance (6, 6) with a least variance: filters take a zero for certainty."""
+    return covariance + np.diag(np.maximum(variance - np.diag(covariance), 0.0))
 
 
 def path_message(stamp_ns: int, frame_id: str, path: KeyframePath) -> Path:

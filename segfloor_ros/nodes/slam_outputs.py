@@ -12,13 +12,18 @@ from segfloor_ros.messages.clouds import features_message, sparse_cloud_message
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.messages.path_bytes import path_bytes
 from segfloor_ros.messages.poses import (
+    at_least,
     body_twist,
     odometry_message,
     transform_message,
+    twist_covariance,
 )
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.stage_node import StageNode
 from segfloor_ros.slam.results import FrameResult, Keyframe
+
+LEAST_VARIANCE = 1e-6
+"""Of a millimetre and a milliradian, in m² and rad²: the first pose is the origin by definition."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +72,13 @@ class SlamOutputs:
         self._last = result
 
     def _publish_odometry(self, result: FrameResult) -> None:
-        last, twist = self._last, None
+        last, twist, of_twist = self._last, None, None
+        covariance = at_least(result.covariance, LEAST_VARIANCE)
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
             duration_s = (result.stamp_ns - last.stamp_ns) * 1e-9
             twist = body_twist(last.T_odom_base, result.T_odom_base, duration_s)
+            before = at_least(last.covariance, LEAST_VARIANCE)
+            of_twist = twist_covariance(before, result.T_odom_base, covariance, duration_s)
         own = self._own
         self._odometry.publish(
             odometry_message(
@@ -78,8 +86,9 @@ class SlamOutputs:
                 own.odom_frame,
                 own.base_frame,
                 result.T_odom_base,
-                result.covariance,
+                covariance,
                 twist,
+                of_twist,
             )
         )
 
@@ -100,7 +109,11 @@ class SlamOutputs:
             self._images[side].publish(image_message(stamp_ns, frame_id, image))
         self._pose.publish(
             odometry_message(
-                stamp_ns, own.map_frame, own.base_frame, keyframe.T_map_base, result.covariance
+                stamp_ns,
+                own.map_frame,
+                own.base_frame,
+                keyframe.T_map_base,
+                at_least(result.covariance, LEAST_VARIANCE),
             )
         )
         features = features_message(stamp_ns, own.map_frame, keyframe.features)

@@ -267,8 +267,9 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._announce_mount(int(result.keyframe.path.stamp_ns[0]), self._slam.mount)
         if self._mount is not None:
             self._resumption.keep(self._calibration.camera, self._mount, result)
-        self._outputs_of_slam.publish(result, self._calibration, self._frames)
+        # What a robot steers by comes first, the images of a keyframe later.
         self._transforms.broadcast(result)
+        self._outputs_of_slam.publish(result, self._calibration, self._frames)
         self.report_processed(
             result.stamp_ns,
             Level.OK if result.tracked else Level.ERROR,

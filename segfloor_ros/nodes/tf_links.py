@@ -28,6 +28,12 @@ class TfLink(Protocol):
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
         """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
 
+    def latest_ns(self, parent: str, child: str) -> int | None:
+        """Return up to when it is known where a moving frame is on its parent; None if never."""
+
+    def forget_moving(self) -> None:
+        """Forget where frames moved: time begins anew."""
+
     def root_of(self, frame: str) -> str:
         """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
 
@@ -74,6 +80,17 @@ class Tf2Ros:
             return transform_array(self._buffer.lookup_transform(target, source, time))
         except self._error:
             return None
+
+    def latest_ns(self, parent: str, child: str) -> int | None:
+        """Return up to when it is known where a moving frame is on its parent; None if never."""
+        try:
+            return to_ns(self._buffer.lookup_transform(parent, child, Time()).header.stamp) or None
+        except self._error:
+            return None
+
+    def forget_moving(self) -> None:
+        """Forget where frames moved: time begins anew. tf2 keeps the fixed ones."""
+        self._buffer.clear()
 
     def root_of(self, frame: str) -> str:
         """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
@@ -129,6 +146,14 @@ class TfMessages:
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
         """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
         return self._frames.lookup(target, source, stamp_ns)
+
+    def latest_ns(self, parent: str, child: str) -> int | None:
+        """Return up to when it is known where a moving frame is on its parent; None if never."""
+        return self._frames.latest_ns(child)
+
+    def forget_moving(self) -> None:
+        """Forget where frames moved: time begins anew."""
+        self._frames.forget_moving()
 
     def root_of(self, frame: str) -> str:
         """Return the topmost frame that a frame hangs on; itself where it hangs on none."""

@@ -21,7 +21,9 @@ class Transforms:
     """What SLAM broadcasts, and where tf has the camera's mount.
 
     With `publish_odom_tf` off another node owns odom → base_link, e.g. one that fuses the wheels'
-    odometry. map → odom is then what is between that node's base and SLAM's, at the same time.
+    odometry. map → odom is then what is between that node's base and SLAM's, at the same time; it
+    holds on until the next frame of the camera, up to the latest time that odometry has reached,
+    so that whoever looks up map → base_link finds it as fresh as the odometry.
     """
 
     def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
@@ -33,6 +35,7 @@ class Transforms:
         self._unsent_mount: tuple[int, str, Mount] | None = None
         self._uncorrected: deque[FrameResult] = deque(maxlen=MAX_UNCORRECTED)
         self._T_map_odom: Array | None = None
+        self._corrected_ns = 0
         self._is_fused = own.publish_tf and not own.publish_odom_tf
         if self._link is None:
             node.get_logger().info(
@@ -55,6 +58,9 @@ class Transforms:
         """Forget the map's place in odom."""
         self._uncorrected.clear()
         self._T_map_odom = None
+        self._corrected_ns = 0
+        if self._link is not None:
+            self._link.forget_moving()
 
     def mount_is_settled(self, camera_frame: str) -> bool:
         """Whether tf tells the mount of the left optical frame, or had time enough to."""
@@ -110,7 +116,8 @@ class Transforms:
         if self._link is None or not self._own.publish_tf:
             return
         if self._is_fused:
-            self._note(result)
+            if result.tracked:
+                self._uncorrected.append(result)
             self._correct()
         elif result.tracked:
             own, stamp_ns = self._own, result.stamp_ns
@@ -120,15 +127,21 @@ class Transforms:
             )
             self._link.send([transform_message(stamp_ns, *pair) for pair in pairs])
 
-    def _note(self, result: FrameResult) -> None:
-        if result.tracked:
-            self._uncorrected.append(result)
-        elif self._T_map_odom is not None:
-            # The other node's odometry goes on, from the last place that SLAM knew.
-            self._send_correction(result.stamp_ns, self._T_map_odom)
-
     def _correct(self) -> None:
-        """Broadcast the correction for the latest frame whose time tf has reached."""
+        """Broadcast the correction for the latest frame whose time tf has reached, and for what
+        the other node's odometry has reached since.
+        """
+        assert self._link is not None
+        self._correct_at_frame()
+        latest_ns = self._link.latest_ns(self._own.odom_frame, self._own.base_frame)
+        if (
+            self._T_map_odom is not None
+            and latest_ns is not None
+            and latest_ns > self._corrected_ns
+        ):
+            self._send_correction(latest_ns, self._T_map_odom)
+
+    def _correct_at_frame(self) -> None:
         assert self._link is not None
         odom, base = self._own.odom_frame, self._own.base_frame
         for result in reversed(self._uncorrected):
@@ -152,3 +165,4 @@ class Transforms:
         own = self._own
         message = transform_message(stamp_ns, own.map_frame, own.odom_frame, T_map_odom)
         self._link.send([message])
+        self._corrected_ns = max(stamp_ns, self._corrected_ns)

@@ -162,6 +162,24 @@ def test_the_velocity_is_in_the_moving_frame() -> None:
     )
 
 
+def test_the_covariance_of_the_velocity_is_that_of_both_poses_in_the_moving_frame() -> None:
+    left = make_transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.zeros(3))
+    before, now = np.diag([4.0, 1, 0, 0, 0, 1]), np.diag([12.0, 3, 0, 0, 0, 3])
+    found = poses.twist_covariance(before, left, now, 2.0)
+    # x of the frame points along y of the moving frame, with its sign turned; 2 s: a quarter.
+    np.testing.assert_allclose(found, np.diag([1.0, 4, 0, 0, 0, 1]), atol=1e-12)
+    message = poses.odometry_message(0, 'odom', 'base_link', left, now, np.ones(6), found)
+    np.testing.assert_allclose(over_the_wire(message).twist.covariance.reshape(6, 6), found)
+
+
+def test_no_variance_is_below_the_least_one() -> None:
+    covariance = np.diag([0.0, 1e-9, 2.0, 0, 0, 0])
+    covariance[0, 2] = covariance[2, 0] = 1e-12
+    expected = np.diag([1e-6, 1e-6, 2.0, 1e-6, 1e-6, 1e-6])
+    expected[0, 2] = expected[2, 0] = 1e-12
+    np.testing.assert_allclose(poses.at_least(covariance, 1e-6), expected, rtol=1e-12)
+
+
 def test_impossible_poses_are_refused() -> None:
     pose = poses.pose_message(np.eye(4))
     pose.position.x = float('nan')

@@ -158,6 +158,10 @@ class TestStereoSlam:
             assert np.linalg.norm(error) < 0.02, frame.index
             assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
         assert received['odometry'][-1].twist.twist.linear.x == pytest.approx(0.6, abs=0.05)
+        for message in received['odometry']:
+            for covariance in (message.pose.covariance, message.twist.covariance):
+                assert (np.diag(np.reshape(covariance, (6, 6))) > 0).all()
+        assert 0 < received['odometry'][-1].twist.covariance[0] < 0.1
         path = path_arrays(received['keyframe/path'][-1])
         assert path.stamp_ns.tolist() == keyframes
         np.testing.assert_array_equal(

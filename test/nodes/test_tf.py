@@ -218,9 +218,18 @@ def test_odometry_of_another_node_is_corrected(start, drive) -> None:
             chain.graph.until(lambda: stamp_ns in tf.stamps('odom'), 'the correction')  # noqa: B023
     own = [m for m in tf.moving if m.header.frame_id == 'map']
     assert {m.child_frame_id for m in own} == {'odom'}
-    for message in own:
+    by_stamp = {frame.stamp_ns: frame for frame in frames}
+    at_frames = [m for m in own if to_ns(m.header.stamp) in by_stamp]
+    assert len(at_frames) >= len(frames) - 1
+    for message in at_frames:
         stamp_ns = to_ns(message.header.stamp)
-        frame = frames[round(stamp_ns / 1e8)]
+        frame = by_stamp[stamp_ns]
         T_map_base = transform_array(message) @ tf.frames.lookup('odom', 'base_link', stamp_ns)
         expected = invert(truth[0]) @ truth[frame.index]
         np.testing.assert_allclose(T_map_base, expected, atol=0.02)
+    # The camera is silent, the other odometry goes on: map -> odom stays as it was, and fresh.
+    last = transform_array(own[-1])
+    latest_ns = frames[-1].stamp_ns + 400_000_000
+    others[0].send(latest_ns, 'odom', 'base_link', T_odom_base[max(T_odom_base)])
+    chain.graph.until(lambda: latest_ns in tf.stamps('odom'), 'the correction without a frame')
+    np.testing.assert_allclose(tf.frames.lookup('map', 'odom', latest_ns), last, atol=1e-12)
