@@ -3,10 +3,15 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
+MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -38,6 +43,11 @@ def generate_launch_description() -> LaunchDescription:
                 description='Run all nodes in one process, for small machines: true or false.',
             ),
             DeclareLaunchArgument(
+                'log_level',
+                default_value='info',
+                description='What the nodes log: debug, info, warn, error or fatal.',
+            ),
+            DeclareLaunchArgument(
                 'rviz', default_value='false', description='Show the map in RViz: true or false.'
             ),
             IncludeLaunchDescription(
@@ -46,6 +56,7 @@ def generate_launch_description() -> LaunchDescription:
                     'namespace': LaunchConfiguration('namespace'),
                     'params_file': LaunchConfiguration('params_file'),
                     'composed': LaunchConfiguration('composed'),
+                    'log_level': LaunchConfiguration('log_level'),
                     'rviz': LaunchConfiguration('rviz'),
                     'camera': 'false',
                     'use_sim_time': 'true',
@@ -57,6 +68,13 @@ def generate_launch_description() -> LaunchDescription:
                     *('--clock', '--rate', LaunchConfiguration('rate')),
                     *('--delay', LaunchConfiguration('delay')),
                 ],
+                # Unless the user has named another file; what it is for stands in this one.
+                additional_env={
+                    MIDDLEWARE: EnvironmentVariable(
+                        MIDDLEWARE,
+                        default_value=PathJoinSubstitution([share, 'params', 'fastdds.xml']),
+                    )
+                },
                 output='screen',
             ),
         ]

@@ -10,6 +10,7 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
 STAGES = ('stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+RESPAWN_DELAY_S = 2.0
 YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
 
@@ -55,6 +56,23 @@ def generate_launch_description() -> LaunchDescription:
                 'wait for a lifecycle manager.',
             ),
             DeclareLaunchArgument(
+                'respawn',
+                default_value='false',
+                description='Start a node again that has died: true or false. It goes on with what '
+                'it knew.',
+            ),
+            DeclareLaunchArgument(
+                'namespaced_tf',
+                default_value='false',
+                description='Take /tf and /tf_static into the namespace, as Nav2 does for several '
+                'robots: true or false.',
+            ),
+            DeclareLaunchArgument(
+                'log_level',
+                default_value='info',
+                description='What the nodes log: debug, info, warn, error or fatal.',
+            ),
+            DeclareLaunchArgument(
                 'rviz', default_value='false', description='Show the map in RViz: true or false.'
             ),
             DeclareLaunchArgument(
@@ -74,8 +92,12 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     composed = truth('composed', LaunchConfiguration('composed').perform(context))
     autostart = truth('autostart', LaunchConfiguration('autostart').perform(context))
     sim_time = truth('use_sim_time', LaunchConfiguration('use_sim_time').perform(context))
+    respawn = truth('respawn', LaunchConfiguration('respawn').perform(context))
+    own_tf = truth('namespaced_tf', LaunchConfiguration('namespaced_tf').perform(context))
+    log_level = LaunchConfiguration('log_level').perform(context)
     with_camera = bool(source) if camera.lower() == 'auto' else truth('camera', camera)
     with_rviz = truth('rviz', LaunchConfiguration('rviz').perform(context))
+    remappings = [('/tf', 'tf'), ('/tf_static', 'tf_static')] if own_tf else []
 
     def node(executable: str, *arguments: str, name: str | None = None) -> Node:
         # Plain command-line parameters win over every section of the file.
@@ -85,7 +107,13 @@ def make_nodes(context: LaunchContext) -> list[Node]:
             name=name,
             namespace=LaunchConfiguration('namespace'),
             parameters=[LaunchConfiguration('params_file'), {'use_sim_time': sim_time}],
-            ros_arguments=['-p', f'autostart:={str(autostart).lower()}', *arguments],
+            remappings=remappings,
+            ros_arguments=[
+                *('--log-level', log_level),
+                *('-p', f'autostart:={str(autostart).lower()}', *arguments),
+            ],
+            respawn=respawn,
+            respawn_delay=RESPAWN_DELAY_S,
             output='screen',
         )
 
@@ -96,10 +124,10 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     else:
         nodes = [node('stereo_camera', *given, name='stereo_camera')] if with_camera else []
         nodes += [node(stage, name=stage) for stage in STAGES]
-    return [*nodes, rviz(sim_time)] if with_rviz else nodes
+    return [*nodes, rviz(sim_time, remappings)] if with_rviz else nodes
 
 
-def rviz(sim_time: bool) -> Node:
+def rviz(sim_time: bool, remappings: list[tuple[str, str]]) -> Node:
     """Return RViz with the package's layout."""
     return Node(
         package='rviz2',
@@ -107,6 +135,7 @@ def rviz(sim_time: bool) -> Node:
         namespace=LaunchConfiguration('namespace'),
         arguments=['-d', LaunchConfiguration('rviz_config')],
         parameters=[{'use_sim_time': sim_time}],
+        remappings=remappings,
         output='screen',
     )
 
