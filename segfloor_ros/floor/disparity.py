@@ -1,11 +1,13 @@
 """Disparity by semi-global matching.
 
 Hirschmüller, Stereo Processing by Semiglobal Matching and Mutual Information (2008); OpenCV's
-block variant with three path directions.
+block variant with three path directions. What is near is matched at half the resolution: there
+disparities are large, and an error of twice as many pixels is still a small share of them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import cv2
@@ -22,6 +24,11 @@ _STEP = 16
 _SAME_GAIN = 0.08
 _SAME_MEAN_GREY = 8.0
 """Within this the two cameras are exposed alike; what they see differs anyway."""
+_COARSE_BLOCK_PX = 3
+_OVERLAP_PX = 4
+"""So near to the end of its range the fine match leaves what is nearer to the coarse one."""
+_RUN_OUT_ROWS = 8
+"""The matcher's blocks and paths reach beyond the last fine row."""
 
 
 def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.15) -> int:
@@ -88,4 +95,56 @@ class DisparityMatcher:
         # A match outside the right image is a match with the padding.
         columns = np.arange(disparity.shape[1], dtype=np.float32)
         disparity[disparity > columns + 0.5] = 0
+        return disparity
+
+
+class TwoScaleMatcher:
+    """Matches far floor at full resolution and all else at half of it.
+
+    num_disparities: searched, a multiple of 16; one more step of 16 where it takes two scales.
+    """
+
+    def __init__(self, num_disparities: int, settings: FloorSegmentationSettings) -> None:
+        fine = -(-math.ceil(settings.coarse_above_px) // _STEP) * _STEP + _STEP
+        self._coarse: DisparityMatcher | None = None
+        self.num_disparities = num_disparities
+        if fine < num_disparities:
+            coarse = dataclasses.replace(
+                settings,
+                block_size_px=_COARSE_BLOCK_PX,
+                speckle_size_px=settings.speckle_size_px // 4,
+            )
+            self._coarse = DisparityMatcher(-(-num_disparities // (2 * _STEP)) * _STEP, coarse)
+            self.num_disparities = 2 * self._coarse.num_disparities
+        self._fine = DisparityMatcher(min(fine, num_disparities), settings)
+
+    def compute(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], fine_rows: int
+    ) -> NDArray[np.float32]:
+        """Return the disparities (H, W) float32 in pixels of a rectified pair (H, W) uint8, 0 where
+        there is no match.
+
+        fine_rows: so many rows at the top are matched at full resolution, unless what they show is
+        too near for that.
+        """
+        if self._coarse is None:
+            return self._fine.compute(left, right)
+        height, width = (size // 2 for size in left.shape)
+        halves = [
+            cv2.resize(
+                image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA
+            )
+            for image in (left, right)
+        ]
+        disparity = np.zeros(left.shape, np.float32)
+        disparity[: 2 * height, : 2 * width] = cv2.resize(
+            2 * self._coarse.compute(halves[0], halves[1]),
+            (2 * width, 2 * height),
+            interpolation=cv2.INTER_NEAREST,
+        )
+        part = slice(0, fine_rows + _RUN_OUT_ROWS)
+        far = self._fine.compute(left[part], right[part])[:fine_rows]
+        near = disparity[:fine_rows]
+        too_near = near > self._fine.num_disparities - _OVERLAP_PX
+        disparity[:fine_rows] = np.where(too_near, near, far)
         return disparity

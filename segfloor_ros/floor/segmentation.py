@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
+from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, equal_exposure
 from segfloor_ros.floor.evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.filling import (
     drop_islands,
@@ -56,7 +56,7 @@ class FloorSegmentation:
         self._settings = settings
         self._memory = FloorMemory()
         self._mount: Mount | None = None
-        self._matcher: DisparityMatcher
+        self._matcher: TwoScaleMatcher
         self._overhead: OverheadMatcher
         self._scanner: FloorScanner
 
@@ -130,7 +130,7 @@ class FloorSegmentation:
 
     def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)
-        self._matcher = DisparityMatcher(-(-searched // 16) * 16, self._settings)
+        self._matcher = TwoScaleMatcher(-(-searched // 16) * 16, self._settings)
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
@@ -157,9 +157,15 @@ class FloorSegmentation:
     def _disparity(
         self, first_row: int, left: NDArray[np.uint8], right: NDArray[np.uint8]
     ) -> NDArray[np.float32]:
-        top = 0 if self._settings.disparity_above_horizon else first_row
+        settings, camera = self._settings, self._camera
+        top = 0 if settings.disparity_above_horizon else first_row
+        assert self._mount is not None
+        line = FloorLine.of(camera, self._mount)
+        shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
+        last_fine = line.horizon + settings.coarse_above_px / line.slope + shear
+        fine_rows = int(np.clip(last_fine - top, _ROWS_ABOVE_HORIZON, camera.height - top))
         disparity = np.zeros(left.shape, np.float32)
-        disparity[top:] = self._matcher.compute(left[top:], right[top:])
+        disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
         return disparity
 
     def _plane(

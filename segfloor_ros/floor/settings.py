@@ -58,6 +58,13 @@ class FloorSegmentationSettings(StageSettings):
         minimum=0,
         maximum=512,
     )
+    coarse_above_px: float = setting(
+        32.0,
+        'Where the floor has a larger disparity, images are matched at half the resolution.',
+        unit='px',
+        minimum=8.0,
+        maximum=512.0,
+    )
     block_size_px: int = setting(
         5, 'Side of the block that is matched, odd.', unit='px', minimum=3, maximum=15
     )
