@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,13 +93,15 @@ class Mount:
     left_m: float = 0.0
     yaw_rad: float = 0.0
 
-    @property
+    @cached_property
     def T_base_left(self) -> Array:
-        """The pose (4, 4) of the left optical frame in the base frame."""
+        """The pose (4, 4) of the left optical frame in the base frame; not to be written to."""
         angles = [self.yaw_rad, self.pitch_rad, self.roll_rad]
         R_base_camera = Rotation.from_euler('ZYX', angles).as_matrix()
         translation = np.array([self.forward_m, self.left_m, self.height_m])
-        return make_transform(R_base_camera @ R_ROS_OPTICAL, translation)
+        T_base_left = make_transform(R_base_camera @ R_ROS_OPTICAL, translation)
+        T_base_left.flags.writeable = False
+        return T_base_left
 
     @classmethod
     def from_transform(cls, T_base_left: Array) -> Mount:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
-from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
@@ -29,7 +28,6 @@ _BEHIND = 0.6
 
 def fill_to_contact(
     view: FloorView,
-    profile: FloorProfile,
     mask: NDArray[np.uint8],
     alike: NDArray[np.bool_],
     disparity: NDArray[np.float32],
@@ -44,7 +42,7 @@ def fill_to_contact(
     small = mask[part]
     open_ = alike & (small == NO_EVIDENCE)
     upright_px = _upright_above(disparity[part], ~compared.consistent[part] | compared.denied[part])
-    floor_px = profile.at_pixels(view.derolled[part])
+    floor_px = compared.floor_px
     nearest, farthest = floor_px + np.float32(_TOLERANCE_PX), np.float32(_BEHIND) * floor_px
     contact = (upright_px < nearest) & (upright_px > farthest - np.float32(_TOLERANCE_PX))
     rows = np.arange(small.shape[0], dtype=np.int32)[:, None]

@@ -24,13 +24,15 @@ _CONTACT_HEIGHT_M = 0.12
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the images say of each pixel of a view, (R, W) bool.
+    """What the images say of each pixel of a view, (R, W) bool where not said otherwise.
 
+    floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
     against: clearly more like the matched disparity than like floor. denied: the same of the
     surroundings taken together. unlike: unlike floor, whatever it is. distinct: like floor, and
     less so a little off the floor. consistent: may be floor.
     """
 
+    floor_px: NDArray[np.float32]
     against: NDArray[np.bool_]
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
@@ -40,10 +42,12 @@ class Comparison:
 
 @dataclass(frozen=True)
 class HeightTable:
-    """Per disparity step: height above the floor is `offset - scale * derolled row`, in metres;
-    up, down: how much of it is still floor. All (B,) float32, NaN at disparity 0.
+    """Per disparity step: row: the de-rolled row of the floor. Height above the floor is
+    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor. All (B,)
+    float32, NaN at disparity 0.
     """
 
+    row: NDArray[np.float32]
     offset: NDArray[np.float32]
     scale: NDArray[np.float32]
     up: NDArray[np.float32]
@@ -63,8 +67,10 @@ class HeightTable:
         scale = line.metres_per_row / disparity
         # One pixel of disparity is this much height: the camera's height over the disparity.
         noise_m = settings.disparity_noise_px * line.metres_per_row / line.slope / disparity
+        row = profile.row_of_disparity(disparity)
         tables = (
-            scale * profile.row_of_disparity(disparity),
+            row,
+            scale * row,
             scale,
             np.hypot(settings.step_height_m, noise_m),
             settings.drop_height_m + 2 * noise_m,
@@ -94,43 +100,47 @@ def judge(
     textured: where a disparity means something; compared: what the images say of the floor. A
     disparity makes floor only where the images agree, and denies it only where they do.
     """
-    index = (disparity * SUBPIXEL).astype(np.intp)
-    height = table.offset[index] - table.scale[index] * view.derolled
-    above = height > table.up[index]
-    off = above | (height < -table.down[index])
+    index = (disparity * np.float32(SUBPIXEL)).astype(np.int32)
+    height = table.offset.take(index) - table.scale.take(index) * view.derolled
+    up = table.up.take(index)
+    above = height > up
+    off = above | (height < -table.down.take(index))
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
     near = disparity >= np.float32(settings.min_disparity_px)
     # On a sill the images contradict the floor, and show that it is a sill.
     sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))
-    sill &= table.up[index] < np.float32(_SURE_SHARE * settings.step_height_m)
+    sill &= up < np.float32(_SURE_SHARE * settings.step_height_m)
     floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
     mask[floor | compared.distinct] = FLOOR
     mask[off & sure] = NOT_FLOOR
-    low = above & sure & (height < table.up[index] + np.float32(_CONTACT_HEIGHT_M))
-    mask[_below_contact(view, profile, disparity, low)] = NOT_FLOOR
+    low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
+    mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
     return Evidence(mask, height)
 
 
 def _below_contact(
     view: FloorView,
-    profile: FloorProfile,
-    disparity: NDArray[np.float32],
+    floor_row: NDArray[np.float32],
+    index: NDArray[np.int32],
     low: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Return the pixels between the foot of an upright surface and where it meets the floor.
 
     They are lower than a step but belong to the same surface: its disparity says at which row
-    the floor is.
+    the floor is. floor_row: by disparity step. index: (R, W) disparity steps.
     """
-    rows, columns = np.nonzero(low)
-    foot = profile.row_of_disparity(disparity[rows, columns])
-    foot -= view.shear_px[columns] + view.first_row
     height, width = low.shape
-    end = np.clip(np.floor(foot), rows, height - 1).astype(np.intp) + 1
+    at = np.flatnonzero(low)
+    foot = floor_row.take(index.reshape(-1).take(at))
+    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
+    foot -= view.shear_px.take(columns) + np.float32(view.first_row)
+    end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
     size = (height + 1) * width
-    change = np.bincount(rows * width + columns, minlength=size)
-    change -= np.bincount(end * width + columns, minlength=size)
-    return np.cumsum(change.reshape(height + 1, width), axis=0)[:height] >= 2
+    covered = np.zeros((height + 1, width), np.int16)
+    covered[:height] = low
+    ends = np.bincount(end * np.int32(width) + columns, minlength=size)
+    covered -= ends.reshape(-1, width).astype(np.int16)
+    return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2

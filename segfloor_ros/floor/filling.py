@@ -10,6 +10,7 @@ from segfloor_ros.floor.contact import fill_to_contact
 from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorProfile
+from segfloor_ros.floor.runs import Runs, pixels_where
 from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
@@ -30,7 +31,6 @@ def fill_regions(
     view: FloorView,
     mask: NDArray[np.uint8],
     image: NDArray[np.uint8],
-    profile: FloorProfile,
     disparity: NDArray[np.float32],
     compared: Comparison,
     textured: NDArray[np.bool_],
@@ -39,11 +39,10 @@ def fill_regions(
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    image: whole image rows (R, image width). consistent: (R, W), where the images do not
-    contradict the floor. A region is bounded by edges of the image stronger than most of the
-    floor's own; floor by evidence must be in `min_share` of its columns. In it a pixel becomes
-    floor below floor, the next evidence up its column; or between floor on its left and right;
-    or, if it is not blank, nearer than any of its floor.
+    image: whole image rows (R, image width). A region is bounded by edges of the image stronger
+    than most of the floor's own; floor by evidence must be in `min_share` of its columns. In it a
+    pixel becomes floor below floor, the next evidence up its column; or between floor on its left
+    and right; or, if it is not blank, nearer than any of its floor.
     """
     part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
     small = mask[part]
@@ -51,7 +50,8 @@ def fill_regions(
     if np.count_nonzero(floor) < _MIN_REGION_PX:
         return mask
     slope = _slope(image)
-    limit = max(_MIN_SLOPE, float(np.percentile(slope[floor][::7], 90)))
+    own = slope.take(np.flatnonzero(floor)[::7])
+    limit = max(_MIN_SLOPE, float(np.percentile(own, 90)))
     alike = (small != NOT_FLOOR) & compared.consistent[part] & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
@@ -64,11 +64,12 @@ def fill_regions(
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
     nearer = (rows >= highest) & (not_blank > 0)
-    fill = inside & (nearer | _under_floor(small) | _between_floor(small))
-    mask = _with_floor(mask, fill)
+    fill = inside & (nearer | _next_to_floor(small))
+    mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     plain = compared.consistent[part] & ~compared.denied[part] & (slope < _STRONG_SLOPE)
-    return _with_floor(mask, fill_to_contact(view, profile, mask, plain, disparity, compared))
+    to_contact = fill_to_contact(view, mask, plain, disparity, compared)
+    return with_floor(mask, _enlarged(to_contact, mask))
 
 
 def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -86,46 +87,51 @@ def _top_of_supported(
     too little.
     """
     height, width = region.shape
-    rows, columns = np.nonzero(floor)
-    owner = region[rows, columns]
-    has_floor = np.zeros((count, width), np.bool_)
-    has_floor[owner, columns] = True
-    extent = np.zeros((count, width), np.bool_)
-    extent[region, np.arange(width)] = True
-    wide = has_floor.sum(axis=1) >= min_share * extent.sum(axis=1)
-    good = wide & (np.bincount(owner, minlength=count) >= _MIN_REGION_PX)
-    good[0] = False
+    rows, columns = pixels_where(floor)
+    owner: NDArray[np.intp] = region[rows, columns].astype(np.intp)
+    large = np.flatnonzero(np.bincount(owner, minlength=count) >= _MIN_REGION_PX)
+    large = large[large > 0]
+    number = np.zeros(count, np.intp)
+    number[large] = np.arange(1, len(large) + 1)
+    owner = number[owner]
+
+    def columns_of(owner: NDArray[np.intp], columns: NDArray[np.int32]) -> NDArray[np.intp]:
+        cells = np.bincount(owner * width + columns, minlength=(len(large) + 1) * width)
+        return np.count_nonzero(cells.reshape(-1, width), axis=1)
+
+    extent = columns_of(
+        number[region].reshape(-1), np.tile(np.arange(width, dtype=np.int32), height)
+    )
+    wide = columns_of(owner, columns) >= min_share * extent
+    first = np.full(len(large) + 1, height, np.intp)
+    first[owner[::-1]] = rows[::-1]  # the topmost comes last
     top = np.full(count, height, np.intp)
-    np.minimum.at(top, owner, rows)
-    top[~good] = height
+    top[large] = np.where(wide, first, height)[1:]
     return top
 
 
-def _under_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell where the next evidence up the column is floor."""
-    return _last_known(mask) == FLOOR
+def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of NO_EVIDENCE where the next evidence up the column is floor, or that to the left and
+    that to the right.
+    """
+    nothing = mask == NO_EVIDENCE
+    across, turned = Runs.of(nothing), np.ascontiguousarray(mask.T)
+    between = across.before(mask, NO_EVIDENCE) == FLOOR
+    between &= across.after(mask, NO_EVIDENCE) == FLOOR
+    down = Runs.of(turned == NO_EVIDENCE)
+    under = down.painted(down.before(turned, NO_EVIDENCE) == FLOOR)
+    return across.painted(between) | under.T
 
 
-def _between_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell where the next evidence to the left and to the right is floor."""
-    left = _last_known(mask.T).T
-    right = _last_known(mask[:, ::-1].T).T[:, ::-1]
-    return (left == FLOOR) & (right == FLOOR)
+def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the mask (R, W) with floor where nothing is known and `where` (R, W) is set."""
+    change = (mask == NO_EVIDENCE) & where
+    return mask ^ (change.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
 
 
-def _last_known(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return per pixel the last evidence at or before it, down its column."""
-    rows = np.arange(mask.shape[0], dtype=np.int32)[:, None]
-    last = np.maximum.accumulate(np.where(mask != NO_EVIDENCE, rows, 0), axis=0)
-    return np.take_along_axis(mask, last, axis=0)
-
-
-def _with_floor(mask: NDArray[np.uint8], fill: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     size = (mask.shape[1], mask.shape[0])
-    grown = cv2.resize(fill.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    filled = mask.copy()
-    filled[(grown > 0) & (mask == NO_EVIDENCE)] = FLOOR
-    return filled
+    return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def fill_gaps(
@@ -141,17 +147,13 @@ def fill_gaps(
     height, width = mask.shape
     disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
     longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
-    known = mask != NO_EVIDENCE
-    columns = np.arange(width, dtype=np.int32)
-    left = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
-    right = np.minimum.accumulate(np.where(known, columns, width - 1)[:, ::-1], axis=1)[:, ::-1]
-    first, last = np.take_along_axis(mask, left, axis=1), np.take_along_axis(mask, right, axis=1)
+    gaps = Runs.of(mask == NO_EVIDENCE)
     # The matcher leaves out some columns at the right border.
-    at_border = (right == width - 1) & (width - 1 - left <= _BORDER_PX // view.step)
-    between = (first == FLOOR) & ((last == FLOOR) | (at_border & (last == NO_EVIDENCE)))
-    filled = mask.copy()
-    filled[~known & consistent & between & (right - left <= longest[:, None])] = FLOOR
-    return filled
+    at_border = (gaps.stop == width) & (width - gaps.first <= _BORDER_PX // view.step)
+    between = gaps.before(mask, NO_EVIDENCE) == FLOOR
+    between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
+    across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
+    return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
 
 
 def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]:
@@ -162,12 +164,11 @@ def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]
     if count < 3:
         return mask
     area = stats[:, cv2.CC_STAT_AREA]
-    lone = (area < min_share * area[1:].max())[label]
-    size = (mask.shape[1], mask.shape[0])
-    grown = cv2.resize(lone.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    kept = mask.copy()
-    kept[(grown > 0) & (mask == FLOOR)] = NO_EVIDENCE
-    return kept
+    is_lone = area < min_share * area[1:].max()
+    if not is_lone.any():
+        return mask
+    lone = _enlarged(is_lone[label], mask) & (mask == FLOOR)
+    return mask ^ (lone.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
 
 
 def trim_to_edges(

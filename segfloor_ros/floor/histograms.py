@@ -84,8 +84,8 @@ def filtered_v_disparity(
     """
     camera = view.camera
     # Half of the columns tell as much.
-    disparity, textured, derolled = disparity[:, ::2], textured[:, ::2], view.derolled[:, ::2]
-    bins = (disparity + 0.5).astype(np.intp)
+    disparity = np.ascontiguousarray(disparity[:, ::2])
+    bins = (disparity + np.float32(0.5)).astype(np.intp)
     num = num_disparities + 1
     limit = obstacle_rows(
         np.arange(num),
@@ -94,10 +94,17 @@ def filtered_v_disparity(
         1 / view.line.slope,
     )
     upright = u_disparity(bins, num) > limit[:, None]
-    keep = (disparity > 0) & textured & ~upright[bins, np.arange(bins.shape[1])]
-    keep &= rising(disparity, view.line.slope)
-    first, last = math.floor(float(derolled.min())), math.ceil(float(derolled.max()))
-    rows = (derolled[keep] - np.float32(first - 0.5)).astype(np.intp)
-    fine = (disparity[keep] * bins_per_px + 0.5).astype(np.intp)
+    width = bins.shape[1]
+    keep = (disparity > 0) & textured[:, ::2] & rising(disparity, view.line.slope)
+    keep &= ~upright.take(bins * width + np.arange(width))
+    at = np.flatnonzero(keep)
+    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
+    derolled = view.derolled[:, 0].take(rows) + (view.shear_px[::2] - view.shear_px[0]).take(
+        columns
+    )
+    first = math.floor(float(view.derolled.min()))
+    last = math.ceil(float(view.derolled.max()))
+    rows = (derolled - np.float32(first - 0.5)).astype(np.intp)
+    fine = (disparity.take(at) * np.float32(bins_per_px) + np.float32(0.5)).astype(np.intp)
     counts = v_disparity(rows, fine, (last - first + 1, num * bins_per_px))
     return counts * (2 * view.step), first

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.view import FloorView
 from segfloor_ros.geometry import Array
 
@@ -19,6 +20,8 @@ _REACH_M = 4.0
 _MOST_VOTES = 6
 _ENOUGH_VOTES = 2
 _BLOCKED = -2
+_SWING = 0.15
+"""So far, as a share of the focal length, the robot's pitch and roll may move the picture."""
 
 
 class FloorMemory:
@@ -27,14 +30,14 @@ class FloorMemory:
     def __init__(self) -> None:
         self._votes = np.zeros((_SIZE, _SIZE), np.int8)
         self._corner = np.full(2, -_SIZE // 2, np.int32)
-        self._around = _cells_around()
+        self._around: NDArray[np.float32] | None = None
 
     def fill(
         self, view: FloorView, mask: NDArray[np.uint8], T_map_base: Array
     ) -> NDArray[np.uint8]:
         """Return the mask (R, W) with floor where nothing is seen now and floor was before."""
         nearest_row = _first_row_within_reach(view)
-        rows, columns = np.nonzero(mask[nearest_row:] == NO_EVIDENCE)
+        rows, columns = pixels_where(mask[nearest_row:] == NO_EVIDENCE)
         rows += nearest_row
         xy = view.floor_positions(rows, columns)
         index, inside = self._index(_in_map(T_map_base, xy))
@@ -53,6 +56,8 @@ class FloorMemory:
         """Note the cells that are floor in the mask (R, W), and points (2, N) that stand up."""
         self._follow(T_map_base[:2, 3])
         votes = self._votes.reshape(-1)
+        if self._around is None:
+            self._around = _cells_in_sight(view)
         seen = _floor_at(mask, view.pixels_of_floor(self._around))
         index, inside = self._index(_in_map(T_map_base, self._around[:, seen]))
         index = index[inside]
@@ -88,12 +93,19 @@ class FloorMemory:
         self._votes, self._corner = moved, wanted
 
 
-def _cells_around() -> NDArray[np.float32]:
-    """Return the centres (2, N) of the cells within reach ahead, relative to the robot."""
+def _cells_in_sight(view: FloorView) -> NDArray[np.float32]:
+    """Return the centres (2, N) of the cells within reach that the camera sees, relative to the
+    robot; also those that it sees when the robot swings.
+    """
     steps = np.arange(-_REACH_M, _REACH_M, CELL_M, dtype=np.float32) + np.float32(CELL_M / 2)
     x, y = np.meshgrid(steps, steps, indexing='ij')
     near = np.hypot(x, y) < _REACH_M
-    return np.stack([x[near], y[near]])
+    cells = np.stack([x[near], y[near]])
+    row, column = view.pixels_of_floor(cells)
+    (rows, columns), swing = view.derolled.shape, _SWING * view.camera.fx
+    in_sight = (row > -swing) & (row < rows + swing)
+    in_sight &= (column > -swing) & (column < columns + swing)
+    return cells[:, in_sight]
 
 
 def _first_row_within_reach(view: FloorView) -> int:

@@ -46,8 +46,8 @@ def compare(
     """
     part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
     sampled = left[::_STEP_PX, ::_STEP_PX]
-    rows, columns = np.mgrid[0 : left.shape[0] : _STEP_PX, 0 : left.shape[1] : _STEP_PX]
-    rows, columns = rows.astype(np.float32), columns.astype(np.float32)
+    steps = (np.arange(0, size, _STEP_PX, dtype=np.float32) for size in left.shape)
+    rows, columns = np.meshgrid(*steps, indexing='ij')
     floor_px = profile.at_pixels(view.derolled[part])
     matched_px = disparity[part]
 
@@ -74,7 +74,7 @@ def compare(
     distinct = closer & reached & ~against & ~unlike
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), distinct, ~(contrary & reached))
-    return Comparison(*(_enlarged(mask, disparity.shape) for mask in masks))
+    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

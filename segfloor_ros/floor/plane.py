@@ -201,9 +201,13 @@ def refine(
 
 def _jacobian(angles_height: Array) -> Array:
     """Return dm / d(pitch, roll, height) (3, 3)."""
-    step = 1e-6
-    offsets = step * np.eye(3)
-    return ((plane_of(angles_height + offsets) - plane_of(angles_height - offsets)) / (2 * step)).T
+    pitch, roll, height = (float(value) for value in angles_height)
+    (sp, cp), (sr, cr) = ((math.sin(angle), math.cos(angle)) for angle in (pitch, roll))
+    by_angles = np.array(
+        [[sp * sr, -cp * cr, cp * sr / height], [sp * cr, cp * sr, cp * cr / height]]
+    )
+    by_angles = np.vstack([by_angles, [-cp, 0.0, sp / height]])
+    return by_angles / height
 
 
 def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tuple[Array, Array]:
@@ -213,16 +217,13 @@ def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tupl
         along = 1 + float(plane @ samples.position_m)
         toward = samples.rays @ plane
         expected = -samples.disparity_m * toward / along
-        by_plane = (
-            -samples.disparity_m
-            / along
-            * (samples.rays - (toward / along)[:, None] * samples.position_m)
-        )
         error = samples.disparity_px - expected
         weight = samples.weight * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
         weight = np.where(expected > _MIN_PLANE_PX, weight, 0)
         weight /= _CORRELATED_SAMPLES * _SIGMA_PX**2
-        jacobian = by_plane @ by_state
+        jacobian = samples.rays @ by_state
+        jacobian -= (toward / along)[:, None] * (samples.position_m @ by_state)
+        jacobian *= -samples.disparity_m / along
         information += jacobian.T @ (jacobian * weight[:, None])
         gradient += jacobian.T @ (weight * error)
     return information, gradient

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
@@ -131,7 +132,7 @@ def fit_profile(
     Tukey's biweight; first as a line, then as a spline that grows along a floor that bends.
     The result rises strictly with the row and is never above the line's horizon.
     """
-    rows, bins = np.nonzero(counts)
+    rows, bins = pixels_where(counts > 0)
     disparity = bins * bin_px
     height = counts.shape[0]
     start = max(float(first_row), line.horizon)

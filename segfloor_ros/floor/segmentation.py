@@ -29,6 +29,7 @@ from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
 from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
+from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.texture import NOISE_TEXTURE, noise_grey, texture_grey
@@ -181,18 +182,21 @@ class FloorSegmentation:
         """
         camera = self._camera
         step = max(2, round(math.sqrt(disparity.size / _PLANE_SAMPLES)))
-        rows, columns = np.nonzero(disparity[::step, ::step] > 0)
+        part = disparity[::step, ::step]
+        rows, columns = pixels_where(part > 0)
         across = step * column_step(camera)
         grey = texture[::step, ::step][rows, columns].astype(np.float64) / (4 * enough)
+        grey *= grey
+        grey *= grey
         slope = FloorLine.of(camera, Mount(height_m=expected[0, 2], pitch_rad=expected[0, 0])).slope
-        inclined = rising(disparity, slope)[::step, ::step][rows, columns]
-        found = disparity[::step, ::step][rows, columns].astype(np.float64)
+        inclined = rising(disparity[:, ::step], slope)[::step][rows, columns]
+        found = part[rows, columns].astype(np.float64)
         uv = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
         samples = Samples(
             rays=camera.back_project(uv, np.ones(len(uv))),
             position_m=np.zeros(3),
             disparity_px=found,
-            weight=grey**4 / (grey**4 + 1) * np.where(inclined, 1.0, _FLAT_WEIGHT),
+            weight=grey / (grey + 1) * np.where(inclined, 1.0, _FLAT_WEIGHT),
             disparity_m=camera.disparity_times_depth,
         )
         likelihood = scores(samples, expected)
@@ -233,7 +237,7 @@ class FloorSegmentation:
             mask = self._memory.fill(view, mask, T_map_base)
         consistent = compared.consistent
         mask = fill_regions(
-            view, mask, left_rows, profile, disparity, compared, textured, settings.fill_support
+            view, mask, left_rows, disparity, compared, textured, settings.fill_support
         )
         mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
         return drop_islands(mask, settings.island_share)
@@ -252,14 +256,14 @@ class FloorSegmentation:
         the way above the horizon.
         """
         standing = (evidence.mask[::2] == NOT_FLOOR) & (evidence.height_m[::2] > 0)
-        rows, columns = np.nonzero(standing)
+        rows, columns = pixels_where(standing)
         rows *= 2
         upright_xy = view.positions(rows, columns, disparity[rows, columns])
         if T_map_base is not None:
             self._memory.learn(view, evidence.mask, upright_xy, T_map_base)
         v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
-        floor[floor] = mask[v[floor], u[floor]] == FLOOR
+        floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
         shared = u * view.step >= floor_px
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])

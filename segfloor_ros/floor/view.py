@@ -78,14 +78,16 @@ class FloorView:
 
     def pixels_of_floor(self, xy_base: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the view's pixels, (2, N) of row and column, of positions (2, N) on the floor's
-        plane; negative where they are behind the camera.
+        plane; negative rows where they are behind the camera.
         """
         x, y, depth = self._in_camera(xy_base)
         camera = self.camera
         v = y / depth * np.float32(camera.fy) + np.float32(camera.cy - self.first_row)
         u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
-        pixels: NDArray[np.float32] = np.stack([v, u / np.float32(self.step)])
-        pixels[:, depth > _FAR_M] = -1
+        behind = depth > _FAR_M
+        pixels: NDArray[np.float32] = np.stack(
+            [np.where(behind, np.float32(-1), v), u / np.float32(self.step)]
+        )
         return pixels
 
     def pixels_of_profile(

@@ -28,9 +28,10 @@ def filled(wall_px_of_floor: float) -> np.ndarray:
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
     nothing = np.zeros(shape, bool)
-    compared = Comparison(wall, wall, wall, nothing, ~wall)
+    floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
+    compared = Comparison(floor_px, wall, wall, wall, nothing, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
-    result = fill_to_contact(view, profile, mask, plain, disparity, compared)
+    result = fill_to_contact(view, mask, plain, disparity, compared)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 

@@ -1,10 +1,16 @@
 """Disparities of shifted pictures and the range that geometry asks for."""
 
+import cv2
 import numpy as np
 import pytest
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
+from segfloor_ros.floor.disparity import (
+    DisparityMatcher,
+    TwoScaleMatcher,
+    disparity_range,
+    equal_exposure,
+)
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 
@@ -51,3 +57,32 @@ def test_exposure_is_made_equal_only_where_it_differs():
     adapted = equal_exposure(left, dark)
     assert adapted.mean() == pytest.approx(left.mean(), abs=1.0)
     assert adapted.std() == pytest.approx(left.std(), rel=0.03)
+
+
+def test_two_scales_find_what_one_finds():
+    # Three bands of one picture: far, near, and far again with something near in it.
+    rng = np.random.default_rng(5)
+    shifts = np.full((120, 1), 12)
+    shifts[60:] = 80
+    wide = cv2.GaussianBlur(rng.normal(size=(120, 500)), (0, 0), 1.5)
+    wide = np.clip(128 + 40 * wide / wide.std(), 0, 255).astype(np.uint8)
+    left = wide[:, :400].copy()
+    right = np.take_along_axis(wide, np.arange(400) + shifts, axis=1)
+    near = wide[::-1][20:50, 400:500]
+    left[20:50, 230:330], right[20:50, 150:250] = near, near  # 80 px within the far rows
+    settings = FloorSegmentationSettings(coarse_above_px=32.0)
+    matcher = TwoScaleMatcher(112, settings)
+    assert matcher.num_disparities == 128
+    disparity = matcher.compute(left, right, fine_rows=60)
+    assert np.mean(np.abs(disparity[5:15, 30:-10] - 12) < 0.2) > 0.95
+    assert np.mean(np.abs(disparity[66:-5, 100:-10] - 80) < 1.0) > 0.95
+    assert np.mean(np.abs(disparity[26:44, 240:320] - 80) < 1.0) > 0.9
+
+
+def test_a_short_range_takes_one_scale():
+    left, right = shifted_pair(20)
+    settings = FloorSegmentationSettings()
+    matcher = TwoScaleMatcher(48, settings)
+    assert matcher.num_disparities == 48
+    whole = DisparityMatcher(48, settings).compute(left, right)
+    assert np.array_equal(matcher.compute(left, right, fine_rows=10), whole)
