@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,11 +36,11 @@ class FrozenCheck:
         self._last: NDArray[np.uint8] | None = None
         self._frozen = False
 
-    def frozen(self, left: NDArray[np.uint8], expected_shift: float) -> bool:
+    def frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
         """Return whether the image (H, W) is the one before although it was to move by
-        expected_shift, a share of its width.
+        expected_shift(), a share of its width, which is asked for only then.
         """
         same = self._last is not None and np.array_equal(left, self._last)
         self._last = left
-        self._frozen = same and (self._frozen or expected_shift > MIN_EXPECTED_SHIFT)
+        self._frozen = same and (self._frozen or expected_shift() > MIN_EXPECTED_SHIFT)
         return self._frozen

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
+from segfloor_ros.slam.coarse_disparity import guess_disparity
 from segfloor_ros.slam.disparity_offset import DisparityOffset
-from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
-from segfloor_ros.slam.matching import match_rows
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import Observations
@@ -35,7 +34,9 @@ class Adjustment:
     """A local bundle adjustment and where its unknowns belong.
 
     newest: index of the keyframe that caused it. free: (K,) indices of the keyframes that move.
-    ids: (P,) of the points. edge_keyframe, edge_row: (N,) of the observations.
+    ids: (P,) of the points. edge_keyframe, edge_row: (N,) of the observations. carried_ids,
+    carried_by: (C,) points that one keyframe alone sees, which tell nothing about poses and move
+    along with it.
     """
 
     newest: int
@@ -44,6 +45,8 @@ class Adjustment:
     ids: NDArray[np.int32]
     edge_keyframe: NDArray[np.int32]
     edge_row: NDArray[np.int32]
+    carried_ids: NDArray[np.int32]
+    carried_by: NDArray[np.int32]
 
 
 class LocalMapper:
@@ -57,27 +60,22 @@ class LocalMapper:
         )
 
     def measure_stereo(
-        self,
-        images: Images,
-        features: Features,
-        right_features: Features,
-        observations: Observations,
+        self, frame: StereoFrame, images: Images, observations: Observations
     ) -> None:
         """Add a disparity, in place, to every feature that has none yet and is found in the
         right image.
         """
-        max_disparity = 0.5 * self._camera.width
-        rows, matched = match_rows(
-            features,
-            right_features,
-            max_disparity,
-            self._settings.pyramid_scale,
-            self._settings.max_hamming,
+        missing = np.flatnonzero(np.isnan(observations.uvd_px[:, 2]))
+        guess = guess_disparity(frame.left, frame.right, observations.uvd_px[missing, :2])
+        found = np.isfinite(guess)
+        measure_disparity(
+            images.left,
+            images.right,
+            observations,
+            missing[found],
+            guess[found],
+            DISPARITY_REACH_PX,
         )
-        missing = np.isnan(observations.uvd_px[rows, 2])
-        rows, matched = rows[missing], matched[missing]
-        guess = (features.uv_px[rows, 0] - right_features.uv_px[matched, 0]).astype(np.float64)
-        measure_disparity(images.left, images.right, observations, rows, guess, DISPARITY_REACH_PX)
 
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
@@ -128,6 +126,11 @@ class LocalMapper:
         slot = np.full(len(sparse_map.keyframes), -1)
         slot[chosen] = np.arange(len(chosen))
         taking_part = slot[edge_keyframe] >= 0
+        seen_by = np.bincount(edge_point[taking_part], minlength=len(sparse_map.alive))
+        ids = ids[seen_by[ids] > 1]
+        alone = taking_part & (seen_by[edge_point] == 1)
+        carried = edge_point[alone], edge_keyframe[alone]
+        taking_part &= ~alone
         edge_point, edge_keyframe, edge_row = (
             edges[taking_part] for edges in (edge_point, edge_keyframe, edge_row)
         )
@@ -140,7 +143,7 @@ class LocalMapper:
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
         )
-        return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row)
+        return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 
     def solve(self, adjustment: Adjustment) -> BundleResult:
         """Adjust the copy; safe on another thread, since it shares nothing with the map."""
@@ -151,7 +154,7 @@ class LocalMapper:
         points.
         """
         self.offset.learn(result.offset)
-        self._write_back(sparse_map, adjustment.free, adjustment.ids, result)
+        self._write_back(sparse_map, adjustment, result)
         self._drop_outliers(
             sparse_map, adjustment.edge_keyframe, adjustment.edge_row, result.inliers
         )
@@ -178,15 +181,16 @@ class LocalMapper:
         return free, fixed
 
     def _write_back(
-        self,
-        sparse_map: SparseMap,
-        free: NDArray[np.intp],
-        ids: NDArray[np.int32],
-        result: BundleResult,
+        self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult
     ) -> None:
-        for slot, k in enumerate(free):
-            sparse_map.keyframes[k].T_camera_world = result.T_camera_world[slot]
-        sparse_map.xyz_world[ids] = result.points_world
+        sparse_map.xyz_world[adjustment.ids] = result.points_world
+        for slot, k in enumerate(adjustment.free):
+            keyframe, T_camera_world = sparse_map.keyframes[k], result.T_camera_world[slot]
+            carried = adjustment.carried_ids[adjustment.carried_by == k]
+            sparse_map.xyz_world[carried] = transform_points(
+                invert(T_camera_world) @ keyframe.T_camera_world, sparse_map.xyz_world[carried]
+            )
+            keyframe.T_camera_world = T_camera_world
 
     def _drop_outliers(
         self,

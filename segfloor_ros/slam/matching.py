@@ -1,6 +1,4 @@
-"""Matching of binary descriptors: guided by a predicted pixel, along a rectified row, or
-without guidance.
-"""
+"""Matching of binary descriptors: guided by a predicted pixel, or without guidance."""
 
 from __future__ import annotations
 
@@ -64,39 +62,6 @@ def match_predicted(
     accepted = (best_distance <= max_hamming) & (best_distance <= ratio * second)
     points = np.flatnonzero(accepted)
     return one_to_one(points, near[points, best[points]], best_distance[points])
-
-
-def match_rows(
-    left: Features,
-    right: Features,
-    max_disparity_px: float,
-    pyramid_scale: float,
-    max_hamming: int,
-) -> Matches:
-    """Match a rectified pair: same row within the feature's scale, disparity in [0,
-    max_disparity_px].
-
-    Returns (left rows, right rows), one to one and best in both directions.
-    """
-    order = np.argsort(right.uv_px[:, 1], kind='stable')
-    right_v = right.uv_px[order, 1]
-    tolerance = 2.0 * pyramid_scale ** left.octave.astype(np.float64)
-    low = np.searchsorted(right_v, left.uv_px[:, 1] - tolerance)
-    high = np.searchsorted(right_v, left.uv_px[:, 1] + tolerance, side='right')
-    i = np.repeat(np.arange(len(left)), high - low)
-    j = order[
-        np.arange(len(i))
-        - np.repeat(np.cumsum(high - low) - (high - low), high - low)
-        + np.repeat(low, high - low)
-    ]
-    disparity = left.uv_px[i, 0] - right.uv_px[j, 0]
-    octaves_apart = np.abs(left.octave[i].astype(np.int32) - right.octave[j])
-    valid = (disparity > -1.0) & (disparity <= max_disparity_px) & (octaves_apart <= 1)
-    i, j = i[valid], j[valid]
-    distance = hamming(left.descriptor[i], right.descriptor[j])
-    near = distance <= max_hamming
-    i, j, distance = i[near], j[near], distance[near]
-    return one_to_one(i, j, distance)
 
 
 def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8], max_hamming: int) -> Matches:

@@ -75,6 +75,7 @@ def align_patches(
     prior = np.where(np.arange(J.shape[1]) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
     max_step = np.where(prior > 0, MAX_SLOPE_STEP, MAX_SHIFT_STEP_PX)
     step = np.zeros((len(template), 2, 3))
+    deviation = np.zeros((len(template), J.shape[1] // 3, 3))
     for iteration in range(STEPS):
         warped = _warp(A, x, y) + (start_uv_px + offset)[:, :, None].astype(np.float32)
         residual = _match_brightness(_remap(image, warped[:, 0], warped[:, 1]), target, weight)
@@ -85,8 +86,8 @@ def align_patches(
             prior_level = level[:, None]
             inverse = np.linalg.inv(H + prior_level[..., None] * np.diag(prior + 1e-9))
         rhs = (weighted @ residual[..., None])[..., 0].astype(np.float64)
-        deviation = (A / zoom[:, None, None] - np.eye(2))[:, : J.shape[1] // 3]
-        rhs += prior_level * prior * np.pad(deviation, ((0, 0), (0, 0), (1, 0))).reshape(rhs.shape)
+        deviation[:, :, 1:] = (A / zoom[:, None, None] - np.eye(2))[:, : J.shape[1] // 3]
+        rhs += prior_level * prior * deviation.reshape(rhs.shape)
         found = np.clip((inverse @ rhs[..., None])[..., 0], -max_step, max_step)
         step[:, : J.shape[1] // 3] = found.reshape(len(found), J.shape[1] // 3, 3)
         A = A @ _inverse_2x2(np.eye(2) + step[:, :, 1:])

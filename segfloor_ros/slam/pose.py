@@ -93,8 +93,8 @@ def refine_pose(
         chi2 = _chi2(camera, pose, points_world, observations)
         excess = chi2 / observations.chi2_median
         factor = float(np.sqrt(np.clip(np.median(excess), 1.0, max_noise_factor**2)))
-        inliers = chi2 <= factor**2 * observations.chi2_limit
-        if inliers.sum() < 4:
+        before, inliers = inliers, chi2 <= factor**2 * observations.chi2_limit
+        if inliers.sum() < 4 or (inliers == before).all():
             break
     scaled = observations.take(inliers).with_noise_factor(factor)
     covariance = _covariance(camera, pose, points_world[inliers], scaled)

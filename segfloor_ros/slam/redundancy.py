@@ -34,8 +34,9 @@ def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
     same pyramid level or a finer one.
     """
     rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-    if len(rows) == 0:
-        return 0.0
+    enough = sparse_map.observer_count[keyframe.point_id[rows]] > OTHERS
+    if not len(rows) or enough.mean() < REDUNDANT_SHARE:
+        return float(enough.mean()) if len(rows) else 0.0
     rows = rows[np.argsort(keyframe.point_id[rows])]
     ids = keyframe.point_id[rows]
     edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)

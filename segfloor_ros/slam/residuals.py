@@ -85,7 +85,9 @@ def residuals(camera: StereoCamera, points: Array, observations: Observations) -
         ],
         axis=1,
     )
-    return np.nan_to_num(predicted - observations.uvd_px, nan=0.0)
+    residual = predicted - observations.uvd_px
+    residual[np.isnan(residual)] = 0.0
+    return residual
 
 
 def point_jacobians(camera: StereoCamera, points: Array) -> Array:

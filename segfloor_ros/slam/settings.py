@@ -49,7 +49,7 @@ class StereoSlamSettings(StageSettings):
         maximum=10.0,
     )
     num_features: int = setting(
-        1500, 'Features per image, spread over it.', minimum=200, maximum=10000
+        1000, 'Features per image, spread over it.', minimum=200, maximum=10000
     )
     cell_size_px: int = setting(
         16,

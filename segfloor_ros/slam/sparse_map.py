@@ -378,9 +378,10 @@ class SparseMap:
 
     def points_of(self, keyframe_indices: NDArray[np.integer]) -> NDArray[np.int32]:
         """Return the ascending rows of all points that the keyframes observe."""
-        ids = [self.keyframes[k].point_id for k in keyframe_indices]
-        merged = np.unique(np.concatenate(ids)) if ids else np.zeros(0, np.int32)
-        return merged[merged != NO_POINT]
+        observed = np.zeros(len(self.alive) + 1, bool)  # one more: NO_POINT is the last
+        for k in keyframe_indices:
+            observed[self.keyframes[k].point_id] = True
+        return np.flatnonzero(observed[:-1]).astype(np.int32)
 
     def edges_of(
         self, ids: NDArray[np.integer]

@@ -45,9 +45,6 @@ UNKNOWN_COVARIANCE = 1e6
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images for the mount to be known."""
 
-RIGHT_FEATURES = 2
-"""Right features per left feature: what the left image has must be found among them."""
-
 
 class StereoSlam:
     """Tracks a stereo camera and maps what it sees.
@@ -75,9 +72,6 @@ class StereoSlam:
         self._background = background
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
-        self._right_extractor = FeatureExtractor(
-            settings.replaced(num_features=RIGHT_FEATURES * settings.num_features)
-        )
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
         self._tracker = Tracker(camera, settings)
@@ -124,7 +118,7 @@ class StereoSlam:
 
     def _fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
-        frozen = self._frozen.frozen(frame.left, self._expected_shift(frame.stamp_ns))
+        frozen = self._frozen.frozen(frame.left, lambda: self._expected_shift(frame.stamp_ns))
         fault = image_fault(frame.left, frame.right)
         if frozen and not fault:
             return 'the image is the one before although the camera was moving'
@@ -269,7 +263,6 @@ class StereoSlam:
             matched = self._match_features(images, features) if track else None
             if track and matched is None:
                 return None
-        right_features = self._right_extractor.extract(frame.right)
         self._take_adjustment(wait=True)
         point_id = np.full(len(features), NO_POINT, np.int32)
         if matched is None:
@@ -278,7 +271,7 @@ class StereoSlam:
             observations = matched.observations
             alive = self.map.alive[matched.point_ids]
             point_id[matched.feature_rows[alive]] = matched.point_ids[alive]
-        self._mapper.measure_stereo(images, features, right_features, observations)
+        self._mapper.measure_stereo(frame, images, observations)
         keyframe = KeyframeRecord(
             len(self.map.keyframes),
             frame.index,

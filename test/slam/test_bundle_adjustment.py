@@ -4,7 +4,8 @@ import numpy as np
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import se3_exp, transform_points
-from segfloor_ros.slam.bundle_adjustment import BundleProblem, _inverse_cholesky, adjust
+from segfloor_ros.slam.bundle_adjustment import BundleProblem, adjust
+from segfloor_ros.slam.normal_equations import inverse_cholesky
 from segfloor_ros.slam.residuals import Observations
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
@@ -128,7 +129,7 @@ def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_k
     A = np.random.default_rng(4).normal(size=(50, 3, 3))
     A = np.swapaxes(A, 1, 2) @ A + 1e-3 * np.eye(3)
     A[0] = np.diag([1e4, 1e4, 1e-6])
-    L_inverse = _inverse_cholesky(A)
+    L_inverse = np.moveaxis(inverse_cholesky(np.moveaxis(A, 0, -1)), -1, 0)
     assert not np.triu(L_inverse, 1).any()
     np.testing.assert_allclose(
         np.swapaxes(L_inverse, 1, 2) @ L_inverse @ A, [np.eye(3)] * 50, atol=1e-9

@@ -59,8 +59,8 @@ def test_image_faults_are_named():
 def test_an_image_is_frozen_when_it_repeats_although_the_camera_was_moving():
     one, two = np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
     check = FrozenCheck()
-    assert not check.frozen(one, 0.05)  # nothing came before
-    assert check.frozen(one.copy(), 0.05)
-    assert check.frozen(one.copy(), 0.0)  # still the same one
-    assert not check.frozen(two, 0.05)
-    assert not check.frozen(two.copy(), 0.0005)  # it stands still
+    assert not check.frozen(one, lambda: 0.05)  # nothing came before
+    assert check.frozen(one.copy(), lambda: 0.05)
+    assert check.frozen(one.copy(), lambda: 0.0)  # still the same one
+    assert not check.frozen(two, lambda: 0.05)
+    assert not check.frozen(two.copy(), lambda: 0.0005)  # it stands still

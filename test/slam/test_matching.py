@@ -7,7 +7,6 @@ from segfloor_ros.slam.features import FeatureExtractor, Features, spread
 from segfloor_ros.slam.matching import (
     hamming,
     match_predicted,
-    match_rows,
     match_unguided,
     one_to_one,
 )
@@ -45,18 +44,6 @@ def test_one_to_one_keeps_the_nearest_of_both_ends():
     kept = one_to_one(a, b, distance)
     np.testing.assert_array_equal(kept[0], [0, 1, 2])
     np.testing.assert_array_equal(kept[1], [6, 5, 7])
-
-
-def test_rows_match_within_row_and_disparity_only():
-    left = features([[100, 50], [100, 80], [100, 120]])
-    # The first is 20 px left on its row; the second on another row; the third impossibly right.
-    right = Features(
-        np.array([[80, 50.5], [80, 90], [110, 120]], np.float32), left.octave, left.descriptor
-    )
-    rows, matched = match_rows(left, right, 64, 1.2, 80)
-    np.testing.assert_array_equal(rows, [0])
-    np.testing.assert_array_equal(matched, [0])
-    assert len(match_rows(left, right, 10, 1.2, 80)[0]) == 0
 
 
 def test_predicted_matches_need_nearness_and_a_clear_winner():
