@@ -28,6 +28,15 @@ class StageTimes:
         """Add one duration in seconds."""
         self._durations_s.setdefault(name, []).append(duration_s)
 
+    def clear(self) -> None:
+        """Forget what was measured so far."""
+        self._durations_s.clear()
+
+    @property
+    def durations_s(self) -> dict[str, list[float]]:
+        """All durations in seconds by name, in the order they were added."""
+        return {name: list(durations) for name, durations in self._durations_s.items()}
+
     def summary(self) -> dict[str, dict[str, float]]:
         """Return count, mean, median, 95th percentile and maximum in milliseconds by name."""
         table = {}
@@ -41,3 +50,10 @@ class StageTimes:
                 'max_ms': round(float(ms.max()), 3),
             }
         return table
+
+
+class NoTimes(StageTimes):
+    """For stages whose times nobody asks for."""
+
+    def add(self, name: str, duration_s: float) -> None:
+        """Forget it."""

@@ -8,6 +8,7 @@ import sys
 import typer
 
 from segfloor_ros.cli.benchmark import benchmark
+from segfloor_ros.cli.benchmark_floor import benchmark_floor
 from segfloor_ros.cli.benchmark_nodes import benchmark_nodes
 from segfloor_ros.cli.benchmark_slam import benchmark_slam
 from segfloor_ros.cli.calibrate import calibrate
@@ -26,7 +27,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-benchmarks = (benchmark, benchmark_slam, benchmark_nodes)
+benchmarks = (benchmark, benchmark_floor, benchmark_slam, benchmark_nodes)
 for command in (run, replay, simulate, calibrate, convert, *benchmarks, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')

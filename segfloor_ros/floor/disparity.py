@@ -63,21 +63,29 @@ def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray
 class DisparityMatcher:
     """Semi-global matching of one camera at a given range."""
 
-    def __init__(self, num_disparities: int, settings: FloorSegmentationSettings) -> None:
+    def __init__(
+        self,
+        num_disparities: int,
+        settings: FloorSegmentationSettings,
+        mode: int = cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        left_right_check: bool = True,
+    ) -> None:
         self.num_disparities = num_disparities
         area = settings.block_size_px**2
+        # OpenCV takes what is not positive for 1.
+        tolerance = settings.left_right_tolerance_px if left_right_check else num_disparities
         self._matcher = cv2.StereoSGBM_create(
             minDisparity=0,
             numDisparities=num_disparities,
             blockSize=settings.block_size_px | 1,
             P1=settings.smoothness_small * area,
             P2=max(settings.smoothness_large, settings.smoothness_small + 1) * area,
-            disp12MaxDiff=settings.left_right_tolerance_px,
+            disp12MaxDiff=tolerance,
             preFilterCap=31,
             uniquenessRatio=settings.uniqueness_percent,
             speckleWindowSize=settings.speckle_size_px,
             speckleRange=2,
-            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+            mode=mode,
         )
 
     def compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

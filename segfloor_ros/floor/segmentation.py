@@ -35,7 +35,9 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.texture import NOISE_TEXTURE, noise_grey, texture_grey
 from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
+from segfloor_ros.timing import NoTimes, StageTimes
 
+DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _ROWS_ABOVE_HORIZON = 16
 """The matcher's paths get a run-up, and the horizon some play."""
 _TEXTURE_WINDOW_PX = 11
@@ -50,9 +52,15 @@ _FLAT_WEIGHT = 0.1
 
 
 class FloorSegmentation:
-    """Finds the floor in rectified stereo pairs of one camera."""
+    """Finds the floor in rectified stereo pairs of one camera. times: told what each step takes."""
 
-    def __init__(self, camera: StereoCamera, settings: FloorSegmentationSettings) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: FloorSegmentationSettings,
+        times: StageTimes | None = None,
+    ) -> None:
+        self._times = times or NoTimes()
         self._camera = camera
         self._settings = settings
         self._memory = FloorMemory()
@@ -73,33 +81,51 @@ class FloorSegmentation:
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
         the map, where known; with it the floor found by earlier keyframes helps.
         """
-        settings = self._settings
+        settings, measure = self._settings, self._times.measure
         self._prepare(mount)
         expected = self._expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
-        right = equal_exposure(left, right)
         columns = np.s_[first_row:, :: column_step(self._camera)]
-        disparity = self._disparity(first_row, left, right)
-        below = disparity[columns]
-        left_rows, right_rows = left[first_row:], right[first_row:]
-        noise = noise_grey(left_rows)
-        enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
-        texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
-        fit = self._plane(first_row, below, texture, enough, expected)
+        with measure('texture'):
+            right = equal_exposure(left, right)
+            left_rows, right_rows = left[first_row:], right[first_row:]
+            noise = noise_grey(left_rows)
+            enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
+            texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
+        with measure(DISPARITY):
+            disparity = self._disparity(first_row, left, right)
+        below, textured = disparity[columns], texture > enough
+        with measure('plane'):
+            fit = self._plane(first_row, below, texture, enough, expected)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
-        profile = self._profile(view, below, texture > 2 * enough)
-        compared = compare(view, profile, left_rows, right_rows, below, noise, settings)
-        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
-        textured = texture > enough
-        evidence = judge(view, profile, below, textured, compared, table, settings)
-        seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
-        evidence = Evidence(seen, evidence.height_m)
-        mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
-        overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
-        scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
+        with measure('profile'):
+            profile = self._profile(view, below, texture > 2 * enough)
+        with measure('comparison'):
+            compared = compare(view, profile, left_rows, right_rows, below, noise, settings)
+        with measure('evidence'):
+            table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
+            evidence = judge(view, profile, below, textured, compared, table, settings)
+            seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
+            evidence = Evidence(seen, evidence.height_m)
+        with measure('filling'):
+            mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
+        with measure(DISPARITY_ABOVE):
+            overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
+        with measure('scan'):
+            scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
+        return self._observation(view, profile, disparity, mask, scan)
+
+    def _observation(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        disparity: NDArray[np.float32],
+        mask: NDArray[np.uint8],
+        scan: FloorScan,
+    ) -> FloorObservation:
         rows = np.arange(self._camera.height, dtype=np.float64)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
-        whole[first_row:] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
+        whole[view.first_row :] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
         return FloorObservation(
             disparity_px=disparity,
             mask=whole,

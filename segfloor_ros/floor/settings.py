@@ -78,7 +78,7 @@ class FloorSegmentationSettings(StageSettings):
         5, 'How much better than the second the best match must be.', minimum=0, maximum=50
     )
     left_right_tolerance_px: int = setting(
-        1, 'Largest left-right difference of a disparity.', unit='px', minimum=0, maximum=8
+        1, 'Largest left-right difference of a disparity.', unit='px', minimum=1, maximum=8
     )
     speckle_size_px: int = setting(
         60, 'Islands of fewer pixels are dropped.', unit='px', minimum=0, maximum=2000

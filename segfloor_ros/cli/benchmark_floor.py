@@ -1,0 +1,99 @@
+"""`segfloor benchmark-floor`: the share of each step of floor segmentation, and what the choices of
+the disparity bring.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import cv2
+import typer
+from rich.table import Table
+
+from segfloor_ros.cli.benchmark import announcing
+from segfloor_ros.cli.options import ParamsOption, SetOption
+from segfloor_ros.cli.output import console
+from segfloor_ros.configuration import resolve
+from segfloor_ros.evaluation.benchmark_disparity import (
+    DisparityScore,
+    choices,
+    read_pairs,
+    score,
+)
+from segfloor_ros.evaluation.benchmark_floor import (
+    WITHOUT_DISPARITY,
+    FloorTimes,
+    generated_keyframes,
+    keyframes_of,
+    time_steps,
+)
+
+
+def benchmark_floor(
+    recordings: Annotated[
+        Optional[list[str]],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        typer.Argument(help='Recordings whose keyframes to segment. [default: generated images]'),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=3, help='Generated image pairs.')] = 60,
+    seed: Annotated[int, typer.Option(help='Of the generated images.')] = 0,
+    threads: Annotated[int, typer.Option(min=1, help='Threads of OpenCV.')] = 2,
+    middlebury: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help='Folder with cones/ and teddy/: score the choices of the disparity too.'),
+    ] = None,
+    params: ParamsOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Time each step of floor segmentation; with --middlebury, score the disparity."""
+    configuration = resolve(params, assignments or ())
+    pairs = read_pairs(middlebury) if middlebury is not None else []
+    with announcing() as announce:
+        announce('segmenting generated images', 0)
+        for name in recordings or ['generated']:
+            camera, keyframes = (
+                keyframes_of(name, configuration, announce)
+                if recordings
+                else generated_keyframes(frames, seed)
+            )
+            title = f'{Path(name).name}, {camera.width}x{camera.height}'
+            console.print(steps_table(time_steps(title, camera, keyframes, configuration, threads)))
+        cv2.setNumThreads(threads)
+        scores = []
+        for choice, match in choices(configuration.floor_segmentation).items() if pairs else ():
+            announce(choice, 0)
+            scores += [score(choice, match, pair) for pair in pairs]
+    if scores:
+        console.print(disparity_table(scores))
+
+
+def steps_table(times: FloorTimes) -> Table:
+    """Return a row for each step: its time per keyframe and its share."""
+    table = Table('step', 'median ms', 'p95 ms', 'share %', title=times.name)
+    for column in table.columns[1:]:
+        column.justify = 'right'
+    for name, step in times.steps.items():
+        if name == WITHOUT_DISPARITY:
+            table.add_section()
+        share = f'{100 * step["share"]:.1f}'
+        table.add_row(name, f'{step["p50_ms"]:.2f}', f'{step["p95_ms"]:.2f}', share)
+    table.caption = f'{times.keyframes} keyframes; shares of the time of all'
+    return table
+
+
+def disparity_table(scores: list[DisparityScore]) -> Table:
+    """Return a row for each choice and pair."""
+    names = ('bad-0.5', 'bad-1.0', 'bad-2.0', 'wrong', 'matched', 'median ms')
+    table = Table('disparity', 'pair', *names)
+    for column in table.columns[2:]:
+        column.justify = 'right'
+    for one in scores:
+        shares = (one.bad_half, one.bad_1, one.bad_2, one.wrong_2, one.matched)
+        table.add_row(
+            one.choice, one.pair, *(f'{100 * s:.1f}' for s in shares), f'{one.time_ms:.1f}'
+        )
+    table.caption = (
+        'bad: off by more, or no match, in % of the pixels that both cameras see; '
+        'wrong: off by more than 2 px, in % of those matched'
+    )
+    return table

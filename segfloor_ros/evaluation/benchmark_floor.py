@@ -1,0 +1,123 @@
+"""What each step of floor segmentation costs, keyframe by keyframe."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.errors import MapError
+from segfloor_ros.evaluation.benchmark import Announce
+from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT
+from segfloor_ros.evaluation.benchmark_images import STEP_M, CorridorImages
+from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
+from segfloor_ros.geometry import Array
+from segfloor_ros.stages import make_slam
+from segfloor_ros.timing import StageTimes
+
+WHOLE, WITHOUT_DISPARITY = 'all', 'all but disparity'
+WARM_UP = 2
+"""The first keyframes pay for tables and memory."""
+
+
+@dataclass(frozen=True)
+class FloorInput:
+    """What floor segmentation gets of one keyframe: a rectified pair (H, W) uint8, the mount, and
+    the base's pose (4, 4) in the map.
+    """
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    mount: Mount
+    T_map_base: Array
+
+
+@dataclass(frozen=True)
+class FloorTimes:
+    """name: of the recording. camera: its own. steps: by name p50_ms and p95_ms over the keyframes,
+    the last two being `WITHOUT_DISPARITY` and `WHOLE`; share: of the time of all keyframes.
+    """
+
+    name: str
+    camera: StereoCamera
+    keyframes: int
+    steps: dict[str, dict[str, float]]
+
+
+def generated_drive(frames: int, seed: int) -> Iterator[FloorInput]:
+    """Yield a drive through a corridor without SLAM: its poses are known."""
+    for frame in CorridorImages(frames, seed).drive():
+        T_map_base = np.eye(4)
+        T_map_base[0, 3] = frame.index * STEP_M
+        yield FloorInput(frame.left, frame.right, MOUNT, T_map_base)
+
+
+def keyframes_of(
+    recording: str, configuration: Configuration, announce: Announce
+) -> tuple[StereoCamera, Iterator[FloorInput]]:
+    """Return the camera of a recording, and its keyframes as SLAM makes them."""
+    settings = dataclasses.replace(configuration.stereo_camera, input=recording)
+    source = open_source(settings)
+
+    def drive() -> Iterator[FloorInput]:
+        report = announce(f'segmenting {recording}', source.frame_count or 0)
+        slam = make_slam(source.camera, configuration.stereo_slam)
+        for done, frame in enumerate(source.frames(), start=1):
+            for result in slam.process(frame):
+                if result.keyframe is not None and slam.mount is not None:
+                    key = result.keyframe
+                    yield FloorInput(key.left, key.right, slam.mount, key.T_map_base)
+            report(done)
+        slam.close()
+
+    return source.camera, drive()
+
+
+def generated_keyframes(frames: int, seed: int) -> tuple[StereoCamera, Iterator[FloorInput]]:
+    """Return the camera of the generated drive and its frames, all of them keyframes."""
+    return CAMERA, generated_drive(frames, seed)
+
+
+def time_steps(
+    name: str,
+    camera: StereoCamera,
+    keyframes: Iterator[FloorInput],
+    configuration: Configuration,
+    threads: int,
+) -> FloorTimes:
+    """Segment the keyframes and time every step. threads: of OpenCV. Raises MapError where there
+    are too few.
+    """
+    cv2.setNumThreads(threads)
+    times, count, settings = StageTimes(), 0, configuration.floor_segmentation
+    stage = FloorSegmentation(camera, settings, times)
+    for count, key in enumerate(keyframes, start=1):
+        if count == WARM_UP + 1:
+            times.clear()
+        with times.measure(WHOLE):
+            stage.process(key.left, key.right, key.mount, key.T_map_base)
+    if count <= WARM_UP:
+        raise MapError(f'{name}: {count} keyframes are too few to time')
+    return FloorTimes(name, camera, count - WARM_UP, _figures(times))
+
+
+def _figures(times: StageTimes) -> dict[str, dict[str, float]]:
+    seconds = {step: np.array(durations) for step, durations in times.durations_s.items()}
+    whole = seconds.pop(WHOLE)
+    rest = whole - seconds[DISPARITY] - seconds[DISPARITY_ABOVE]
+    seconds = {**seconds, WITHOUT_DISPARITY: rest, WHOLE: whole}
+    return {
+        step: {
+            'p50_ms': 1e3 * float(np.median(values)),
+            'p95_ms': 1e3 * float(np.percentile(values, 95)),
+            'share': float(values.sum() / whole.sum()),
+        }
+        for step, values in seconds.items()
+    }
