@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,17 +34,33 @@ def benchmark_nodes(
             'frame; 0: once, in step with the clock.',
         ),
     ] = 0.0,
+    idle_seconds: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help='Measure for so long each what the nodes cost without images, with a camera that '
+            'stands, and while nobody listens to what they make; 0: drive.',
+        ),
+    ] = 0.0,
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
     """Measure the nodes on a recording: image to map, CPU and memory of each, what is lost."""
     try:
+        from segfloor_ros.cli.idle_figures import longest_s, measure_idle
         from segfloor_ros.cli.replay_figures import measure_nodes
     except ImportError as error:
         raise SettingsError(f'benchmark-nodes needs ROS 2 ({error})') from None
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})
     source = open_source(configuration.stereo_camera)
     with tempfile.TemporaryDirectory(prefix='segfloor-soak-') as folder:
+        if idle_seconds:
+            stands = write_endless_drive(
+                source, Path(folder) / 'stands', longest_s(idle_seconds), stands=True
+            )
+            configuration = resolve(params, assignments or (), stereo_camera={'input': str(stands)})
+            console.print(idle_table(measure_idle(configuration, idle_seconds)))
+            return
         if soak_minutes:
             drive = write_endless_drive(source, Path(folder) / 'drive', 60 * soak_minutes)
             configuration = resolve(params, assignments or (), stereo_camera={'input': str(drive)})
@@ -56,6 +73,14 @@ def benchmark_nodes(
                 lambda done, state: progress.update(TaskID(0), completed=done, note=state),
             )
     console.print(figures_table(figures))
+
+
+def idle_table(shares: Mapping[str, Mapping[str, float]]) -> Table:
+    """Return shares of a core by phase and node as a table in percent."""
+    table = Table('node', *shares)
+    for node in next(iter(shares.values())):
+        table.add_row(node, *(f'{100 * by_node[node]:.1f} %' for by_node in shares.values()))
+    return table
 
 
 def figures_table(figures: NodeFigures) -> Table:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +112,17 @@ def measure_nodes(
     configuration: Configuration, rate: float, lossless: bool, on_progress: ProgressListener
 ) -> NodeFigures:
     """Play the recording of the configuration through the nodes. Raises ReplayError."""
+    with connected_nodes(configuration, rate, lossless) as graph:
+        return _follow(graph, graph.recorder, on_progress)
+
+
+@contextlib.contextmanager
+def connected_nodes(
+    configuration: Configuration, rate: float, lossless: bool
+) -> Iterator[FigureGraph]:
+    """The five nodes in a graph of their own, connected, with the camera paused. Raises
+    ReplayError.
+    """
     environment = isolated_environment()
     os.environ.update(environment)
     context = rclpy.Context()
@@ -118,13 +131,18 @@ def measure_nodes(
         with tempfile.TemporaryDirectory(prefix='segfloor-figures-') as folder:
             arguments = _node_arguments(configuration, rate, lossless, Path(folder))
             with NodeProcesses(NODES, arguments, environment, Path(folder)) as processes:
-                recorder = FigureRecorder(context, processes)
-                graph = ReplayGraph(recorder, processes)
+                graph = FigureGraph(FigureRecorder(context, processes), processes)
                 # A camera that keeps to the clock does not listen to the nodes.
                 graph.connect(status_listeners=1 + lossless)
-                return _follow(graph, recorder, on_progress)
+                yield graph
     finally:
         rclpy.try_shutdown(context=context)
+
+
+class FigureGraph(ReplayGraph):
+    """The running nodes and the one that measures them."""
+
+    recorder: FigureRecorder
 
 
 def _node_arguments(
@@ -141,9 +159,9 @@ def _node_arguments(
 
 
 def _follow(
-    graph: ReplayGraph, recorder: FigureRecorder, on_progress: ProgressListener
+    graph: FigureGraph, recorder: FigureRecorder, on_progress: ProgressListener
 ) -> NodeFigures:
-    start_s, cpu_s = time.monotonic(), _cpu_s(graph.processes)
+    start_s, before_s = time.monotonic(), cpu_s(graph.processes)
     graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
     try:
         graph.play(on_progress, threading.Event())
@@ -151,7 +169,7 @@ def _follow(
         # Frames that were lost never come; that is a figure, unless a node has died.
         graph.processes.check()
     wall_s = time.monotonic() - start_s
-    spent_s = {node: s - cpu_s[node] for node, s in _cpu_s(graph.processes).items()}
+    spent_s = {node: s - before_s[node] for node, s in cpu_s(graph.processes).items()}
     graph.spin(2 * HEALTH_PERIOD_S)
     stop_s = time.monotonic()
     graph.processes.stop()
@@ -171,7 +189,7 @@ def _follow(
     )
 
 
-def _cpu_s(processes: NodeProcesses) -> dict[str, float]:
+def cpu_s(processes: NodeProcesses) -> dict[str, float]:
     """Return the CPU time every node has used, all threads, user and system (proc(5))."""
     used = {}
     for node, process_id in processes.process_ids.items():

@@ -11,10 +11,12 @@ from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import InputError
 
 
-def write_endless_drive(source: StereoSource, folder: Path, duration_s: float) -> Path:
+def write_endless_drive(
+    source: StereoSource, folder: Path, duration_s: float, stands: bool = False
+) -> Path:
     """Write a KITTI odometry folder in which a recording is driven forwards and backwards in turn,
-    and return it. Every image is stored once; the frames link to them. Raises InputError for a
-    recording of less than two frames.
+    and return it. Every image is stored once; the frames link to them. stands: the camera stays
+    where it is in the first frame. Raises InputError for a recording of less than two frames.
     """
     stamps_ns = _write_images(source, folder)
     if len(stamps_ns) < 2:
@@ -26,7 +28,7 @@ def write_endless_drive(source: StereoSource, folder: Path, duration_s: float) -
         images = folder / f'image_{camera}'
         images.mkdir()
         for frame in range(count):
-            place = min(frame % turn, turn - frame % turn)
+            place = 0 if stands else min(frame % turn, turn - frame % turn)
             (images / f'{frame:06d}.png').symlink_to(folder / f'stored_{camera}/{place:06d}.png')
     times = ''.join(f'{frame * period_s:.6f}\n' for frame in range(count))
     (folder / 'times.txt').write_text(times)
