@@ -13,7 +13,9 @@ NOBLE := .venv-noble
 NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
 # What processes and links do to each other does not depend on the four libraries.
 APART_FROM := nodes/test_faults nodes/test_restarts nodes/test_two_hosts nodes/test_tf nodes/test_reset \
-  nodes/test_lifecycle nodes/test_on_demand nodes/test_diagnoses nodes/test_pipeline test_package
+  nodes/test_lifecycle nodes/test_on_demand nodes/test_diagnoses nodes/test_pipeline test_package \
+  nodes/test_launched nodes/test_losses nodes/test_lossless nodes/test_middleware \
+  nodes/test_ros2_commands
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 CODE := segfloor_ros test launch_configs docs tools setup.py
 

@@ -149,7 +149,8 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
     for life in ('first', 'second'):
         frames = [journey.next() for _ in range(12)]
         drive = write_kitti(tmp_path / life, [replace(f, index=i) for i, f in enumerate(frames)])
-        chain.start(CAMERA, input=drive, rate=10.0)
+        # Lossless: a busy machine may be slower than 10 Hz.
+        chain.start(CAMERA, input=drive, rate=10.0, lossless=True)
         assert all(a.level is Level.OK for a in chain.answers(f.stamp_ns for f in frames[:4]))
         chain.kill(CAMERA)
         journey.miss(1)
