@@ -47,8 +47,8 @@ def benchmark_nodes(
 ) -> None:
     """Measure the nodes on a recording: image to map, CPU and memory of each, what is lost."""
     try:
-        from segfloor_ros.cli.idle_figures import longest_s, measure_idle
         from segfloor_ros.cli.replay_figures import measure_nodes
+        from segfloor_ros.cli.replay_idle import longest_s, measure_idle
     except ImportError as error:
         raise SettingsError(f'benchmark-nodes needs ROS 2 ({error})') from None
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})

@@ -18,6 +18,9 @@ HEALTH = 'health'
 
 HEALTH_PERIOD_S = 1.0
 
+NEED_LASTS_S = 5.0
+"""A node that nobody has needed for so long takes no messages until somebody does."""
+
 RECORDING = 'recording'
 """Kind of the status of the camera that says that its recording has ended."""
 

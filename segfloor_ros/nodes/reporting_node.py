@@ -17,6 +17,7 @@ from segfloor_ros.messages.diagnostics import (
     CONNECTIONS,
     HEALTH,
     HEALTH_PERIOD_S,
+    NEED_LASTS_S,
     Level,
     Status,
     status_message,
@@ -32,7 +33,6 @@ from segfloor_ros.nodes.qos_check import incompatible_topics
 CONNECTION_CHECK_S = 0.1
 FALLS_BEHIND_S = 2.0
 LOSS_LASTS_S = 10.0
-NEED_LASTS_S = 5.0
 PATH = 'keyframe/path'
 PROBLEM_LASTS_S = 3.0
 REPEAT_FAULT_S = 5.0

@@ -18,7 +18,7 @@ from segfloor_ros.evaluation.endless_drive import write_endless_drive
 
 pytest.importorskip('rclpy')
 
-from segfloor_ros.cli import idle_figures
+from segfloor_ros.cli import replay_idle
 from segfloor_ros.cli.benchmark_nodes import figure_rows, idle_table
 from segfloor_ros.cli.replay_figures import NodeFigures
 from segfloor_ros.messages.topics import NODES
@@ -85,22 +85,22 @@ def test_a_soak_loses_nothing(tmp_path) -> None:
 
 
 def test_what_nodes_cost_that_do_nothing_is_told(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(idle_figures, 'SETTLE_S', 0.5)
-    monkeypatch.setattr(idle_figures, 'ALL_IDLE_S', 0.1)
+    monkeypatch.setattr(replay_idle, 'SETTLE_S', 0.5)
+    monkeypatch.setattr(replay_idle, 'ALL_IDLE_S', 0.1)
     frames, _ = room_drive(2)
     source = open_recording(write_kitti(tmp_path / 'drive', frames))
     stands = write_endless_drive(source, tmp_path / 'stands', 20.0, stands=True)
     configuration = resolve(None, ('stereo_slam.num_features=700',),
                             stereo_camera={'input': str(stands)})  # fmt: skip
     monkeypatch.setenv('ROS_DOMAIN_ID', '')
-    shares = idle_figures.measure_idle(configuration, 2.0)
-    assert tuple(shares) == idle_figures.PHASES
+    shares = replay_idle.measure_idle(configuration, 2.0)
+    assert tuple(shares) == replay_idle.PHASES
     assert all(set(by_node) == set(NODES) for by_node in shares.values())
     waiting, standing = shares['no images'], shares['camera stands']
     assert 0 < waiting['stereo_slam'] < standing['stereo_slam'] < 4
     table = idle_table(shares)
     assert table.row_count == len(NODES)
-    assert [column.header for column in table.columns] == ['node', *idle_figures.PHASES]
+    assert [column.header for column in table.columns] == ['node', *replay_idle.PHASES]
 
 
 def test_a_camera_that_stands_sends_its_first_frame(tmp_path) -> None:

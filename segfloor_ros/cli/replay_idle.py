@@ -8,8 +8,8 @@ from std_srvs.srv import SetBool
 
 from segfloor_ros.cli.replay_figures import FigureGraph, connected_nodes, cpu_s
 from segfloor_ros.configuration import Configuration
+from segfloor_ros.messages.diagnostics import NEED_LASTS_S
 from segfloor_ros.messages.topics import CAMERA, GRID
-from segfloor_ros.nodes.reporting_node import NEED_LASTS_S
 
 SETTLE_S = 3.0
 ALL_IDLE_S = 3 * NEED_LASTS_S + SETTLE_S
