@@ -4,6 +4,7 @@ the disparity bring.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -28,6 +29,8 @@ from segfloor_ros.evaluation.benchmark_floor import (
     keyframes_of,
     time_steps,
 )
+from segfloor_ros.evaluation.benchmark_floor_scenes import SCENES, SceneScore, score_scene
+from segfloor_ros.simulation.any_scene import open_scene
 
 
 def benchmark_floor(
@@ -42,11 +45,27 @@ def benchmark_floor(
         Optional[Path],  # noqa: UP045
         typer.Option(help='Folder with cones/ and teddy/: score the choices of the disparity too.'),
     ] = None,
+    simulated: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help='Scenes to simulate and score, with commas; all: those made for floor.'),
+    ] = None,
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
-    """Time each step of floor segmentation; with --middlebury, score the disparity."""
+    """Time each step of floor segmentation; with --middlebury, score the disparity; with
+    --simulated, score the masks.
+    """
     configuration = resolve(params, assignments or ())
+    if simulated is not None:
+        names = SCENES if simulated == 'all' else simulated.split(',')
+        scenes = {name: open_scene(name) for name in names}
+        with announcing() as announce:
+            found = [
+                score_scene(name, scene, configuration, announce(f'driving {name}', 0))
+                for name, scene in scenes.items()
+            ]
+        console.print(scenes_table(found))
+        return
     pairs = read_pairs(middlebury) if middlebury is not None else []
     with announcing() as announce:
         announce('segmenting generated images', 0)
@@ -65,6 +84,23 @@ def benchmark_floor(
             scores += [score(choice, match, pair) for pair in pairs]
     if scores:
         console.print(disparity_table(scores))
+
+
+def scenes_table(scores: list[SceneScore]) -> Table:
+    """Return a row for each scene."""
+    names = ('precision %', 'recall %', 'low as floor %', 'sill as floor %')
+    table = Table('scene', 'masks', *names)
+    for column in table.columns[1:]:
+        column.justify = 'right'
+    for one in scores:
+        shares = (one.precision, one.recall, one.low_called_floor, one.sill_called_floor)
+        cells = ('-' if math.isnan(share) else f'{100 * share:.1f}' for share in shares)
+        table.add_row(one.name, str(one.masks), *cells)
+    table.caption = (
+        'recall: floor from 0.5 to 6 m; low: what stands 3 to 10 cm high up to 2 m ahead, feet of '
+        'walls included; sill: floor that lies 1 to 3 cm high'
+    )
+    return table
 
 
 def steps_table(times: FloorTimes) -> Table:

@@ -52,7 +52,8 @@ def fill_regions(
     slope = _slope(image)
     own = slope.take(np.flatnonzero(floor)[::7])
     limit = max(_MIN_SLOPE, float(np.percentile(own, 90)))
-    alike = (small != NOT_FLOOR) & compared.consistent[part] & (slope < limit)
+    agreed = compared.consistent[part] & ~compared.denied[part]
+    alike = (small != NOT_FLOOR) & agreed & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
     top = _top_of_supported(region, count, floor, min_share)
@@ -67,8 +68,7 @@ def fill_regions(
     fill = inside & (nearer | _next_to_floor(small))
     mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
-    plain = compared.consistent[part] & ~compared.denied[part] & (slope < _STRONG_SLOPE)
-    to_contact = fill_to_contact(view, mask, plain, disparity, compared)
+    to_contact = fill_to_contact(view, mask, agreed & (slope < _STRONG_SLOPE), disparity, compared)
     return with_floor(mask, _enlarged(to_contact, mask))
 
 

@@ -33,11 +33,19 @@ class FloorMemory:
         self._around: NDArray[np.float32] | None = None
 
     def fill(
-        self, view: FloorView, mask: NDArray[np.uint8], T_map_base: Array
+        self,
+        view: FloorView,
+        mask: NDArray[np.uint8],
+        open_: NDArray[np.bool_],
+        T_map_base: Array,
     ) -> NDArray[np.uint8]:
-        """Return the mask (R, W) with floor where nothing is seen now and floor was before."""
+        """Return the mask (R, W) with floor where nothing is seen now and floor was before.
+
+        open_: (R, W), where the images do not deny it. Beyond the crest of a ramp the floor that
+        was seen lies lower, out of sight.
+        """
         nearest_row = _first_row_within_reach(view)
-        rows, columns = pixels_where(mask[nearest_row:] == NO_EVIDENCE)
+        rows, columns = pixels_where((mask[nearest_row:] == NO_EVIDENCE) & open_[nearest_row:])
         rows += nearest_row
         xy = view.floor_positions(rows, columns)
         index, inside = self._index(_in_map(T_map_base, xy))

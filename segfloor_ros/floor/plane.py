@@ -48,6 +48,16 @@ class Samples:
     weight: Array
     disparity_m: float
 
+    def every(self, step: int) -> Samples:
+        """Return only one of every so many."""
+        return Samples(
+            self.rays[::step],
+            self.position_m,
+            self.disparity_px[::step],
+            self.weight[::step],
+            self.disparity_m,
+        )
+
 
 @dataclass(frozen=True)
 class PlaneFit:

@@ -27,7 +27,7 @@ from segfloor_ros.floor.observation import (
 )
 from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
-from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, refine, scores
+from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, propose, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.scan import FloorScanner
@@ -47,6 +47,14 @@ _FAITH = 2.0
 """So much more must speak for the second expectation than for the first."""
 _SWING_RAD = math.radians(3.0)
 """So far robots swing on their wheels; what the map says beyond that is drift."""
+_MAX_SLOPE_RAD = math.radians(18.0)
+_SLOPE_HEIGHT = 0.35
+"""By how much the camera's height above a slope ahead may differ from that above the floor."""
+_SLOPE_EVERY = 4
+_SLOPE_PROPOSALS = 100
+_SLOPE_SIGMA = np.array([math.radians(5.0), math.radians(1.0), 0.1])
+_PLAIN_SHARE = 0.4
+"""So much of all that is seen must lie on a slope that nobody expects."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 
@@ -174,6 +182,29 @@ class FloorSegmentation:
         level = angles_height_of(T_map_left[2, :3] / mount.height_m)
         return np.stack([mounted, level])
 
+    def _slope(self, samples: Samples, known_score: float, mounted: Array) -> Array | None:
+        """Return pitch, roll and height (3,) above a slope that is all there is to see, as it is
+        right before a ramp; None where it is not so.
+
+        known_score: of the best expectation.
+        """
+        few = samples.every(_SLOPE_EVERY)
+        total, known_score = few.weight.sum(), known_score / _SLOPE_EVERY
+        if known_score > _PLAIN_SHARE / _FAITH * total or len(few.weight) < _SLOPE_PROPOSALS:
+            return None
+        known = np.array([math.nan, mounted[1], math.nan])
+        rng = np.random.default_rng(len(few.weight))
+        found = propose(few, _SLOPE_PROPOSALS, rng, known)
+        ratio = found[:, 2] / mounted[2]
+        near = np.abs(found[:, 0] - mounted[0]) < _MAX_SLOPE_RAD
+        found = found[near & (ratio > 1 - _SLOPE_HEIGHT) & (ratio < 1 + _SLOPE_HEIGHT)]
+        if len(found) == 0:
+            return None
+        score = scores(few, found)
+        best = int(np.argmax(score))
+        plain = score[best] > max(_PLAIN_SHARE * total, _FAITH * known_score)
+        return found[best] if plain else None
+
     def _first_row(self, expected: Mount) -> int:
         camera = self._camera
         line = FloorLine.of(camera, expected)
@@ -226,16 +257,17 @@ class FloorSegmentation:
             disparity_m=camera.disparity_times_depth,
         )
         likelihood = scores(samples, expected)
+        slope_start = self._slope(samples, likelihood.max(), expected[0])
         swing = np.hypot(*(expected - expected[0])[:, :2].T)
         likelihood = likelihood * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
         likelihood[0] *= _FAITH
         start = expected[int(np.argmax(likelihood))]
         settings = self._settings
-        tilt, height = settings.pitch_sigma_rad, settings.height_sigma * start[2]
+        sigma = np.array([*2 * [settings.pitch_sigma_rad], settings.height_sigma * start[2]])
+        if slope_start is not None:
+            start, sigma = slope_start, _SLOPE_SIGMA
         unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
-        return refine(
-            [samples], start, unknown, no_travel, np.array([tilt, tilt, height]), _PLANE_SCALES_PX
-        )
+        return refine([samples], start, unknown, no_travel, sigma, _PLANE_SCALES_PX)
 
     def _profile(
         self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
@@ -260,12 +292,12 @@ class FloorSegmentation:
         """Return the mask with floor where this pair of images alone cannot tell."""
         settings = self._settings
         if T_map_base is not None:
-            mask = self._memory.fill(view, mask, T_map_base)
+            mask = self._memory.fill(view, mask, ~compared.denied, T_map_base)
         consistent = compared.consistent
         mask = fill_regions(
             view, mask, left_rows, disparity, compared, textured, settings.fill_support
         )
-        mask = fill_gaps(view, profile, mask, consistent, settings.fill_gap_m)
+        mask = fill_gaps(view, profile, mask, consistent & ~compared.denied, settings.fill_gap_m)
         return drop_islands(mask, settings.island_share)
 
     def _scan(

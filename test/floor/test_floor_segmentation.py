@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from floor_scenes import CAMERA, MOUNT, Scene, box, floor_patch, ramp, wall
+from floor_scenes import CAMERA, MOUNT, Patch, Scene, box, floor_patch, ramp, wall
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
@@ -118,6 +118,34 @@ def test_a_ramp_is_floor(slope_deg, least_recall):
     assert recall > least_recall
 
 
+@pytest.mark.parametrize('slope_deg', [8.0, 15.0])
+def test_a_ramp_is_floor_when_nothing_else_is_in_sight(slope_deg):
+    scene = Scene([floor_patch(far_m=0.25), ramp(0.25, np.radians(slope_deg))])
+    observation, floor, depth = segment(scene)
+    precision, _ = shares(observation, floor, depth)
+    below_camera = points_of(scene, depth)[..., 2] < 0.25
+    _, recall = shares(observation, floor & below_camera, depth)
+    assert precision > 0.99
+    assert recall > 0.8
+
+
+def test_remembered_floor_is_not_drawn_beyond_a_crest():
+    """Floor ahead was seen before; now a wall is seen over the crest, where it ends."""
+    wall_behind = wall(5.0, contrast=8.0)
+    stage = FloorSegmentation(CAMERA, SETTINGS)
+    for seed in range(3):
+        left, right, _, _ = Scene([floor_patch(far_m=5.0), wall_behind], seed=seed).render()
+        stage.process(left, right, MOUNT, np.eye(4))
+    # The same place in the map; what is ahead ends in a drop of 0.5 m after 1.2 m.
+    left, right, floor, _ = Scene(
+        [floor_patch(far_m=1.2), Patch((5.0, -4, -3), (0, 8, 0), (0, 0, 5.5), False, contrast=8.0)]
+    ).render()
+    mask = stage.process(left, right, MOUNT, np.eye(4)).mask
+    called = mask == FLOOR
+    assert (called & floor).sum() / floor.sum() > 0.97
+    assert (called & ~floor).sum() / called.sum() < 0.05
+
+
 @pytest.mark.parametrize('drop_m', [0.10, 0.15])
 def test_the_floor_below_a_kerb_is_not_floor(drop_m):
     lower = dataclasses.replace(floor_patch(near_m=1.5, height_m=-drop_m), is_floor=False)
@@ -165,13 +193,6 @@ def test_the_left_border_is_known_from_before():
     assert shares_of_corner[-1] > 0.7
 
 
-def with_blank_patch(image, first_column):
-    """Return the image with a patch of floor that has lost its texture."""
-    image = image.copy()
-    image[300:, first_column : first_column + 200] = 90
-    return image
-
-
 @pytest.mark.parametrize(
     ('change', 'is_remembered'),
     [
@@ -182,11 +203,13 @@ def with_blank_patch(image, first_column):
     ],
 )
 def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_remembered):
-    scene = Scene([floor_patch(), wall(3.0)])
+    """A patch of floor has lost its texture, and nothing but what was seen before fills it."""
+    scene, wet = Scene([floor_patch(), wall(3.0)]), floor_patch(0.6, 1.5, 0.4, 0.001, contrast=0.0)
     left, right, _, _ = scene.render()
-    blank = with_blank_patch(left, 200), with_blank_patch(right, 150)
-    changed = dataclasses.replace(SETTINGS, **change)
-    stage = FloorSegmentation(scene.camera, SETTINGS)
+    blank = Scene([wet, *scene.patches]).render()[:2]
+    before = dataclasses.replace(SETTINGS, fill_support=1.0, fill_gap_m=0.0)
+    changed = dataclasses.replace(before, **change)
+    stage = FloorSegmentation(scene.camera, before)
     for _ in range(3):
         stage.process(left, right, scene.mount, np.eye(4))
     stage.change_settings(changed)
