@@ -21,16 +21,15 @@ class View:
     """What the policy looks at.
 
     frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
-    points of the reference keyframe that several keyframes see. T_last_now: motion (4, 4) since
-    the last keyframe. median_depth_m: of the reference keyframe's points, seen from here.
-    mapper_idle: whether the mapper could take a keyframe at once.
+    points of the last keyframe that several keyframes see. novelty: how far the view is from known
+    ones, in units of what makes it new. mapper_idle: whether the mapper could take a keyframe at
+    once.
     """
 
     frames_since: int
     num_tracked: int
     num_reliable: int
-    T_last_now: Array
-    median_depth_m: float
+    novelty: float
     mapper_idle: bool = True
 
 
@@ -38,9 +37,8 @@ def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
     """Decide by the published conditions; A1 and A2 also ask for a view that is new, so that a
     robot that stands still adds nothing.
     """
-    novelty = _novelty(view, settings)
-    new_view = novelty > 1
-    due = view.frames_since >= settings.keyframe_min_frames or novelty > MUCH_NEW
+    new_view = view.novelty > 1
+    due = view.frames_since >= settings.keyframe_min_frames or view.novelty > MUCH_NEW
     a1 = view.frames_since >= settings.keyframe_max_frames and new_view
     a2 = view.mapper_idle and due and new_view
     a3 = view.num_tracked < settings.keyframe_tracked_ratio * view.num_reliable
@@ -48,9 +46,13 @@ def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
     return b and (a1 or a2 or a3)
 
 
-def _novelty(view: View, settings: StereoSlamSettings) -> float:
-    """Return the motion since the last keyframe, in units of what makes a view new."""
-    moved = float(np.linalg.norm(view.T_last_now[:3, 3]))
-    turned = rotation_angle(view.T_last_now[:3, :3])
-    near = settings.keyframe_motion_ratio * view.median_depth_m
-    return max(moved / near, turned / settings.keyframe_turn_rad)
+def novelty(T_known_now: Array, median_depth_m: float, settings: StereoSlamSettings) -> float:
+    """Return the motion (4, 4) from a known view in units of what makes a view new.
+    median_depth_m: of what is seen.
+    """
+    moved = float(np.linalg.norm(T_known_now[:3, 3]))
+    turned = rotation_angle(T_known_now[:3, :3])
+    return max(
+        moved / (settings.keyframe_motion_ratio * median_depth_m),
+        turned / settings.keyframe_turn_rad,
+    )

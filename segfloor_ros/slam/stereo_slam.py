@@ -30,16 +30,18 @@ from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map, take_snapshot
 from segfloor_ros.slam.patch_alignment import sample_patches
-from segfloor_ros.slam.results import (
-    NO_POINT,
-    FrameResult,
-)
+from segfloor_ros.slam.places import view_novelty, views_near
+from segfloor_ros.slam.residuals import MIN_DEPTH_M
+from segfloor_ros.slam.results import NO_POINT, FrameResult
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking import FeatureTrack, Tracker
 from segfloor_ros.timing import StageTimes
 
 LOCAL_MAP_KEYFRAMES = 20
+PLACE_KEYFRAMES = 10
+"""Keyframes of the local map that belong to it by where they are."""
+
 RECOVERY_KEYFRAMES = 3
 UNKNOWN_COVARIANCE = 1e6
 MAX_HELD_KEYFRAMES = 50
@@ -164,7 +166,7 @@ class StereoSlam:
         self._lost = False
         self._T_camera_world = track.T_camera_world
         self._sighting = Sighting(images.small, track.point_ids, track.uv_px)
-        self._local_ids = self._choose_local_points(track.point_ids)
+        self._local_ids = self._choose_local_points(track.point_ids, track.T_camera_world)
         self.map.note_tracking(track.visible_ids, track.point_ids)
         self._frames_since_keyframe += 1
         return track
@@ -209,7 +211,7 @@ class StereoSlam:
             images,
             features,
             self.map,
-            self._choose_local_points(ids),
+            self._choose_local_points(ids, estimate.T_camera_world),
             estimate.T_camera_world,
             self.disparity_offset_px,
         )
@@ -226,24 +228,38 @@ class StereoSlam:
         turn = rotation_angle(motion[:3, :3]) / dt_s
         return speed <= self._settings.max_speed_mps and turn <= self._settings.max_turn_radps
 
-    def _choose_local_points(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+    def _choose_local_points(
+        self, ids: NDArray[np.int32], T_camera_world: Array
+    ) -> NDArray[np.int32]:
+        """Return the points of keyframes that share points with a view, or stand where it is."""
         order, _ = self.map.covisible(ids)
-        local = self.map.points_of(order[:LOCAL_MAP_KEYFRAMES])
+        depth_m = self._median_depth(ids, T_camera_world)
+        here = views_near(self.map, T_camera_world, depth_m, PLACE_KEYFRAMES)
+        local = self.map.points_of(np.append(order[:LOCAL_MAP_KEYFRAMES], here))
         # The oldest first: of two points that fit a feature equally well it is the one to keep.
         return local[np.argsort(self.map.stable_id[local])]
+
+    def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
+        depth = transform_points(T_camera_world, self.map.xyz_world[ids])[:, 2]
+        return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
     def _wants_keyframe(self, track: Track) -> bool:
         last = self.map.keyframes[-1]
         known = last.point_id[last.point_id != NO_POINT]
         reliable = known[self.map.observer_count[known] >= SEEN_BY_SEVERAL]
-        seen = reliable if len(reliable) else known
-        depth = transform_points(track.T_camera_world, self.map.xyz_world[seen])[:, 2]
+        depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         view = View(
             self._frames_since_keyframe,
             len(track.point_ids),
             min(len(reliable), self._settings.tracked_points),
-            last.T_camera_world @ invert(track.T_camera_world),
-            float(np.median(depth)),
+            view_novelty(
+                self._camera,
+                self._settings,
+                self.map,
+                track.point_ids,
+                track.T_camera_world,
+                depth_m,
+            ),
             self._adjusting.idle,
         )
         return is_keyframe(view, self._settings)
@@ -316,7 +332,7 @@ class StereoSlam:
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
         ids = keyframe.point_id[rows]
         self._sighting = Sighting(images.small, ids, keyframe.observations.uvd_px[rows, :2])
-        self._local_ids = self._choose_local_points(ids)
+        self._local_ids = self._choose_local_points(ids, keyframe.T_camera_world)
 
     def _take_adjustment(self, wait: bool) -> None:
         """Bring a finished adjustment into the map. The camera, and with it `odom`, moves along

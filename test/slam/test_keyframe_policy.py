@@ -5,7 +5,7 @@ import pytest
 
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.slam.image_check import FrozenCheck, image_fault
-from segfloor_ros.slam.keyframe_policy import View, is_keyframe
+from segfloor_ros.slam.keyframe_policy import View, is_keyframe, novelty
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 SETTINGS = StereoSlamSettings(
@@ -22,20 +22,27 @@ TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
 
 
 @pytest.mark.parametrize(
+    ('motion', 'depth_m', 'expected'),
+    [(STILL, 2.0, 0.0), (MOVED, 2.0, 2.0), (MOVED, 8.0, 0.5), (TURNED, 2.0, 1.5)],
+)
+def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
+    assert novelty(motion, depth_m, SETTINGS) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
     ('view', 'expected'),
     [
-        (View(10, 200, 300, STILL, 2.0), False),  # nothing new
-        (View(10, 200, 300, MOVED, 2.0), True),  # A2: moved 0.2 > 0.05 · 2
-        (View(10, 200, 300, MOVED, 8.0), False),  # moved little for a scene that far away
-        (View(10, 200, 300, TURNED, 2.0), True),  # A2: turned
-        (View(2, 200, 300, MOVED, 2.0), False),  # too soon
-        (View(1, 200, 300, MOVED, 1.0), True),  # moved 0.2 = 4 · 0.05 · 1: waits for no frames
-        (View(10, 200, 300, MOVED, 2.0, mapper_idle=False), False),  # mapper busy
-        (View(30, 200, 300, MOVED, 2.0, mapper_idle=False), True),  # A1: too many frames
-        (View(500, 200, 300, STILL, 2.0), False),  # standing still adds nothing
-        (View(1, 74, 300, STILL, 2.0), True),  # A3: 74 < 0.25 · 300
-        (View(1, 76, 300, STILL, 2.0), False),
-        (View(1, 15, 300, MOVED, 2.0), False),  # B: not more than 15 tracked
+        (View(10, 200, 300, 0.0), False),  # nothing new
+        (View(10, 200, 300, 1.1), True),  # A2
+        (View(10, 200, 300, 0.9), False),
+        (View(2, 200, 300, 1.5), False),  # too soon
+        (View(1, 200, 300, 4.0), True),  # so new that it waits for no frames
+        (View(10, 200, 300, 1.5, mapper_idle=False), False),  # mapper busy
+        (View(30, 200, 300, 1.5, mapper_idle=False), True),  # A1: too many frames
+        (View(500, 200, 300, 0.0), False),  # standing still adds nothing
+        (View(1, 74, 300, 0.0), True),  # A3: 74 < 0.25 · 300
+        (View(1, 76, 300, 0.0), False),
+        (View(1, 15, 300, 1.5), False),  # B: not more than 15 tracked
     ],
 )
 def test_conditions(view, expected):
