@@ -11,13 +11,18 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.benchmark import announcing
 from segfloor_ros.cli.options import ParamsOption, SetOption
 from segfloor_ros.cli.output import console
-from segfloor_ros.configuration import resolve
+from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.benchmark import Announce
 from segfloor_ros.evaluation.benchmark_rendering import render_once
 from segfloor_ros.evaluation.benchmark_slam import DRIVES, DriveResult, measure_drive
+from segfloor_ros.evaluation.endless_drive import write_endless_drive
+from segfloor_ros.evaluation.soak import Soak, SoakPart
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.simulation.any_scene import open_scene
 
 
@@ -35,6 +40,17 @@ def benchmark_slam(
         Optional[Path],  # noqa: UP045
         typer.Option(help='Keep renderings here; what is there is used again.'),
     ] = None,
+    soak_minutes: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help='Drive each recording to and fro for so long, in recording time, through all '
+            'five stages; 0: once, SLAM alone.',
+        ),
+    ] = 0.0,
+    rate: Annotated[
+        float, typer.Option(min=0.0, help='Frames a second of a soak. [default: as recorded]')
+    ] = 0.0,
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
@@ -46,9 +62,55 @@ def benchmark_slam(
         with announcing() as announce:
             for drive in drives or DRIVES:
                 for name, recording in _recordings(drive, seeds, folder, announce):
+                    if soak_minutes:
+                        parts = _soak(name, recording, configuration, soak_minutes, rate, announce)
+                        console.print(soak_table(name, parts))
+                        continue
                     report = announce(f'tracking {name}', len(list(recording.glob('image_0/*'))))
                     results.append(measure_drive(name, recording, configuration, report))
-    console.print(drives_table(results))
+    if results:
+        console.print(drives_table(results))
+
+
+def _soak(
+    name: str,
+    recording: Path,
+    configuration: Configuration,
+    minutes: float,
+    rate_hz: float,
+    announce: Announce,
+) -> list[SoakPart]:
+    settings = dataclasses.replace(configuration.stereo_camera, input=str(recording))
+    source = open_source(settings)
+    truth = read_trajectory(recording / 'poses.txt')[1]
+    with tempfile.TemporaryDirectory(prefix='segfloor-soak-') as folder:
+        path = write_endless_drive(source, Path(folder) / 'drive', 60 * minutes, rate_hz=rate_hz)
+        drive = open_source(dataclasses.replace(settings, input=str(path)))
+        report = announce(f'soaking {name}', drive.frame_count or 0)
+        pipeline = Pipeline(drive.camera, configuration)
+        return Soak(pipeline, drive, truth).run(report)
+
+
+def soak_table(name: str, parts: list[SoakPart]) -> Table:
+    """Return a row for each part of a soak."""
+    columns = ('tracked', 'keyframes', 'in map', 'points', 'CPU ms', 'p95', 'error m', 'MB')
+    table = Table('minutes', *columns, padding=0, title=name)
+    for column in table.columns:
+        column.justify, column.no_wrap = 'right', True
+    for part in parts:
+        middle, high = part.frame_ms
+        table.add_row(
+            f'{part.minutes:.0f}',
+            f'{part.tracked}/{part.frames}',
+            f'{part.keyframes}',
+            f'{part.views}',
+            f'{part.points}',
+            f'{middle:.1f}',
+            f'{high:.1f}',
+            f'{part.error_m:.4f}',
+            f'{part.rss_mb:.1f}',
+        )
+    return table
 
 
 def _recordings(drive: str, seeds: int, folder: Path, announce: Announce) -> list[tuple[str, Path]]:

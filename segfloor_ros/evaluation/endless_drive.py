@@ -12,28 +12,38 @@ from segfloor_ros.errors import InputError
 
 
 def write_endless_drive(
-    source: StereoSource, folder: Path, duration_s: float, stands: bool = False
+    source: StereoSource,
+    folder: Path,
+    duration_s: float,
+    stands: bool = False,
+    rate_hz: float = 0.0,
 ) -> Path:
     """Write a KITTI odometry folder in which a recording is driven forwards and backwards in turn,
     and return it. Every image is stored once; the frames link to them. stands: the camera stays
-    where it is in the first frame. Raises InputError for a recording of less than two frames.
+    where it is in the first frame. rate_hz: frames a second, 0: as recorded. Raises InputError for
+    a recording of less than two frames.
     """
     stamps_ns = _write_images(source, folder)
     if len(stamps_ns) < 2:
         raise InputError(f'{source.name}: a drive to and fro needs two frames')
-    period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+    period_s = 1 / rate_hz if rate_hz else float(np.median(np.diff(stamps_ns))) * 1e-9
     count = max(round(duration_s / period_s), 2)
-    turn = 2 * (len(stamps_ns) - 1)
     for camera in (0, 1):
         images = folder / f'image_{camera}'
         images.mkdir()
         for frame in range(count):
-            place = 0 if stands else min(frame % turn, turn - frame % turn)
+            place = 0 if stands else place_of(frame, len(stamps_ns))
             (images / f'{frame:06d}.png').symlink_to(folder / f'stored_{camera}/{place:06d}.png')
     times = ''.join(f'{frame * period_s:.6f}\n' for frame in range(count))
     (folder / 'times.txt').write_text(times)
     _write_calibration(source, folder / 'calib.txt')
     return folder
+
+
+def place_of(frame: int, places: int) -> int:
+    """Return which frame of the recording, of `places`, a frame of the endless drive shows."""
+    turn = 2 * (places - 1)
+    return min(frame % turn, turn - frame % turn)
 
 
 def _write_images(source: StereoSource, folder: Path) -> list[int]:

@@ -16,6 +16,7 @@ from stereo_room import MOUNT
 
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED
+from segfloor_ros.slam.settings import StereoSlamSettings
 
 FRAMES = 16
 
@@ -120,7 +121,7 @@ def test_settings_are_written_as_resolved(result):
     settings = yaml.safe_load((result[0] / 'settings.yaml').read_text())
     slam = settings['stereo_slam']['ros__parameters']
     assert slam['camera_height_m'] == MOUNT.height_m
-    assert slam['num_features'] == 1500
+    assert slam['num_features'] == StereoSlamSettings().num_features
 
 
 def test_masks_show_floor_low_and_none_above_the_horizon(result):

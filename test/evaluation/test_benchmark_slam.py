@@ -12,12 +12,18 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.cli.benchmark_slam import drives_table
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.benchmark_slam import drives_table, soak_table
 from segfloor_ros.cli.main import app
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.benchmark_slam import measure_drive
+from segfloor_ros.evaluation.endless_drive import write_endless_drive
+from segfloor_ros.evaluation.soak import Soak
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import invert
+from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.simulation.renderer import RenderingError
 
 FRAMES = 12
@@ -76,3 +82,22 @@ def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
     rendered = (recordings[0] / 'poses.txt').stat().st_mtime_ns
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert (recordings[0] / 'poses.txt').stat().st_mtime_ns == rendered
+
+
+def test_a_soak_goes_to_and_fro_and_its_map_does_not_grow(drive, tmp_path) -> None:
+    source = open_source(StereoCameraSettings(input=str(drive)))
+    path = write_endless_drive(source, tmp_path / 'drive', duration_s=48.0, rate_hz=2.0)
+    endless = open_source(StereoCameraSettings(input=str(path)))
+    _, truth = read_trajectory(drive / 'poses.txt')
+    pipeline = Pipeline(endless.camera, Configuration())
+    parts = Soak(pipeline, endless, truth).run(lambda done: None)
+    assert [part.frames for part in parts] == list(range(12, 97, 12))
+    assert parts[-1].tracked == 96
+    assert parts[-1].minutes == pytest.approx(95 / 2 / 60)
+    # The first way shows everything; the others show it again.
+    assert parts[-1].keyframes == parts[0].keyframes == parts[0].views
+    assert parts[-1].points == parts[0].points > 100
+    assert all(part.error_m < 0.02 for part in parts)
+    console = Console(record=True, width=80)
+    console.print(soak_table('room', parts))
+    assert '…' not in console.export_text()
