@@ -14,6 +14,7 @@ from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorObservation
+from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.memory import MemoryLog
 from segfloor_ros.pipeline import Pipeline
@@ -44,11 +45,13 @@ class LockstepRun:
         configuration: Configuration,
         folder: OutputFolder,
         save_masks: SaveMasks = SaveMasks.keyframes,
+        save_debug: bool = False,
     ) -> None:
         self._source = source
         self._configuration = configuration
         self._folder = folder
         self._save_masks = save_masks
+        self._save_debug = save_debug
         self._memory = MemoryLog()
         self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
@@ -125,6 +128,12 @@ class LockstepRun:
         self._memory.sample()
         if self._save_masks is not SaveMasks.none:
             self._folder.add_mask(keyframe.frame_index, floor.mask)
+        if self._save_debug:
+            pictures = {
+                'overlay': mask_overlay(keyframe.left, floor.mask),
+                'v_disparity': v_disparity_picture(floor),
+            }
+            self._folder.add_debug(keyframe.frame_index, pictures)
 
     def _why_no_map(self) -> str:
         name = self._configuration.stereo_camera.input

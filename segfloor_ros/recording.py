@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -37,6 +37,7 @@ OUTPUT_NAMES = (
     'camera_trajectory.txt',
     'labelled_cloud.ply',
     'floor_masks',
+    'floor_debug',
     'summary.json',
     'settings.yaml',
 )
@@ -122,6 +123,13 @@ class OutputFolder:
         folder = self._open() / 'floor_masks'
         folder.mkdir(exist_ok=True)
         cv2.imwrite(str(folder / f'{frame_index:06d}.png'), mask)
+
+    def add_debug(self, frame_index: int, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Keep pictures (H, W, 3) BGR of what floor segmentation did with a frame, by name."""
+        folder = self._open() / 'floor_debug'
+        folder.mkdir(exist_ok=True)
+        for name, picture in pictures.items():
+            cv2.imwrite(str(folder / f'{frame_index:06d}_{name}.png'), picture)
 
     def write(self, result: RunResult) -> None:
         """Write every file and move them into place, replacing the files of an earlier run."""

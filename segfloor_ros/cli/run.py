@@ -29,6 +29,13 @@ def run(
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save.')
     ] = SaveMasks.keyframes,
+    save_debug: Annotated[
+        bool,
+        typer.Option(
+            '--save-debug',
+            help='Save pictures of the floor of each keyframe: mask, v-disparity with profile.',
+        ),
+    ] = False,
     report: ReportOption = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
@@ -36,7 +43,7 @@ def run(
     source = open_source(configuration.stereo_camera)
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:
-            result = LockstepRun(source, configuration, folder, save_masks).execute(
+            result = LockstepRun(source, configuration, folder, save_masks, save_debug).execute(
                 lambda done, state: progress.update(TaskID(0), completed=done, note=state)
             )
         folder.write(result)

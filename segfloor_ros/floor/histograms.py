@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.observation import VDisparity
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView
 
@@ -78,10 +79,8 @@ def filtered_v_disparity(
     num_disparities: int,
     bins_per_px: int,
     settings: FloorSegmentationSettings,
-) -> tuple[NDArray[np.intp], int]:
-    """Return the v-disparity (rows, bins) of what is textured and not upright, and its first
-    de-rolled row.
-    """
+) -> VDisparity:
+    """Return the v-disparity of what is textured and not upright."""
     camera = view.camera
     # Half of the columns tell as much.
     disparity = np.ascontiguousarray(disparity[:, ::2])
@@ -107,4 +106,4 @@ def filtered_v_disparity(
     rows = (derolled - np.float32(first - 0.5)).astype(np.intp)
     fine = (disparity.take(at) * np.float32(bins_per_px) + np.float32(0.5)).astype(np.intp)
     counts = v_disparity(rows, fine, (last - first + 1, num * bins_per_px))
-    return counts * (2 * view.step), first
+    return VDisparity(counts * (2 * view.step), first, bins_per_px)

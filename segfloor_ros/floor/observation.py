@@ -44,11 +44,23 @@ class FloorScan:
 
 
 @dataclass(frozen=True)
+class VDisparity:
+    """How often each disparity occurs per row, without what is upright or blank: counts (R, B),
+    row i being the de-rolled image row first_row + i, bin j the disparity j / bins_per_px.
+    """
+
+    counts: NDArray[np.integer]
+    first_row: int
+    bins_per_px: int
+
+
+@dataclass(frozen=True)
 class FloorObservation:
     """The floor seen in one rectified stereo pair.
     disparity_px: (H, W) float32, 0 where there is no match. mask: (H, W) uint8 of `FLOOR`,
     `NO_EVIDENCE` and `NOT_FLOOR`. profile_px: (H,) float64, the floor's disparity at each image row
     in the de-rolled image (NaN above the horizon). scan: the compact free-space scan.
+    v_disparity: what the profile was fitted to.
     """
 
     disparity_px: NDArray[np.float32]
@@ -57,3 +69,4 @@ class FloorObservation:
     scan: FloorScan
     min_disparity_px: float
     max_disparity_px: float
+    v_disparity: VDisparity

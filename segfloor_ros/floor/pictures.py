@@ -22,21 +22,20 @@ def mask_overlay(left: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np
 
 
 def v_disparity_picture(observation: FloorObservation) -> NDArray[np.uint8]:
-    """Return the v-disparity of what is not upright with the floor's profile in green, (H, D, 3)
-    BGR: rows are image rows, columns disparities in half pixels.
+    """Return the filtered v-disparity with the floor's profile in green, (H, B, 3) BGR: rows are
+    rows of the de-rolled image, columns bins of disparity; the brighter the more pixels.
     """
-    disparity, mask = observation.disparity_px, observation.mask
-    height = disparity.shape[0]
-    width = 2 * int(np.ceil(observation.max_disparity_px)) + 1
-    rows, columns = np.nonzero((disparity > 0) & (mask != NOT_FLOOR))
-    bins = np.rint(2 * disparity[rows, columns]).astype(np.intp)
-    counts = np.bincount(rows * width + bins, minlength=height * width)[: height * width]
-    brightness = np.log1p(counts) / max(np.log1p(counts.max()), 1.0) * 255
-    grey = brightness.reshape(height, width).astype(np.uint8)
+    counted, profile = observation.v_disparity, observation.profile_px
+    height, bins = len(profile), counted.counts.shape[1]
+    rows = np.arange(counted.first_row, counted.first_row + len(counted.counts))
+    inside = (rows >= 0) & (rows < height)
+    light = np.log1p(counted.counts[inside].astype(np.float64))
+    grey = np.zeros((height, bins), np.uint8)
+    grey[rows[inside]] = 255 * light / max(light.max(initial=0.0), 1e-6)
     picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    known = np.nonzero(np.isfinite(observation.profile_px))[0]
+    known = np.flatnonzero(np.isfinite(profile))
     if len(known):
-        points = np.stack([2 * observation.profile_px[known], known], axis=1)
+        points = np.stack([counted.bins_per_px * profile[known], known], axis=1)
         line = np.rint(points).astype(np.int32)[:, None]
-        cv2.polylines(picture, [line], False, (0, 220, 0), 1)
-    return picture
+        cv2.polylines(picture, [line], False, _COLOURS_BGR[FLOOR], 1)
+    return picture.astype(np.uint8)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.observation import VDisparity
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
@@ -119,21 +120,19 @@ def spline_basis(positions: NDArray[np.floating]) -> Array:
 
 
 def fit_profile(
-    counts: NDArray[np.integer],
-    first_row: int,
-    bin_px: float,
+    v_disparity: VDisparity,
     line: FloorLine,
     camera: StereoCamera,
     settings: FloorSegmentationSettings,
 ) -> FloorProfile:
     """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
 
-    counts: (R, B), row i is the de-rolled row first_row + i, bin j the disparity j * bin_px.
     Tukey's biweight; first as a line, then as a spline that grows along a floor that bends.
     The result rises strictly with the row and is never above the line's horizon.
     """
+    counts, first_row = v_disparity.counts, v_disparity.first_row
     rows, bins = pixels_where(counts > 0)
-    disparity = bins * bin_px
+    disparity = bins / v_disparity.bins_per_px
     height = counts.shape[0]
     start = max(float(first_row), line.horizon)
     to_position = SEGMENTS / max(first_row + height - 1 - start, 1.0)

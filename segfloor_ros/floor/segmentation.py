@@ -24,6 +24,7 @@ from segfloor_ros.floor.observation import (
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
+    VDisparity,
 )
 from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
@@ -107,7 +108,8 @@ class FloorSegmentation:
             fit = self._plane(first_row, below, texture, enough, expected)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
-            profile = self._profile(view, below, texture > 2 * enough)
+            counted = self._v_disparity(view, below, texture > 2 * enough)
+            profile = fit_profile(counted, view.line, self._camera, settings)
         with measure('comparison'):
             compared = compare(view, profile, left_rows, right_rows, below, noise, settings)
         with measure('evidence'):
@@ -121,7 +123,7 @@ class FloorSegmentation:
             overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
         with measure('scan'):
             scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
-        return self._observation(view, profile, disparity, mask, scan)
+        return self._observation(view, profile, disparity, mask, scan, counted)
 
     def _observation(
         self,
@@ -130,6 +132,7 @@ class FloorSegmentation:
         disparity: NDArray[np.float32],
         mask: NDArray[np.uint8],
         scan: FloorScan,
+        counted: VDisparity,
     ) -> FloorObservation:
         rows = np.arange(self._camera.height, dtype=np.float64)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
@@ -141,6 +144,7 @@ class FloorSegmentation:
             scan=scan,
             min_disparity_px=0.0,
             max_disparity_px=float(self._matcher.num_disparities),
+            v_disparity=counted,
         )
 
     def change_settings(self, settings: FloorSegmentationSettings) -> None:
@@ -269,14 +273,11 @@ class FloorSegmentation:
         unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
         return refine([samples], start, unknown, no_travel, sigma, _PLANE_SCALES_PX)
 
-    def _profile(
+    def _v_disparity(
         self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
-    ) -> FloorProfile:
-        settings = self._settings
-        counts, first = filtered_v_disparity(
-            view, disparity, textured, self._matcher.num_disparities, BINS_PER_PX, settings
-        )
-        return fit_profile(counts, first, 1 / BINS_PER_PX, view.line, self._camera, settings)
+    ) -> VDisparity:
+        most = self._matcher.num_disparities
+        return filtered_v_disparity(view, disparity, textured, most, BINS_PER_PX, self._settings)
 
     def _fill(
         self,

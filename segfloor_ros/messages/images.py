@@ -15,26 +15,28 @@ from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
 
 MAX_PIXELS = 50_000_000
-ENCODINGS = {'mono8': np.uint8, 'mono16': np.uint16, '32FC1': np.float32}
+ENCODINGS = {'mono8': np.uint8, 'mono16': np.uint16, '32FC1': np.float32, 'bgr8': np.uint8}
 """What this package publishes."""
 
 
 def image_message(
     stamp_ns: int, frame_id: str, image: NDArray[np.generic], encoding: str = ''
 ) -> Image:
-    """Return an image (H, W) as a message; grey images of 8 and 16 bits need no encoding."""
+    """Return an image (H, W), or (H, W, 3) with its encoding, as a message; grey images of 8 and 16
+    bits need none.
+    """
     if not encoding:
         encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
     assert image.dtype == ENCODINGS[encoding], (image.dtype, encoding)
     pixels = np.ascontiguousarray(image)
-    height, width = pixels.shape
+    height, width = pixels.shape[:2]
     return Image(
         header=make_header(stamp_ns, frame_id),
         height=height,
         width=width,
         encoding=encoding,
         is_bigendian=0,
-        step=width * pixels.itemsize,
+        step=pixels.strides[0],
         data=array.array('B', pixels.tobytes()),
     )
 

@@ -159,6 +159,24 @@ _ALL = [
         'mono8 on the rectified left image: 255 floor, 127 no evidence, 0 not floor.',
     ),
     Topic(
+        'keyframe/floor_overlay',
+        Image,
+        qos.KEYFRAMES,
+        FLOOR,
+        (),
+        'bgr8, for people: the rectified left image tinted green for floor, blue for no evidence, '
+        'red for not floor. Published while someone listens.',
+    ),
+    Topic(
+        'keyframe/v_disparity',
+        Image,
+        qos.KEYFRAMES,
+        FLOOR,
+        (),
+        'bgr8, for people: the filtered v-disparity (rows: of the de-rolled image; columns: '
+        "half pixels) and the floor's profile in green. Published while someone listens.",
+    ),
+    Topic(
         'keyframe/floor_scan',
         LaserScan,
         qos.KEYFRAMES,

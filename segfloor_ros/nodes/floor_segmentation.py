@@ -10,6 +10,7 @@ from geometry_msgs.msg import TransformStamped
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.mount_check import MountCheck
+from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.messages.camera_info import eye_calibration
@@ -41,6 +42,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._mount_stamp_ns = 0
         self._base_frame = ''
         self._disparity = self.output('keyframe/disparity')
+        self._overlay = self.output('keyframe/floor_overlay')
+        self._v_disparity = self.output('keyframe/v_disparity')
         self._mask = self.output('keyframe/floor_mask')
         self._scan = self.output('keyframe/floor_scan')
         self.listen('camera_mount', self._take_mount)
@@ -89,6 +92,12 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
         if self._disparity.get_subscription_count():
             self._disparity.publish(disparity_message(stamp_ns, frame_id, camera, floor))
+        if self._overlay.get_subscription_count():
+            picture = mask_overlay(left, floor.mask)
+            self._overlay.publish(image_message(stamp_ns, frame_id, picture, 'bgr8'))
+        if self._v_disparity.get_subscription_count():
+            picture = v_disparity_picture(floor)
+            self._v_disparity.publish(image_message(stamp_ns, frame_id, picture, 'bgr8'))
         if self._mount_check is not None and not self._mount_check.is_done:
             self._compare_mounts(self._mount_check.add(left, right, T_map_base))
         return {}

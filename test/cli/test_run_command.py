@@ -52,7 +52,9 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope='module')
 def result(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp('result') / 'out'
-    done = segfloor('run', recording, '--out', out, '--save-masks', 'all', *with_mount())
+    done = segfloor(
+        'run', recording, '--out', out, '--save-masks', 'all', '--save-debug', *with_mount()
+    )
     assert done.returncode == 0, done.stderr
     return out, done
 
@@ -67,6 +69,7 @@ def test_every_promised_file_is_there(result):
         'camera_trajectory.txt',
         'labelled_cloud.ply',
         'floor_masks',
+        'floor_debug',
         'summary.json',
         'settings.yaml',
     }
@@ -139,6 +142,22 @@ def test_a_second_run_gives_the_same_bytes(recording, result, tmp_path):
     for name in ('map.pgm', 'map.yaml', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply'):
         assert (tmp_path / 'out' / name).read_bytes() == (result[0] / name).read_bytes(), name
     assert not (tmp_path / 'out' / 'floor_masks').exists()
+    assert not (tmp_path / 'out' / 'floor_debug').exists()
+
+
+def test_pictures_of_the_floor_are_of_keyframes_and_coloured_by_the_mask(result):
+    out, _ = result
+    names = sorted(path.name for path in (out / 'floor_debug').iterdir())
+    keyframes = json.loads((out / 'summary.json').read_text())['keyframes']
+    assert sum(name.endswith('_overlay.png') for name in names) == keyframes
+    assert sum(name.endswith('_v_disparity.png') for name in names) == keyframes
+    mask = cv2.imread(str(out / 'floor_masks' / names[0][:6]) + '.png', cv2.IMREAD_UNCHANGED)
+    overlay = cv2.imread(str(out / 'floor_debug' / names[0]))
+    assert overlay.shape == (*mask.shape, 3)
+    blue, green, red = (overlay[..., i].astype(int) for i in range(3))
+    assert np.array_equal(green - red > 40, mask == 255)
+    assert np.array_equal(red - green > 40, mask == 0)
+    assert np.array_equal(blue - green > 20, mask == 127)
 
 
 def test_a_truncated_image_is_skipped_and_counted(recording, tmp_path):

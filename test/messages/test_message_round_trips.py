@@ -10,7 +10,7 @@ from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.errors import CalibrationError
-from segfloor_ros.floor.observation import FloorObservation, FloorScan
+from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.messages import clouds, floor, grids, images, poses
@@ -311,9 +311,9 @@ def test_the_floor_scan_survives() -> None:
 
 def test_the_disparity_image_gives_depth() -> None:
     disparity = np.array([[0, 2, 4, 0]] * 3, np.float32)
-    seen = FloorObservation(
-        disparity, np.zeros((3, 4), np.uint8), np.zeros(3), FloorScan(0, 1, disparity[0]), 0.0, 64.0
-    )
+    counted = VDisparity(np.zeros((3, 128), np.intp), 0, 2)
+    mask, scan = np.zeros((3, 4), np.uint8), FloorScan(0, 1, disparity[0])
+    seen = FloorObservation(disparity, mask, np.zeros(3), scan, 0.0, 64.0, counted)
     message = over_the_wire(floor.disparity_message(0, 'eye', _camera(), seen))
     pixels = np.frombuffer(message.image.data, np.float32).reshape(3, 4)
     np.testing.assert_array_equal(pixels, disparity)

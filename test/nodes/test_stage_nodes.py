@@ -28,6 +28,7 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR
 from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.floor.pictures import mask_overlay
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import invert
@@ -259,6 +260,33 @@ def test_floor_segmentation_is_the_stage(make_graph) -> None:
     assert scans[0].header.frame_id == 'base_link'
     np.testing.assert_array_equal(scan_arrays(scans[0], '').ranges_m, expected.scan.ranges_m)
     assert (expected.mask == 255).mean() > 0.1
+
+
+def test_pictures_of_the_floor_are_published_for_those_who_look(make_graph) -> None:
+    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
+    graph = make_graph()
+    masks, overlays = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_overlay')
+    node = graph.add(FloorSegmentationNode())
+    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
+    publishers = publish(graph, {'camera_mount': mount})
+    publish(graph, keyframe_messages(STAMP_NS, frame.left, frame.right), publishers)
+    graph.until(lambda: masks and overlays, 'mask and overlay')
+    expected = mask_overlay(frame.left, grey8_image(masks[0], ''))
+    assert (overlays[0].encoding, overlays[0].step) == ('bgr8', 3 * CAMERA.width)
+    pixels = np.frombuffer(overlays[0].data, np.uint8).reshape(expected.shape)
+    np.testing.assert_array_equal(pixels, expected)
+    drawn = graph.collect('keyframe/v_disparity')
+    (late,) = (p for p in node.publishers if p.topic_name.endswith('/v_disparity'))
+    graph.until(late.get_subscription_count, 'the subscription')
+    publish(graph, keyframe_messages(STAMP_NS + 1, frame.left, frame.right), publishers)
+    graph.until(lambda: drawn, 'the v-disparity')
+    assert to_ns(drawn[0].header.stamp) == STAMP_NS + 1
+    picture = np.frombuffer(drawn[0].data, np.uint8).reshape(CAMERA.height, -1, 3)
+    green = picture[..., 1].astype(int) - picture[..., 2] > 100
+    # The profile: one line from the horizon down, to the right.
+    rows, columns = np.nonzero(green)
+    assert len(np.unique(rows)) > 0.3 * CAMERA.height
+    assert np.corrcoef(rows, columns)[0, 1] > 0.98
 
 
 def test_a_changed_parameter_leaves_the_floor_its_memory(make_graph) -> None:
