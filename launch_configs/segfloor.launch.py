@@ -70,7 +70,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 'log_level',
                 default_value='info',
-                description='What the nodes log: debug, info, warn, error or fatal.',
+                choices=['debug', 'info', 'warn', 'error', 'fatal'],
+                description='From which level on the nodes log.',
             ),
             DeclareLaunchArgument(
                 'rviz', default_value='false', description='Show the map in RViz: true or false.'
