@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from segfloor_ros.configuration import STAGE_SETTINGS
+from segfloor_ros.node_settings import NODE_SETTINGS
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped_scenes
@@ -66,3 +68,27 @@ def test_the_scene_of_the_page_can_be_opened() -> None:
     assert values.pop('like') in shipped_scenes()
     scene = scene_from_mapping(values, 'docs')
     assert scene.boxes[0].size == (0.6, 0.4, 0.3)
+
+
+@pytest.mark.parametrize('page', [DOCS.parent / 'README.md', *sorted(DOCS.glob('*.md'))],
+                         ids=lambda path: path.name)  # fmt: skip
+def test_what_a_page_links_to_is_there(page) -> None:
+    links = re.findall(r'\]\((?!https?:|#)([^)#]+)', page.read_text())
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_the_lifecycle_manager_of_the_page_manages_nodes_that_there_are() -> None:
+    page = (DOCS / 'robot.md').read_text()
+    manager = yaml.safe_load(page.partition('```yaml\n')[2].partition('```')[0])
+    names = manager['lifecycle_manager_segfloor']['ros__parameters']['node_names']
+    assert names == list(STAGE_SETTINGS)[1:]
+
+
+def test_the_parameters_of_the_page_exist() -> None:
+    known = {spec.name for settings in (*STAGE_SETTINGS.values(), *NODE_SETTINGS.values())
+             for spec in settings.specs()}  # fmt: skip
+    named = {'publish_period_s', 'max_waiting_frames', 'lossless', 'publish_odom_tf', 'map_frame',
+             'odom_frame', 'base_frame', 'left_frame', 'right_frame', 'autostart'}  # fmt: skip
+    page = (DOCS / 'robot.md').read_text()
+    assert all(name in page for name in named)
+    assert named <= known

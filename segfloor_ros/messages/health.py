@@ -83,6 +83,10 @@ class Health:
         self._milliseconds.append(milliseconds)
         self._state = state
 
+    def waits(self, state: str) -> None:
+        """Note the words for what is waited for with something that is not processed yet."""
+        self._state = state
+
     def failed(self) -> None:
         """Note that something could not be processed."""
         self._counts['failed'] += 1

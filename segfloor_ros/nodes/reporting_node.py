@@ -111,6 +111,11 @@ class ReportingNode(ManagedNode):
         self._health.processed(milliseconds, message)
         self.report(stamp_ns, level, message, **values, processing_ms=f'{milliseconds:.3f}')
 
+    def report_waiting(self, stamp_ns: int, message: str) -> None:
+        """Publish a status about what cannot be processed yet, and is kept."""
+        self._health.waits(message)
+        self.report(stamp_ns, Level.WARN, message)
+
     def report_fault(self, stamp_ns: int, error: Exception) -> None:
         """Log a fault and publish a status about it."""
         self._health.failed()

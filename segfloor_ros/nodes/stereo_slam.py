@@ -206,7 +206,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self.begin_anew('the place where the last SLAM was killed is not found')
         if not results:
             words = 'waiting for the floor, to measure the mount of the camera'
-            self.report_processed(stamp_ns, Level.WARN, words, milliseconds)
+            self.report_waiting(stamp_ns, words)
 
     def _is_in_order(self, stamp_ns: int) -> bool:
         """Whether a pair comes after the one before; where time has jumped back, e.g. because a

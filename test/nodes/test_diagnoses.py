@@ -222,8 +222,20 @@ def test_rate_delay_and_problems_are_those_of_the_time() -> None:
     level, words, values = found.summary('active')
     assert (level, words, values['rate_hz image']) == (Level.WARN, 'apart', '0.0')
     found.over('stamps')
+    found.waits('waiting for the floor')
+    level, words, values = found.summary('active')
+    assert (level, words, values['processed']) == (Level.OK, 'waiting for the floor', '0')
     found.processed(12.0, 'running')
-    assert found.summary('active')[:2] == (Level.OK, 'running')
+    found.skipped()
+    found.lost('image', 3)
+    level, words, values = found.summary('active')
+    assert (level, words, values['processed']) == (Level.OK, 'running', '1')
+    assert (values['skipped'], values['lost image']) == ('1', '3')
+    found.received('image', 0.1, waited_s=2.5)
+    found.received('image', 0.1, waited_s=0.5)
+    assert found.longest_wait() == ('image', 2.5)
+    assert found.summary('active')[2]['queue_s image'] == '2.500'
+    assert found.longest_wait()[1] == 0.0
 
 
 def test_rows_of_a_pair(frames) -> None:
