@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array
+from segfloor_ros.slam.residuals import weighted_jacobian, with_moment
 
 SMALLEST_PIVOT = 1e-12
 
@@ -171,14 +172,14 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
         in_world[:, :, mine] = R.T @ vectors[:, :, mine]
     edges, free = starts[: at.num_free + 1], slice(0, starts[at.num_free])
     p = at.points_camera[free].T
-    J = _with_moment(p, J[:, :, free])
+    J = with_moment(p, J[:, :, free])
     U = [J[..., a:b].reshape(6, -1) for a, b in pairwise(edges)]
-    of_camera = _sum_runs(_with_moment(p, np.swapaxes(vectors[:, :, free], 0, 1)), edges)
+    of_camera = _sum_runs(with_moment(p, np.swapaxes(vectors[:, :, free], 0, 1)), edges)
     of_point = _sum_by(at.point, in_world, at.num_points)
     return System(
         np.stack([J_k @ J_k.T for J_k in U]),
         _sum_by(at.point, V, at.num_points),
-        _with_moment(p, A[:, :, free]),
+        with_moment(p, A[:, :, free]),
         edges,
         at.point[free],
         -of_camera[:, :, 0],
@@ -194,30 +195,18 @@ def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Arr
     """Return with J = d(u, v, d) / d(point): J^T W^0.5 (3, 3, N), J^T W J (3, 3, N), and both J^T W
     r and J^T W of the disparity alone (2, 3, N).
     """
-    x, y, z = at.points_camera.T
-    size = len(z)
-    su, sv, sd = np.sqrt(at.weight.T)
-    J: Array = np.zeros((3, 3, size))
-    J[0, 0], J[1, 1] = su * (camera.fx / z), sv * (camera.fy / z)
-    J[2, 0], J[2, 1] = -J[0, 0] * x / z, -J[1, 1] * y / z
-    J[2, 2] = -sd * (camera.disparity_times_depth / z**2)
-    M: Array = np.zeros((3, 3, size))
+    root = np.sqrt(at.weight.T)
+    J = weighted_jacobian(camera, at.points_camera, root)
+    M = np.zeros_like(J)
     M[0, 0], M[1, 1] = J[0, 0] ** 2, J[1, 1] ** 2
     M[0, 2] = M[2, 0] = J[0, 0] * J[2, 0]
     M[1, 2] = M[2, 1] = J[1, 1] * J[2, 1]
     M[2, 2] = J[2, 0] ** 2 + J[2, 1] ** 2 + J[2, 2] ** 2
-    ru, rv, rd = at.residual.T * (su, sv, sd)
-    vectors: Array = np.zeros((2, 3, size))
+    ru, rv, rd = at.residual.T * root
+    vectors = np.zeros_like(J[:2])
     vectors[0] = J[0, 0] * ru, J[1, 1] * rv, J[2, 0] * ru + J[2, 1] * rv + J[2, 2] * rd
-    vectors[1, 2] = sd * J[2, 2]
+    vectors[1, 2] = root[2] * J[2, 2]
     return J, M, vectors
-
-
-def _with_moment(p: Array, vectors: Array) -> Array:
-    """Return vectors (3, a, N) with p x vector below them (6, a, N), for points p (3, N)."""
-    x, y, z = p
-    a, b, c = vectors
-    return np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 def _sum_runs(values: Array, edges: NDArray[np.intp]) -> Array:

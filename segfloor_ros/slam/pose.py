@@ -16,14 +16,20 @@ from segfloor_ros.slam.residuals import (
     Observations,
     huber_cost,
     huber_weights,
-    point_jacobians,
-    pose_jacobians,
     residuals,
     squared_norms,
+    weighted_jacobian,
+    with_moment,
 )
 
 ROUNDS = 3
 STEPS_PER_ROUND = 6
+CONVERGED = 1e-4
+"""Relative decrease of the cost, expected or seen, that ends a round."""
+
+SAME_INLIERS = 0.01
+"""Share of the points that changes sides below which another round would change nothing."""
+
 MAX_NOISE_FACTOR = 4.0
 RANSAC_ITERATIONS = 1000
 """Enough for a quarter of right matches, five at a time; it ends early when more are right."""
@@ -94,7 +100,7 @@ def refine_pose(
         excess = chi2 / observations.chi2_median
         factor = float(np.sqrt(np.clip(np.median(excess), 1.0, max_noise_factor**2)))
         before, inliers = inliers, chi2 <= factor**2 * observations.chi2_limit
-        if inliers.sum() < 4 or (inliers == before).all():
+        if inliers.sum() < 4 or (inliers != before).mean() < SAME_INLIERS:
             break
     scaled = observations.take(inliers).with_noise_factor(factor)
     covariance = _covariance(camera, pose, points_world[inliers], scaled)
@@ -129,9 +135,11 @@ def _minimise(
         H, g = _normal_equations(camera, points, residual, information, chi2, limit)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), -g)
         candidate = se3_exp(step) @ pose
+        if -g @ step < CONVERGED * cost:
+            return candidate
         trial = evaluate(candidate)
         if trial[3] <= cost:
-            converged = cost - trial[3] < 1e-4 * cost
+            converged = cost - trial[3] < CONVERGED * cost
             pose, (points, residual, chi2, cost) = candidate, trial
             damping *= 0.2
             if converged:
@@ -149,10 +157,9 @@ def _normal_equations(
     chi2: Array,
     limit: Array,
 ) -> tuple[Array, Array]:
-    weight = information * huber_weights(chi2, limit)[:, None]
-    J = pose_jacobians(point_jacobians(camera, points), points).reshape(-1, 6)
-    weighted = J * weight.reshape(-1, 1)
-    return weighted.T @ J, weighted.T @ residual.ravel()
+    root = np.sqrt(information * huber_weights(chi2, limit)[:, None]).T
+    J = with_moment(points.T, weighted_jacobian(camera, points, root)).reshape(6, -1)
+    return J @ J.T, J @ (residual.T * root).ravel()
 
 
 def _covariance(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import Array, skew
+from segfloor_ros.geometry import Array
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 """95 % quantiles of the chi-squared distribution by degrees of freedom."""
@@ -90,26 +90,27 @@ def residuals(camera: StereoCamera, points: Array, observations: Observations) -
     return residual
 
 
-def point_jacobians(camera: StereoCamera, points: Array) -> Array:
-    """Return d(u, v, d) / d(point), (N, 3, 3), for points (N, 3) of the left optical frame."""
-    inverse_z = 1.0 / points[:, 2]
-    inverse_z2 = inverse_z**2
-    jacobian = np.zeros((len(points), 3, 3))
-    jacobian[:, 0, 0] = camera.fx * inverse_z
-    jacobian[:, 0, 2] = -camera.fx * points[:, 0] * inverse_z2
-    jacobian[:, 1, 1] = camera.fy * inverse_z
-    jacobian[:, 1, 2] = -camera.fy * points[:, 1] * inverse_z2
-    jacobian[:, 2, 2] = -camera.disparity_times_depth * inverse_z2
-    return jacobian
-
-
-def pose_jacobians(point_jacobian: Array, points: Array) -> Array:
-    """Return d(u, v, d) / d(twist), (N, 3, 6), for the update T_camera_world <- exp(twist)
-    T_camera_world.
-
-    d(point)/d(twist) = [I, -skew(point)] (Barfoot 2017, eq. 7.183 with rho first).
+def weighted_jacobian(camera: StereoCamera, points_camera: Array, root: Array) -> Array:
+    """Return J^T W^0.5 (3, 3, N) with J = d(u, v, d) / d(point), for points (N, 3) of the left
+    optical frame and the roots (3, N) of their weights.
     """
-    return np.concatenate([point_jacobian, -point_jacobian @ skew(points)], axis=2)
+    x, y, z = points_camera.T
+    J: Array = np.zeros((3, 3, len(z)))
+    J[0, 0], J[1, 1] = root[0] * (camera.fx / z), root[1] * (camera.fy / z)
+    J[2, 0], J[2, 1] = -J[0, 0] * x / z, -J[1, 1] * y / z
+    J[2, 2] = -root[2] * (camera.disparity_times_depth / z**2)
+    return J
+
+
+def with_moment(p: Array, vectors: Array) -> Array:
+    """Return vectors (3, a, N) with p x vector below them (6, a, N), for points p (3, N).
+
+    A derivative with respect to the point becomes that with respect to the twist of T_camera_world
+    <- exp(twist) T_camera_world (Barfoot 2017, eq. 7.183 with rho first).
+    """
+    x, y, z = p
+    a, b, c = vectors
+    return np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 def squared_norms(residual: Array, information: Array) -> Array:
