@@ -106,9 +106,10 @@ class StereoSlamNodeSettings(NodeSettings):
         choices=('raw', 'compressed'),
     )
     image_reliability: str = setting(
-        'reliable',
-        'Quality of service of the image subscriptions; best_effort where a driver offers no more.',
-        choices=('reliable', 'best_effort'),
+        'auto',
+        'Quality of service of the image subscriptions; auto: reliable, and best effort where a '
+        'driver offers no more.',
+        choices=('auto', 'reliable', 'best_effort'),
     )
     sync_tolerance_s: float = setting(
         0.005,

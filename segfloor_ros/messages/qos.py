@@ -25,7 +25,7 @@ IMAGES = _reliable(IMAGE_DEPTH)
 """Camera images and their calibrations."""
 
 IMAGES_BEST_EFFORT = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.BEST_EFFORT
+    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT
 )
 """Camera images of drivers that publish best effort; frames may be lost."""
 
@@ -49,11 +49,6 @@ TF_STATIC_LISTENER = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 
 DIAGNOSTICS = _reliable(KEYFRAME_DEPTH)
 """Status messages."""
-
-
-def images(reliability: str) -> QoSProfile:
-    """Return the profile of an image subscription for `reliable` or `best_effort`."""
-    return IMAGES_BEST_EFFORT if reliability == 'best_effort' else IMAGES
 
 
 def describe(profile: QoSProfile) -> str:

@@ -115,6 +115,12 @@ class ManagedNode(LifecycleNode):
         self._is_needed = needed
         self._open_or_close()
 
+    def reopen(self) -> None:
+        """Close the inputs and open them again, to subscribe otherwise."""
+        if self._open:
+            self._close()
+            self._open_or_close()
+
     def keep_publisher(
         self, kind: Any, name: str, profile: QoSProfile
     ) -> Publisher | LocalPublisher:
@@ -156,13 +162,13 @@ class ManagedNode(LifecycleNode):
         kind: Any,
         name: str,
         callback: TopicCallback,
-        profile: QoSProfile,
+        choose_profile: Callable[[], QoSProfile],
         raw: bool = False,
     ) -> None:
         """Subscribe to a topic while the inputs are open. raw: take the serialized messages."""
 
         def subscribe() -> Subscription | LocalSubscription:
-            local = None
+            local, profile = None, choose_profile()
             if self._hand_over is not None:
                 topic = self.resolve_topic_name(name)
                 local = self._hand_over.subscribe(topic, callback, profile, raw)
@@ -301,11 +307,14 @@ class ManagedNode(LifecycleNode):
             self._open = [(make(), destroy) for make, destroy in self._openers]
             self.on_inputs_opened()
         elif not self.is_open and self._open:
-            while self._open:
-                entity, destroy = self._open.pop()
-                destroy(entity)
-            self._heard.clear()
-            self.on_inputs_closed()
+            self._close()
+
+    def _close(self) -> None:
+        while self._open:
+            entity, destroy = self._open.pop()
+            destroy(entity)
+        self._heard.clear()
+        self.on_inputs_closed()
 
     def _unsubscribe(self, subscription: Subscription | LocalSubscription) -> None:
         if not isinstance(subscription, LocalSubscription):

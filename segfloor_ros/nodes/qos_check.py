@@ -12,6 +12,19 @@ from rclpy.subscription import Subscription
 from segfloor_ros.messages.qos import describe_policies
 
 
+def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
+    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
+    lossy = ReliabilityPolicy.BEST_EFFORT
+    return [
+        topic
+        for topic in topics
+        if any(
+            info.qos_profile.reliability == lossy
+            for info in node.get_publishers_info_by_topic(topic)
+        )
+    ]
+
+
 def incompatible_topics(
     node: Node, publishers: Iterable[Publisher], subscriptions: Iterable[Subscription]
 ) -> Iterator[tuple[str, str]]:

@@ -131,6 +131,9 @@ class ReportingNode(ManagedNode):
         self._health.found(about, level, text, lasts_s)
         self.say(text, about)
 
+    def adapt(self) -> None:
+        """Follow what others offer; called once a second while the inputs are open."""
+
     def find_problems(self) -> None:
         """Diagnose what shows over time; called once a second while the inputs are open."""
 
@@ -214,6 +217,7 @@ class ReportingNode(ManagedNode):
 
     def _report_health(self) -> None:
         if self.is_open:
+            self.adapt()
             self._find_unconnected()
             self._find_queues()
             self.find_problems()

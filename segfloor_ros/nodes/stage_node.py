@@ -102,11 +102,12 @@ class StageNode(ReportingNode, Generic[Stage, Own]):
         self,
         name: str,
         callback: Callable[[Any], None],
-        profile: QoSProfile | None = None,
+        choose_profile: Callable[[], QoSProfile] | None = None,
         raw: bool = False,
     ) -> None:
         """Subscribe to a topic of `TOPICS` while the node is active; faults in the callback are
-        logged with the topic's name. raw: hand on the serialized message.
+        logged with the topic's name. raw: hand on the serialized message. choose_profile: asked
+        whenever the inputs open.
         """
         topic = TOPICS[name]
 
@@ -117,7 +118,8 @@ class StageNode(ReportingNode, Generic[Stage, Own]):
             except Exception as error:
                 self.say_fault(name, error)
 
-        self.subscribe_while_open(topic.type, name, guarded, profile or topic.profile, raw)
+        choose = choose_profile or (lambda: topic.profile)
+        self.subscribe_while_open(topic.type, name, guarded, choose, raw)
 
     def joiner(self, parts: Sequence[str], **limits: Any) -> StampJoiner:
         """Return a joiner that is emptied when the inputs close."""

@@ -8,6 +8,7 @@ from collections import deque
 from functools import partial
 from typing import Any
 
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
@@ -23,6 +24,7 @@ from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.camera_watch import CameraWatch
 from segfloor_ros.nodes.hand_over import HandOver
+from segfloor_ros.nodes.qos_check import offered_best_effort
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.slam_resumption import SlamResumption
 from segfloor_ros.nodes.stage_node import StageNode, run_node
@@ -55,6 +57,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._transforms = Transforms(self, own)
         self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
+        self._takes_best_effort = own.image_reliability == 'best_effort'
         self._left, self._right = self._subscribe(own)
         self._watch = CameraWatch(self, own, self._left, self._right)
         self._work = self.when_idle(self._work_off)
@@ -114,12 +117,27 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         kind = 'image_rect' if own.rectified_input else 'image_raw'
         kind += '/compressed' if own.image_transport == 'compressed' else ''
         left, right = f'left/{kind}', f'right/{kind}'
-        profile = qos.images(own.image_reliability)
         for info in INFOS:
-            self.listen(info, partial(self._take_info, info), profile)
+            self.listen(info, partial(self._take_info, info), self._image_profile)
         for image in (left, right):
-            self.listen(image, partial(self._take_image, image), profile)
+            self.listen(image, partial(self._take_image, image), self._image_profile)
         return left, right
+
+    def _image_profile(self) -> QoSProfile:
+        return qos.IMAGES_BEST_EFFORT if self._takes_best_effort else qos.IMAGES
+
+    def adapt(self) -> None:
+        """Take the images best effort where a driver offers no more, if the choice is left to the
+        node.
+        """
+        if self._takes_best_effort or self.parameters.own.image_reliability != 'auto':
+            return
+        lossy = offered_best_effort(self, (*INFOS, self._left, self._right))
+        if lossy:
+            self._takes_best_effort = True
+            names = ', '.join(lossy)
+            self.get_logger().info(f'taken best effort, as offered: {names}; images may get lost')
+            self.reopen()
 
     def _take_info(self, topic: str, message: CameraInfo) -> None:
         if topic in self._infos and same_calibration(message, self._infos[topic]):

@@ -80,7 +80,7 @@ class Driver:
 
 
 def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN)
+    graph = make_graph(*GIVEN, '-p', 'image_reliability:=reliable')
     driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
     graph.add(StereoSlamNode())
     words = ('/left/image_raw', '/tester', 'best effort', 'stereo_slam.image_reliability')
@@ -97,6 +97,24 @@ def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph,
         driver.send(side, 0, getattr(frames[0], side))
     status = says(graph, 'stereo_slam', 'tracking')
     assert status.level is Level.OK
+
+
+@pytest.mark.parametrize('comes_first', ['driver', 'slam'])
+def test_images_offered_best_effort_are_taken_as_that_by_themselves(
+    make_graph, frames, comes_first
+) -> None:
+    graph = make_graph(*GIVEN)
+    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT) if comes_first == 'driver' else None
+    node = graph.add(StereoSlamNode())
+    says(graph, 'stereo_slam', '')
+    driver = driver or Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    driver.connect()
+    (info,) = node.get_subscriptions_info_by_topic('/left/image_raw')
+    assert info.qos_profile.reliability.name == 'BEST_EFFORT'
+    graph.statuses.clear()
+    for side in ('left', 'right'):
+        driver.send(side, 0, getattr(frames[0], side))
+    assert says(graph, 'stereo_slam', 'tracking').level is Level.OK
 
 
 def test_a_listener_that_asks_for_more_than_is_offered_is_named(make_graph) -> None:
