@@ -2,7 +2,8 @@
 
 Plain floor shows nothing that both cameras see alike, but what stands behind it does: an upright
 surface has the disparity of the floor on which it stands. Where a plain stretch that begins with
-floor ends at such a surface, and at the row where that surface meets the floor, all of it is floor.
+floor, or at the lower edge of the image, ends at such a surface, and at the row where that surface
+meets the floor, all of it is floor.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ def fill_to_contact(
     last = small.shape[0] - 1
     below = np.minimum.accumulate(np.where(open_, last, rows)[::-1], axis=0)[::-1]
     starts = np.take_along_axis(small, below, axis=0) == FLOOR
+    starts |= open_[last] & (below == last)
     return open_ & starts & np.take_along_axis(contact, above, axis=0)
 
 

@@ -14,8 +14,11 @@ FIRST_ROW = 200
 SEEN_ROW, CONTACT_ROW = 160, 80  # of the view: floor is seen from the one, a wall up to the other
 
 
-def filled(wall_px_of_floor: float) -> np.ndarray:
-    """Return what is filled below a wall, its disparity as a multiple of the floor's there."""
+def filled(wall_px_of_floor: float, seen_row: int = SEEN_ROW) -> np.ndarray:
+    """Return what is filled below a wall, its disparity as a multiple of the floor's there.
+
+    seen_row: from where on floor is seen.
+    """
     view = FloorView.of(CAMERA, MOUNT, FIRST_ROW)
     line = FloorLine.of(CAMERA, MOUNT)
     grid = np.arange(np.ceil(line.horizon), CAMERA.height)
@@ -24,7 +27,7 @@ def filled(wall_px_of_floor: float) -> np.ndarray:
     rows = np.broadcast_to(np.arange(shape[0])[:, None], shape)
     wall = rows < CONTACT_ROW
     mask = np.full(shape, NO_EVIDENCE, np.uint8)
-    mask[rows >= SEEN_ROW], mask[wall] = FLOOR, NOT_FLOOR
+    mask[rows >= seen_row], mask[wall] = FLOOR, NOT_FLOOR
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
     nothing = np.zeros(shape, bool)
@@ -43,6 +46,11 @@ def test_floor_goes_on_to_the_foot_of_a_wall():
 @pytest.mark.parametrize('ratio', [1.3, 0.4])
 def test_not_where_the_wall_stands_nearer_or_is_far_behind(ratio):
     assert not filled(ratio).any()
+
+
+def test_it_may_begin_at_the_lower_edge_of_the_image():
+    assert filled(1.0, seen_row=1000).all()
+    assert not filled(1.3, seen_row=1000).any()
 
 
 def test_not_below_what_has_no_disparity():
