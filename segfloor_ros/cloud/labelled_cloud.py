@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.cloud.evidence import height_evidence, local_floor_m, mask_evidence
-from segfloor_ros.cloud.labels import OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.cloud.point_table import PointTable
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.geometry import Array
@@ -22,6 +22,7 @@ class CloudLabelling:
 
     def __init__(self, settings: CloudLabellingSettings) -> None:
         self.settings = settings
+        self._judged_by = settings
         self._table = PointTable()
 
     def update(
@@ -45,23 +46,41 @@ class CloudLabelling:
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, looks < 0, T_map_base)
         table.look(row, looks, settings.max_mask_log_odds, floor_z, distance_m)
-        return self._labelled(cloud)
-
-    def _labelled(self, cloud: SparseCloud) -> LabelledPoints:
-        table, settings = self._table, self.settings
-        height_m = cloud.xyz_map[:, 2] - table.floor_z_m
-        sigma_m = settings.height_sigma_m + settings.height_sigma_per_m * table.distance_m
-        by_height = height_evidence(height_m, sigma_m, settings) * (table.looks > 0)
-        log_odds = table.mask_log_odds + by_height
-        table.decide(log_odds, settings.label_log_odds)
-        concerned = height_m <= settings.robot_height_m
-        concerned &= height_m >= -(settings.drop_height_m + 2 * sigma_m)
-        label = np.where(concerned, table.label, UNKNOWN).astype(np.uint8)
-        towards = np.where(label == OBSTACLE, log_odds, -log_odds)
-        certainty = np.clip(np.tanh(towards / 2), 0, 1)
+        z_m = cloud.xyz_map[:, 2]
+        stale = table['judged_z_m'] != z_m
+        stale[row] = True
+        if self._judged_by != settings:
+            stale[:] = True
+            self._judged_by = settings
+        self._judge(np.flatnonzero(stale), z_m)
         return LabelledPoints(
             point_id=cloud.point_id,
             xyz_map=cloud.xyz_map,
-            label=label,
-            confidence=np.where(label == UNKNOWN, 0, certainty).astype(np.float32),
+            label=table['label'].copy(),
+            confidence=table['confidence'].copy(),
         )
+
+    def _judge(self, row: NDArray[np.intp], z_m: NDArray[np.float32]) -> None:
+        """Label the points of rows (M,), which were looked at or moved; z_m: of all points (N,).
+
+        All others are as far above the floor as before, and so would be their labels.
+        """
+        table, settings = self._table, self.settings
+        looked = table['looks'][row] > 0
+        height_m = z_m[row] - table['floor_z_m'][row]
+        sigma_m = settings.height_sigma_m + settings.height_sigma_per_m * table['distance_m'][row]
+        by_height = height_evidence(height_m, sigma_m, settings) * looked
+        log_odds = table['mask_log_odds'][row] + by_height
+        belief = table['belief'][row]
+        # Between the thresholds it stays as it is.
+        belief[log_odds >= settings.label_log_odds] = OBSTACLE
+        belief[log_odds <= -settings.label_log_odds] = FLOOR
+        belief[~looked] = UNKNOWN
+        concerned = height_m <= settings.robot_height_m
+        concerned &= height_m >= -(settings.drop_height_m + 2 * sigma_m)
+        label = np.where(concerned, belief, UNKNOWN)
+        towards = np.where(label == OBSTACLE, log_odds, -log_odds)
+        certainty = np.clip(np.tanh(towards / 2), 0, 1)
+        table['belief'][row], table['judged_z_m'][row] = belief, z_m[row]
+        table['label'][row] = label
+        table['confidence'][row] = np.where(label == UNKNOWN, 0, certainty)

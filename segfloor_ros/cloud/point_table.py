@@ -1,35 +1,53 @@
-"""What is remembered of every point, as arrays in the order of the cloud's ids."""
+"""What is remembered of every point, in the order of the cloud's ids."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN
 from segfloor_ros.geometry import Array
+
+_COLUMNS: dict[str, tuple[type, float]] = {
+    'mask_log_odds': (np.float32, 0),
+    'looks': (np.int32, 0),
+    'floor_z_m': (np.float32, 0),
+    'distance_m': (np.float32, 0),
+    'belief': (np.uint8, 0),
+    'judged_z_m': (np.float32, np.nan),
+    'label': (np.uint8, 0),
+    'confidence': (np.float32, 0),
+}
+"""Type and first value. belief: what the evidence says, with hysteresis; label, confidence: what
+is told of it. judged_z_m: where the point was when that was decided, in frame `map`.
+"""
 
 
 class PointTable:
-    """Evidence by point id; rows follow the cloud: removed points vanish, new ones start empty."""
+    """Points by id; rows follow the cloud: removed points vanish, new ones start empty."""
 
     def __init__(self) -> None:
         self.point_id = np.zeros(0, np.int32)
-        self.mask_log_odds = np.zeros(0, np.float32)
-        self.looks = np.zeros(0, np.int32)
-        self.floor_z_m = np.zeros(0, np.float32)
-        self.distance_m = np.zeros(0, np.float32)
-        self.label = np.zeros(0, np.uint8)
+        self._columns = _empty(0)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return a column (N,), to be read and written."""
+        return self._columns[name][: len(self.point_id)]
 
     def follow(self, point_id: NDArray[np.int32]) -> None:
         """Make the rows those of the ids (N,), ascending."""
-        row = np.searchsorted(self.point_id, point_id)
-        row = np.minimum(row, max(len(self.point_id) - 1, 0))
-        known = self.point_id[row] == point_id if len(self.point_id) else np.zeros(row.shape, bool)
-        for name in ('mask_log_odds', 'looks', 'floor_z_m', 'distance_m', 'label'):
-            old = getattr(self, name)
-            new = np.zeros(len(point_id), old.dtype)
-            new[known] = old[row[known]]
-            setattr(self, name, new)
+        known, count = len(self.point_id), len(point_id)
+        if not np.array_equal(point_id[:known], self.point_id):
+            at, row = self.rows_of(point_id)
+            kept = _empty(count)
+            for name, column in kept.items():
+                column[at] = self._columns[name][row]
+            self._columns = kept
+        elif count > len(self._columns['looks']):
+            # Room to grow, so that not every keyframe copies all of it.
+            for name, column in _empty(count - known + known // 4).items():
+                self._columns[name] = np.concatenate([self[name], column])
         self.point_id = point_id
 
     def rows_of(self, ids: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -49,16 +67,14 @@ class PointTable:
         distance_m: Array,
     ) -> None:
         """Add one look at the points of rows (M,): evidence, floor height and distance (M,)."""
-        total = self.mask_log_odds[row] + evidence
-        self.mask_log_odds[row] = np.clip(total, -limit, limit)
+        total = self['mask_log_odds'][row] + evidence
+        self['mask_log_odds'][row] = np.clip(total, -limit, limit)
         # The nearest look placed the point best.
-        nearer = (self.looks[row] == 0) | (distance_m < self.distance_m[row])
-        self.distance_m[row[nearer]] = distance_m[nearer]
-        self.floor_z_m[row] = floor_z_m
-        self.looks[row] += 1
+        nearer = (self['looks'][row] == 0) | (distance_m < self['distance_m'][row])
+        self['distance_m'][row[nearer]] = distance_m[nearer]
+        self['floor_z_m'][row] = floor_z_m
+        self['looks'][row] += 1
 
-    def decide(self, log_odds: Array, threshold: float) -> None:
-        """Set the labels by evidence (N,); between the thresholds a label stays as it is."""
-        self.label[log_odds >= threshold] = OBSTACLE
-        self.label[log_odds <= -threshold] = FLOOR
-        self.label[self.looks == 0] = UNKNOWN
+
+def _empty(count: int) -> dict[str, NDArray[Any]]:
+    return {name: np.full(count, first, kind) for name, (kind, first) in _COLUMNS.items()}

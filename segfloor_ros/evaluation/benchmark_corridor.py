@@ -41,6 +41,11 @@ class Corridor:
         rng = np.random.default_rng(seed)
         self.keyframes = keyframes
         self._points = _points(keyframes * STRIDE_M + SIGHT_M, rng)
+        # As they lie in the map before and after a correction: what is handed out takes no memory.
+        self._xyz_map = [
+            transform_points(turn, self._points).astype(np.float32) for turn in _corrections()
+        ]
+        self._point_id = np.arange(len(self._points), dtype=np.int32)
         self._mask = floor_mask()
         self._scan_rng = rng
 
@@ -50,17 +55,17 @@ class Corridor:
         T_world_base = np.tile(np.eye(4), (self.keyframes, 1, 1))
         T_world_base[:, 0, 3] = np.arange(self.keyframes) * STRIDE_M
         for index in range(self.keyframes):
-            T_map_world = _correction(index)
-            path = T_map_world @ T_world_base[: index + 1]
+            turned = index // CORRECTION_EVERY % 2
+            path = _corrections()[turned] @ T_world_base[: index + 1]
             x_m = index * STRIDE_M
             known = int(np.searchsorted(self._points[:, 0], x_m + SIGHT_M))
             first = int(np.searchsorted(self._points[:, 0], x_m))
-            xyz_map = transform_points(T_map_world, self._points[:known]).astype(np.float32)
+            xyz_map = self._xyz_map[turned][:known]
             yield MapInput(
                 int(stamp_ns[index]),
                 self._features(first, T_world_base[index], xyz_map),
                 KeyframePath(stamp_ns[: index + 1], path),
-                SparseCloud(np.arange(known, dtype=np.int32), xyz_map),
+                SparseCloud(self._point_id[:known], xyz_map),
                 self._mask,
                 self._scan(),
             )
@@ -117,8 +122,8 @@ def _points(length_m: float, rng: np.random.Generator) -> Array:
     return np.stack([x, y + noise[:, 0], z + noise[:, 1]], axis=1)
 
 
-def _correction(index: int) -> Array:
-    """Return how the map has turned by keyframe `index`, (4, 4): to and fro."""
-    yaw = CORRECTION_RAD * (index // CORRECTION_EVERY % 2)
-    c, s = np.cos(yaw), np.sin(yaw)
-    return make_transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+def _corrections() -> Array:
+    """Return the two ways in which the map lies in turns, (2, 4, 4)."""
+    c, s = np.cos(CORRECTION_RAD), np.sin(CORRECTION_RAD)
+    turn = make_transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    return np.stack([np.eye(4), turn])

@@ -6,10 +6,11 @@ reach. Evidence against the floor wins: what stands up clears the cells below it
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.view import FloorView
 from segfloor_ros.geometry import Array
@@ -20,6 +21,7 @@ _REACH_M = 4.0
 _MOST_VOTES = 6
 _ENOUGH_VOTES = 2
 _BLOCKED = -2
+_UNSURE_ROWS = 3
 _SWING = 0.15
 """So far, as a share of the focal length, the robot's pitch and roll may move the picture."""
 
@@ -42,7 +44,8 @@ class FloorMemory:
         """Return the mask (R, W) with floor where nothing is seen now and floor was before.
 
         open_: (R, W), where the images do not deny it. Beyond the crest of a ramp the floor that
-        was seen lies lower, out of sight.
+        was seen lies lower, out of sight. What stands at the border of what only the left camera
+        sees is taken to go on there.
         """
         nearest_row = _first_row_within_reach(view)
         rows, columns = pixels_where((mask[nearest_row:] == NO_EVIDENCE) & open_[nearest_row:])
@@ -50,6 +53,7 @@ class FloorMemory:
         xy = view.floor_positions(rows, columns)
         index, inside = self._index(_in_map(T_map_base, xy))
         known = inside & (self._votes.reshape(-1)[index] >= _ENOUGH_VOTES)
+        known &= columns >= _hidden_up_to(view, mask)[rows]
         filled = mask.copy()
         filled[rows[known], columns[known]] = FLOOR
         return filled
@@ -66,7 +70,7 @@ class FloorMemory:
         votes = self._votes.reshape(-1)
         if self._around is None:
             self._around = _cells_in_sight(view)
-        seen = _floor_at(mask, view.pixels_of_floor(self._around))
+        seen = _floor_at(_within(mask), view.pixels_of_floor(self._around))
         index, inside = self._index(_in_map(T_map_base, self._around[:, seen]))
         index = index[inside]
         votes[index] = np.minimum(votes[index] + 1, _MOST_VOTES)
@@ -121,6 +125,24 @@ def _first_row_within_reach(view: FloorView) -> int:
     rows = np.arange(len(view.derolled))
     distance = np.hypot(*view.floor_positions(rows, np.full(len(rows), len(view.columns) // 2)))
     return int(np.argmax(distance < _REACH_M)) if (distance < _REACH_M).any() else len(rows)
+
+
+def _within(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the mask (R, W) without the last rows of floor before it ends, up the image: there
+    it may have crept up what stands behind it, and far away a row is much floor.
+    """
+    upward = np.ones((_UNSURE_ROWS + 1, 1), np.uint8)
+    return cv2.erode(mask, upward, anchor=(0, _UNSURE_ROWS))
+
+
+def _hidden_up_to(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """Return the columns (R,) in which rows of a mask (R, W) begin with something other than
+    floor, next to what only the left camera sees; 0 where they do not.
+    """
+    nearest_floor_px = view.line.slope * (view.derolled.max() - view.line.horizon)
+    first = (mask != NO_EVIDENCE).argmax(axis=1)
+    begins = np.take_along_axis(mask, first[:, None], axis=1)[:, 0] == NOT_FLOOR
+    return np.where(begins & (first * view.step <= nearest_floor_px), first, 0)
 
 
 def _floor_at(mask: NDArray[np.uint8], pixels: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -129,3 +131,38 @@ def test_empty_cloud() -> None:
     labelled = CloudLabelling(CloudLabellingSettings()).update(cloud({}), features({}), MASK)
     assert labelled.label.shape == (0,)
     assert labelled.xyz_map.shape == (0, 3)
+
+
+def test_labels_do_not_depend_on_which_points_were_judged_anew() -> None:
+    """Points come, move and go; changed settings make one of the two judge every point."""
+    rng = np.random.default_rng(3)
+    settings = CloudLabellingSettings()
+    sparing, thorough = CloudLabelling(settings), CloudLabelling(settings)
+    xyz = {i: tuple(rng.uniform((1, -1, -0.1), (5, 1, 1.2))) for i in range(200)}
+    unmoved = 0
+    for step in range(12):
+        for i in rng.choice(list(xyz), 5, replace=False):
+            del xyz[i]
+        for i in rng.choice(list(xyz), 20, replace=False):
+            xyz[i] = (*xyz[i][:2], xyz[i][2] + rng.normal(scale=0.05))
+        xyz |= {200 + 10 * step + i: (2.0, 0.0, rng.uniform(0, 1)) for i in range(10)}
+        pixels = {int(i): tuple(rng.uniform(0, (59, 39))) for i in rng.choice(list(xyz), 60, False)}
+        one = sparing.update(cloud(xyz), features(pixels), MASK)
+        thorough.settings = dataclasses.replace(settings, max_mask_log_odds=10.0 + 0.1 * step)
+        thorough.update(cloud(xyz), features({}), MASK)
+        thorough.settings = settings
+        other = thorough.update(cloud(xyz), features(pixels), MASK)
+        np.testing.assert_array_equal(one.label, other.label)
+        np.testing.assert_array_equal(one.confidence, other.confidence)
+        unmoved += len(xyz) - len(pixels)
+    assert set(one.label.tolist()) == {UNKNOWN, FLOOR, OBSTACLE}
+    assert unmoved > 1000
+
+
+def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    seen = features({1: ON_OBSTACLE})
+    points = cloud({1: (1.0, 0.0, 0.5)})
+    assert label_of(labelling.update(points, seen, MASK)) == {1: OBSTACLE}
+    labelling.settings = dataclasses.replace(labelling.settings, robot_height_m=0.4)
+    assert label_of(labelling.update(points, features({}), MASK)) == {1: UNKNOWN}
