@@ -10,7 +10,8 @@ from segfloor_ros.grid.log_odds import CHUNK, QUANTUM, ZERO, LogOddsRaster, step
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
-_UNREACHED, _REACHED = 1, 2
+_NOTHING, _UNREACHED, _REACHED, _STANDING = range(4)
+"""What a cell is while the map is drawn."""
 
 
 def render(
@@ -18,12 +19,15 @@ def render(
 ) -> OccupancyGrid:
     """Return the grid of a raster; path_xy_m: (K, 2), where the base has been."""
     first, cells = _touched(raster)
-    state = _trinary(cells, settings)
+    kinds = cv2.LUT(cells, _kinds(settings))
     if settings.connected_only:
         at = np.floor(path_xy_m / settings.resolution_m).astype(np.intp)
-        state[_unreached(state, at[:, 1] - first[0], at[:, 0] - first[1])] = UNKNOWN
+        _reach(kinds, at[:, 1] - first[0], at[:, 0] - first[1])
     if settings.opening_cells > 1:
-        state[_narrow(state, settings.opening_cells)] = UNKNOWN
+        kinds[_narrow(kinds, settings.opening_cells)] = _NOTHING
+    values = np.full(256, UNKNOWN, np.int8)
+    values[_REACHED], values[_STANDING] = FREE, OCCUPIED
+    state = cv2.LUT(kinds, values.view(np.uint8)).view(np.int8)
     if settings.probabilistic:
         state = np.where(state == UNKNOWN, UNKNOWN, _percent(cells)).astype(np.int8)
     origin = (first[1] * settings.resolution_m, first[0] * settings.resolution_m)
@@ -31,22 +35,39 @@ def render(
 
 
 def _touched(raster: LogOddsRaster) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Return the first cell and the cells of the blocks that hold any evidence."""
-    touched = raster.cells != ZERO
-    rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
-    if len(rows) == 0:
+    """Return the first cell and the cells of the blocks that hold any evidence, or of one."""
+    cells = raster.cells
+    if cells.size == 0:
         return raster.first_cell, np.full((1, 1), ZERO, np.uint8)
-    low = (rows[0] // CHUNK * CHUNK, columns[0] // CHUNK * CHUNK)
-    high = (-(-(rows[-1] + 1) // CHUNK) * CHUNK, -(-(columns[-1] + 1) // CHUNK) * CHUNK)
-    first = (raster.first_cell[0] + int(low[0]), raster.first_cell[1] + int(low[1]))
-    return first, raster.cells[low[0] : high[0], low[1] : high[1]]
+    row, column = raster.first_cell
+    rows, columns = (_empty_blocks(part) for part in (cells, cells.T))
+    if rows == (cells.shape[0], 0):
+        return raster.first_cell, cells[:1, :1]
+    held = cells[rows[0] : cells.shape[0] - rows[1], columns[0] : cells.shape[1] - columns[1]]
+    return (row + rows[0], column + columns[0]), held
 
 
-def _trinary(cells: NDArray[np.uint8], settings: OccupancyGridSettings) -> NDArray[np.int8]:
-    values = np.full(256, UNKNOWN, np.int8)
-    values[: ZERO - steps(settings.free_log_odds_needed) + 1] = FREE
-    values[ZERO + steps(settings.occupied_log_odds) :] = OCCUPIED
-    return cv2.LUT(cells, values.view(np.uint8)).view(np.int8)
+def _empty_blocks(cells: NDArray[np.uint8]) -> tuple[int, int]:
+    """Return how many rows of blocks without any evidence there are before the others and after
+    them, in cells; all of them and none where there is no evidence at all.
+    """
+    height = cells.shape[0]
+    before = 0
+    while before < height and (cells[before : before + CHUNK] == ZERO).all():
+        before += CHUNK
+    after = 0
+    while before + after < height and (cells[height - after - CHUNK : height - after] == ZERO).all():
+        after += CHUNK
+    return before, after
+
+
+def _kinds(settings: OccupancyGridSettings) -> NDArray[np.uint8]:
+    """Return what each of the 256 values of evidence makes of a cell."""
+    kinds = np.full(256, _NOTHING, np.uint8)
+    free = _UNREACHED if settings.connected_only else _REACHED
+    kinds[: ZERO - steps(settings.free_log_odds_needed) + 1] = free
+    kinds[ZERO + steps(settings.occupied_log_odds) :] = _STANDING
+    return kinds
 
 
 def _percent(cells: NDArray[np.uint8]) -> NDArray[np.int8]:
@@ -55,28 +76,27 @@ def _percent(cells: NDArray[np.uint8]) -> NDArray[np.int8]:
     return cv2.LUT(cells, percent.view(np.uint8)).view(np.int8)
 
 
-def _unreached(
-    state: NDArray[np.int8], rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> NDArray[np.bool_]:
-    """Return the free cells that are not joined to the path, given as rows and columns (K,).
+def _reach(
+    kinds: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> None:
+    """Mark the free cells that are joined to the path, given as rows and columns (K,).
 
     Floor is seen from the path along lines of floor, so an area without a link to it was seen
     through something, e.g. a wall.
     """
-    part = (state == FREE).astype(np.uint8)
-    inside = (rows >= 0) & (rows < state.shape[0]) & (columns >= 0) & (columns < state.shape[1])
+    inside = (rows >= 0) & (rows < kinds.shape[0]) & (columns >= 0) & (columns < kinds.shape[1])
     rows, columns = rows[inside], columns[inside]
-    # One byte a cell, and as many rounds as there are separate areas that the path touches.
+    # As many rounds as there are separate areas that the path touches.
     while True:
-        waiting = np.flatnonzero(part[rows, columns] == _UNREACHED)
+        waiting = np.flatnonzero(kinds[rows, columns] == _UNREACHED)
         if len(waiting) == 0:
-            return part == _UNREACHED
+            return
         seed = (int(columns[waiting[0]]), int(rows[waiting[0]]))
-        cv2.floodFill(part, None, seed, _REACHED, flags=4)
+        cv2.floodFill(kinds, None, seed, _REACHED, flags=4)
 
 
-def _narrow(state: NDArray[np.int8], size: int) -> NDArray[np.bool_]:
+def _narrow(kinds: NDArray[np.uint8], size: int) -> NDArray[np.bool_]:
     """Return the free cells that a morphological opening of this size (cells) removes."""
-    free = (state == FREE).astype(np.uint8)
+    free = (kinds == _REACHED).astype(np.uint8)
     opened = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     return (free > 0) & (opened == 0)
