@@ -52,13 +52,14 @@ def _empty_blocks(cells: NDArray[np.uint8]) -> tuple[int, int]:
     them, in cells; all of them and none where there is no evidence at all.
     """
     height = cells.shape[0]
-    before = 0
-    while before < height and (cells[before : before + CHUNK] == ZERO).all():
-        before += CHUNK
-    after = 0
-    while before + after < height and (cells[height - after - CHUNK : height - after] == ZERO).all():
-        after += CHUNK
-    return before, after
+
+    def holds(start: int) -> bool:
+        return bool((cells[start : start + CHUNK] != ZERO).any())
+
+    starts = range(0, height, CHUNK)
+    before = next(filter(holds, starts), height)
+    last = next(filter(holds, reversed(starts)), height - CHUNK)
+    return before, height - CHUNK - last
 
 
 def _kinds(settings: OccupancyGridSettings) -> NDArray[np.uint8]:
