@@ -33,6 +33,7 @@ PARAMETERS = {
     'keyframe_motion_ratio': 0.01,
     'background': 'false',
     'publish_period_s': 0.0,
+    'max_waiting_frames': 100,
 }
 STOP_S = 10.0
 ANSWER_S, WAKE_S = 2.0, 60.0

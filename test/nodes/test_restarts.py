@@ -25,7 +25,8 @@ from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import CAMERA, GRID, SLAM
 from segfloor_ros.nodes.kept_state import KeptState
 
-PLACES = 24
+PLACES = 80
+"""More than are driven past: a place that is seen again makes no keyframe."""
 FRAME_NS = 100_000_000
 RECEIVED = ('map', 'labelled_points', 'odometry', 'keyframe/path')
 REJOIN_S = 60.0
@@ -76,12 +77,15 @@ class Journey:
 
     def keyframes(self, count: int) -> tuple[OccupancyGrid, LabelledPoints]:
         """Drive until there are so many more keyframes; return map and cloud of the last one."""
-        while count:
+        for _ in range(PLACES):
+            if count == 0:
+                break
             answer = self.step()
             assert answer.values['tracked'] == '1', answer
             if answer.values['keyframe'] == '1':
                 self.chain.mapped(answer.stamp_ns)
                 count -= 1
+        assert count == 0, 'no more keyframes are made'
         return (
             grid_arrays(self._of('map', answer.stamp_ns), 'map'),
             labelled_arrays(self._of('labelled_points', answer.stamp_ns), 'labelled_points'),
