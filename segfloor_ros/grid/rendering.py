@@ -77,9 +77,7 @@ def _percent(cells: NDArray[np.uint8]) -> NDArray[np.int8]:
     return cv2.LUT(cells, percent.view(np.uint8)).view(np.int8)
 
 
-def _reach(
-    kinds: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> None:
+def _reach(kinds: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> None:
     """Mark the free cells that are joined to the path, given as rows and columns (K,).
 
     Floor is seen from the path along lines of floor, so an area without a link to it was seen
