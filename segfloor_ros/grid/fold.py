@@ -21,6 +21,7 @@ from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
 _BODY_M = 0.05
+_AROUND = np.ones((3, 3), np.uint8)
 
 
 class EvidenceFolder:
@@ -39,7 +40,7 @@ class EvidenceFolder:
         # What is seen from too far to be placed within its cell, or in a part of a cell, counts as
         # long as nothing was seen from nearer: it does not count for much, and changes nothing that
         # does.
-        sure = self._occupied + hit
+        sure = self._sure = self._occupied + hit
         lowered = np.minimum(value, np.maximum(value - free, ZERO - free))
         self._lowered_tentatively = np.where(value > sure, value, lowered).astype(np.uint8)
         raised = np.maximum(value, np.minimum(value + hit, sure))
@@ -62,11 +63,12 @@ class EvidenceFolder:
             touched |= free
         hits = draw_hits(free, placed)
         partly = self._draw_partly_free(free, placed)
-        hidden = self._draw_hidden(cells, touched, placed.fan)
+        near = self._draw_near(cells.shape, placed)
+        in_the_way = self._standing(cells, near) & touched & (1 - cv2.dilate(hits, _AROUND))
+        hidden = self._draw_hidden(in_the_way, placed.fan)
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible
         partly &= visible
-        near = self._draw_near(cells.shape, placed)
         _replace(cells, free & near, self._lowered)
         _replace(cells, partly & ~(free & near), self._lowered_tentatively)
         _replace(cells, hits & near, self._raised)
@@ -83,21 +85,25 @@ class EvidenceFolder:
         draw_rays(partly, placed.fan.centre, fan.directions[:, edge] * fan.lengths[edge], 1.0)
         return partly
 
-    def _draw_hidden(
-        self, cells: NDArray[np.uint8], touched: NDArray[np.uint8], fan: Fan
-    ) -> NDArray[np.uint8] | None:
-        """Return the cells behind what is occupied so far, 1; None when nothing is in the way.
-
-        What stands there itself still gets its share, so that it is cleared once it has left.
-        touched: the cells that this keyframe's view passes.
+    def _standing(self, cells: NDArray[np.uint8], near: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the cells that are occupied so far, 1; of the near ones those that were seen to
+        be from near: others may lie beside what is seen now.
         """
         occupied = cv2.threshold(cells, self._occupied - 1, 1, cv2.THRESH_BINARY)[1]
-        in_the_way = cv2.findNonZero(occupied & touched)
-        if in_the_way is None:
+        sure = cv2.threshold(cells, self._sure, 1, cv2.THRESH_BINARY)[1]
+        return occupied & (sure | (1 - near))
+
+    def _draw_hidden(self, in_the_way: NDArray[np.uint8], fan: Fan) -> NDArray[np.uint8] | None:
+        """Return the cells behind what is in the way, 1; None when nothing is.
+
+        What stands there itself still gets its share, so that it is cleared once it has left.
+        """
+        at = cv2.findNonZero(in_the_way)
+        if at is None:
             return None
-        column, row = in_the_way.reshape(-1, 2).T
+        column, row = at.reshape(-1, 2).T
         horizon = nearest_cells(column, row, fan)
-        return fan.shadow(cells.shape, horizon + max(2.0, _BODY_M / self._resolution_m))
+        return fan.shadow(in_the_way.shape, horizon + max(2.0, _BODY_M / self._resolution_m))
 
     def _draw_near(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the cells that are near enough for an obstacle to be placed in one of them, 1."""

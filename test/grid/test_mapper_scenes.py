@@ -224,3 +224,17 @@ def test_a_wall_seen_from_afar_alone_is_marked(make_drive: MakeDrive) -> None:
     for _ in range(5):
         drive.look(World(walls=((4.02, -3, 4.02, 3),)), (1.0, 0.0, 0.0))
     assert (cells_at(drive.grid(), centres((4.0, 4.05), (-1.0, 1.0))) == 100).all()
+
+
+def test_what_seemed_wider_from_afar_hides_nothing_from_near(make_drive: MakeDrive) -> None:
+    # The end of a wall, and how it looked from 3.5 m: 8 cm longer.
+    long, true = (World(walls=((1.0, -2.0, 1.0, end),)) for end in (0.08, 0.0))
+    drive = make_drive(OccupancyGridSettings(footprint_radius_m=0.0), error_per_m=0.0)
+    for _ in range(6):
+        drive.look(long, (-2.5, -0.5, 0.0))
+    behind = np.array([[1.3, 0.0], [1.6, -0.08], [1.9, -0.17]])
+    assert (cells_at(drive.grid(), behind) == -1).all()
+    assert (cells_at(drive.grid(), centres((1.0, 1.05), (0.0, 0.05))) == 100).all()
+    drive.look(true, (0.0, 0.3, 0.0))
+    assert (cells_at(drive.grid(), behind) == 0).all()
+    assert (cells_at(drive.grid(), centres((1.0, 1.05), (-0.5, -0.1))) == 100).all()
