@@ -21,9 +21,9 @@ class View:
     """What the policy looks at.
 
     frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
-    points of the last keyframe that several keyframes see. novelty: how far the view is from known
-    ones, in units of what makes it new. mapper_idle: whether the mapper could take a keyframe at
-    once.
+    points that several keyframes see, of the keyframe that shares most with this view. novelty: how
+    far the view is from known ones, in units of what makes it new. mapper_idle: whether the mapper
+    could take a keyframe at once.
     """
 
     frames_since: int

@@ -244,8 +244,9 @@ class StereoSlam:
         return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
 
     def _wants_keyframe(self, track: Track) -> bool:
-        last = self.map.keyframes[-1]
-        known = last.point_id[last.point_id != NO_POINT]
+        order, _ = self.map.covisible(track.point_ids)
+        reference = self.map.keyframes[order[0]]
+        known = reference.point_id[reference.point_id != NO_POINT]
         reliable = known[self.map.observer_count[known] >= SEEN_BY_SEVERAL]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         view = View(
