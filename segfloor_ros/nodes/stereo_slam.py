@@ -37,6 +37,10 @@ from segfloor_ros.stages import make_slam
 
 INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
+MAX_KEPT = 100
+"""Pairs that are kept while calibration or mount are not known."""
+CATCH_UP = 0.2
+"""Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
 WORK_OFF_EVERY_S = 0.2
 
 
@@ -70,6 +74,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def start_anew(self) -> None:
         """Begin with an empty map; the mount of the camera is found again, too."""
         self._end_stage()
+        self._allowed: float = MAX_KEPT
         self._outputs_of_slam.start_anew()
         self._transforms.start_anew()
         self._last_stamp_ns: int | None = None
@@ -165,7 +170,11 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         before the next.
         """
         is_ready = bool(self._waiting) and self._is_ready(self._waiting[0])
-        while len(self._waiting) > self.parameters.own.max_waiting_frames:
+        if is_ready:
+            # What came before the mount was known is caught up on, not thrown away at once.
+            least = self.parameters.own.max_waiting_frames
+            self._allowed = max(min(self._allowed - CATCH_UP, len(self._waiting)), least)
+        while len(self._waiting) > self._allowed:
             self._skip(to_ns(self._waiting.popleft()[self._left].header.stamp), is_ready)
         if is_ready:
             self._take_pair(self._waiting.popleft())

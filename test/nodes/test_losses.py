@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from node_messages import cloud_messages, publish
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
@@ -95,8 +96,13 @@ def test_what_comes_while_a_node_is_paused_is_not_lost(make_graph) -> None:
     assert health(graph, 'cloud_labelling')[-1].values['lost map_points'] == '0'
 
 
-def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(make_graph) -> None:
-    """A camera that floods: the newest frames are tracked, every frame gets its answer."""
+@pytest.mark.parametrize('before_calibration', [False, True])
+def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(
+    make_graph, before_calibration
+) -> None:
+    """A camera that floods: the newest frames are tracked, every frame gets its answer. Frames that
+    wait for their calibration are kept.
+    """
     frames, _ = room_drive(12, step_m=0.01)
     graph = make_graph(*GIVEN)
     graph.add(StereoSlamNode())
@@ -108,15 +114,26 @@ def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(make
     for frame in frames:
         for side in ('left', 'right'):
             info = camera_info_message(frame.stamp_ns, side, getattr(CALIBRATION, side))
-            inputs[f'{side}/camera_info'].publish(info)
+            if not before_calibration:
+                inputs[f'{side}/camera_info'].publish(info)
             image = image_message(frame.stamp_ns, side, getattr(frame, side))
             inputs[f'{side}/image_raw'].publish(image)
+        if frame.index == 0 and not before_calibration:
+            graph.until(lambda: graph.reports('stereo_slam'), 'the first answer')
+    if before_calibration:
+        graph.comes(lambda: False, 0.5)
+        for side in ('left', 'right'):
+            info = camera_info_message(frames[0].stamp_ns, side, getattr(CALIBRATION, side))
+            inputs[f'{side}/camera_info'].publish(info)
     graph.until(lambda: len(graph.reports('stereo_slam')) == len(frames), 'all answers')
     by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
     taken = [f.index for f in frames if 'skipped' not in by_stamp[f.stamp_ns].message]
-    assert taken == [9, 10, 11], 'as many as may wait, the newest ones'
+    if before_calibration:
+        assert taken == [f.index for f in frames], 'there is time to catch up'
+        return
+    assert taken == [0, 9, 10, 11], 'as many as may wait, the newest ones'
     assert all(by_stamp[frames[i].stamp_ns].level is Level.OK for i in taken)
-    graph.until(lambda: health(graph, 'stereo_slam')[-1].values['skipped'] == '9', 'the count')
+    graph.until(lambda: health(graph, 'stereo_slam')[-1].values['skipped'] == '8', 'the count')
     assert (
         'left/image_raw comes faster than it is tracked' in health(graph, 'stereo_slam')[-1].message
     )
