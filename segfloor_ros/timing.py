@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
 
 class StageTimes:
-    """Collects durations by name; one instance is shared by the stages of a run."""
+    """Collects durations by name; one instance is shared by the stages of a run. clock: in
+    seconds; `time.thread_time` counts what the calling thread computes, whatever else goes on.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
         self._durations_s: dict[str, list[float]] = {}
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:
         """Add the time spent inside the `with` block under `name`."""
-        start = time.perf_counter()
+        start = self._clock()
         try:
             yield
         finally:
-            self.add(name, time.perf_counter() - start)
+            self.add(name, self._clock() - start)
 
     def add(self, name: str, duration_s: float) -> None:
         """Add one duration in seconds."""

@@ -40,7 +40,9 @@ def benchmark_floor(
     ] = None,
     frames: Annotated[int, typer.Option(min=3, help='Generated image pairs.')] = 60,
     seed: Annotated[int, typer.Option(help='Of the generated images.')] = 0,
-    threads: Annotated[int, typer.Option(min=1, help='Threads of OpenCV.')] = 2,
+    threads: Annotated[
+        int, typer.Option(min=1, help='Threads of OpenCV; 1: time computed, whatever else goes on.')
+    ] = 2,
     middlebury: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help='Folder with cones/ and teddy/: score the choices of the disparity too.'),
@@ -89,7 +91,8 @@ def benchmark_floor(
 def scenes_table(scores: list[SceneScore]) -> Table:
     """Return a row for each scene."""
     names = ('precision %', 'recall %', 'low as floor %', 'sill as floor %')
-    table = Table('scene', 'masks', *names)
+    table = Table('scene', 'masks', *names, padding=0)
+    table.columns[0].no_wrap = True
     for column in table.columns[1:]:
         column.justify = 'right'
     for one in scores:

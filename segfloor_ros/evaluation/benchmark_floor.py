@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -92,11 +93,12 @@ def time_steps(
     configuration: Configuration,
     threads: int,
 ) -> FloorTimes:
-    """Segment the keyframes and time every step. threads: of OpenCV. Raises MapError where there
-    are too few.
+    """Segment the keyframes and time every step: with one thread of OpenCV the time that is spent
+    computing, with more the time that passes. Raises MapError where there are too few.
     """
     cv2.setNumThreads(threads)
-    times, count, settings = StageTimes(), 0, configuration.floor_segmentation
+    times = StageTimes(time.thread_time if threads == 1 else time.perf_counter)
+    count, settings = 0, configuration.floor_segmentation
     stage = FloorSegmentation(camera, settings, times)
     for count, key in enumerate(keyframes, start=1):
         if count == WARM_UP + 1:
