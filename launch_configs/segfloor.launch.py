@@ -45,6 +45,12 @@ def generate_launch_description() -> LaunchDescription:
                 'where input is given; with true the input may stand in params_file.',
             ),
             DeclareLaunchArgument(
+                'lossless',
+                default_value='auto',
+                description='A recording slows down rather than lose a frame where the nodes '
+                'cannot follow: true, false, or auto, which is true unless input is a device.',
+            ),
+            DeclareLaunchArgument(
                 'composed',
                 default_value='false',
                 description='Run all nodes in one process, for small machines: true or false.',
@@ -96,6 +102,7 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     respawn = truth('respawn', LaunchConfiguration('respawn').perform(context))
     own_tf = truth('namespaced_tf', LaunchConfiguration('namespaced_tf').perform(context))
     log_level = LaunchConfiguration('log_level').perform(context)
+    lossless = LaunchConfiguration('lossless').perform(context)
     with_camera = bool(source) if camera.lower() == 'auto' else truth('camera', camera)
     with_rviz = truth('rviz', LaunchConfiguration('rviz').perform(context))
     remappings = [('/tf', 'tf'), ('/tf_static', 'tf_static')] if own_tf else []
@@ -120,6 +127,10 @@ def make_nodes(context: LaunchContext) -> list[Node]:
 
     # Without a word on the input, that of the parameter file holds.
     given = () if with_camera and not source else ('-p', as_text('input', source, with_camera))
+    if lossless.lower() != 'auto' or (with_camera and source):
+        is_recording = not source.removeprefix('/dev/video').isdigit()
+        slows_down = is_recording if lossless.lower() == 'auto' else truth('lossless', lossless)
+        given = (*given, '-p', f'lossless:={str(slows_down).lower()}')
     if composed:
         nodes = [node('segfloor_pipeline', *given)]
     else:

@@ -23,7 +23,7 @@ NODES = {
 STAGES = NODES - {'stereo_camera'}
 ARGUMENTS = {
     'namespace', 'params_file', 'use_sim_time', 'input', 'camera', 'composed', 'autostart',
-    'respawn', 'namespaced_tf', 'log_level', 'rviz', 'rviz_config',
+    'respawn', 'namespaced_tf', 'log_level', 'lossless', 'rviz', 'rviz_config',
 }  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def after(words: list[str], flag: str) -> list[str]:
 
 def test_what_the_arguments_say_is_handed_on(launched) -> None:
     camera = launched(input="/it's a bag")['stereo_camera'].arguments
-    assert after(camera, '-p') == ['autostart:=true', "input:='/it''s a bag'"]
+    assert after(camera, '-p') == ['autostart:=true', "input:='/it''s a bag'", 'lossless:=true']
     assert after(launched(camera='true')['stereo_camera'].arguments, '-p') == ['autostart:=true']
     slam = launched(autostart='no', log_level='debug', namespace='robot')['stereo_slam'].arguments
     assert after(slam, '-p') == ['autostart:=false']
@@ -102,6 +102,15 @@ def test_what_the_arguments_say_is_handed_on(launched) -> None:
     assert after(slam, '-r') == ['__node:=stereo_slam', '__ns:=/robot']
     apart = launched(input='/a', camera='false', composed='true')['segfloor_pipeline'].arguments
     assert after(apart, '-p')[-1] == "input:=''"
+    for arguments, is_lossless in (
+        ({'input': '/a'}, 'true'),
+        ({'input': '/dev/video0'}, 'false'),
+        ({'input': '0'}, 'false'),
+        ({'input': '/a', 'lossless': 'false'}, 'false'),
+        ({'camera': 'true', 'lossless': 'yes'}, 'true'),
+    ):
+        camera = launched(**arguments)['stereo_camera'].arguments
+        assert after(camera, '-p')[-1] == f'lossless:={is_lossless}', arguments
     tf = ['/tf:=tf', '/tf_static:=tf_static']
     for process in launched(namespaced_tf='true', rviz='true', namespace='robot').values():
         assert after(process.arguments, '-r')[-2:] == tf
