@@ -173,9 +173,10 @@ def test_a_slam_that_does_not_find_its_place_again_begins_a_new_map(journey) -> 
     chain.drive([replace(journey.next(), left=dark, right=dark)])
     begun = journey.next()
     assert chain.drive([begun])[0].level is Level.OK
-    chain.mapped(begun.stamp_ns)
+    # The first keyframes may miss a node that still takes the new SLAM for the one killed.
+    journey.rejoin()
     path = path_arrays(journey.latest('keyframe/path'))
-    assert path.stamp_ns.tolist() == [begun.stamp_ns]
+    assert path.stamp_ns[0] == begun.stamp_ns
     assert 'is not found' in chain.log(SLAM)
 
 
