@@ -2,8 +2,8 @@
 not it has seen their points lately.
 
 A place that is seen again is recognised by them, as long as the path has drifted by no more than
-what patches are searched within, and needs no keyframes again: the map follows the space covered,
-not the time driven.
+what patches are searched within, and needs few keyframes and no points again: the map follows the
+space covered, not the time driven.
 """
 
 from __future__ import annotations
@@ -37,6 +37,11 @@ KNOWN_SHARE = 0.3
 SECOND_VISIT = 3.0
 """On a first visit known views lie behind, on a second one on all sides: they may be so many times
 as far."""
+
+LOOK_AGAIN = 6.0
+"""What is known may have changed: a keyframe so many times as far apart as new ones keeps the map of
+it up to date.
+"""
 
 COVERED_SHARE = 0.95
 COLUMNS, ROWS = 8, 6
@@ -73,7 +78,8 @@ def view_novelty(
 
     It is measured from the nearest of the latest keyframes that saw much of the same. Those of an
     earlier visit count from further away, if together they saw what is tracked and no part of the
-    view was out of their sight.
+    view was out of their sight; so far away from the latest that the place should be looked at again
+    they do not count.
     """
     latest = len(sparse_map.keyframes) - 1
     recent, shared = sparse_map.covisible(ids)
@@ -96,7 +102,8 @@ def view_novelty(
         covered_share(camera, views, T_camera_world, depth_m) < COVERED_SHARE
     ):
         return nearest
-    return min(nearest, *(new[int(k)] / SECOND_VISIT for k in earlier))
+    known_view = min(new[int(k)] for k in earlier) / SECOND_VISIT
+    return min(nearest, max(known_view, nearest / LOOK_AGAIN))
 
 
 def covered_share(

@@ -6,7 +6,13 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from test_sparse_map import add, keyframe
 
 from segfloor_ros.geometry import se3_exp
-from segfloor_ros.slam.places import RECENT, covered_share, view_novelty, views_near
+from segfloor_ros.slam.places import (
+    LOOK_AGAIN,
+    RECENT,
+    covered_share,
+    view_novelty,
+    views_near,
+)
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -54,15 +60,23 @@ def test_near_views_come_nearest_first_and_not_beyond_reach():
 
 def test_views_of_an_earlier_visit_count_from_three_times_as_far():
     ids = np.arange(10, dtype=np.int32)
-    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.2)
+    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.02)
     # 0.15 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
     new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, camera_at(-0.15), 2.0)
     assert new == pytest.approx(0.5)
     # Points that the earlier views did not see, or a view that looks past them, are new.
-    unknown = sparse_map_without(sparse_map, [0, 1, 2])
+    unknown = sparse_map_without(sparse_map, range(5))
     assert view_novelty(CAMERA, SETTINGS, unknown, ids, camera_at(-0.15), 2.0) > 1.5
     aside = turned(0.17) @ camera_at(-0.02)
     assert view_novelty(CAMERA, SETTINGS, sparse_map, ids, aside, 2.0) > 1.5
+
+
+def test_a_known_place_is_looked_at_again_now_and_then():
+    ids = np.arange(10, dtype=np.int32)
+    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.2)
+    # The nearest of the latest keyframes stands at 1 m, ten times what makes a new view new.
+    new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, camera_at(0.0), 2.0)
+    assert new == pytest.approx(10 / LOOK_AGAIN)
 
 
 def sparse_map_without(sparse_map, views):
@@ -72,7 +86,7 @@ def sparse_map_without(sparse_map, views):
     return sparse_map
 
 
-def test_laps_of_a_room_add_nothing_after_the_second():
+def test_laps_of_a_room_add_no_points_after_the_second():
     room = StereoRoom()
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     rng = np.random.default_rng(2)
