@@ -39,7 +39,7 @@ SECOND_VISIT = 3.0
 as far."""
 
 LOOK_AGAIN = 6.0
-"""What is known may have changed: a keyframe so many times as far apart as new ones keeps the map of
+"""What is known may have changed: keyframes so many times as far apart as new ones keep the map of
 it up to date.
 """
 
@@ -78,8 +78,8 @@ def view_novelty(
 
     It is measured from the nearest of the latest keyframes that saw much of the same. Those of an
     earlier visit count from further away, if together they saw what is tracked and no part of the
-    view was out of their sight; so far away from the latest that the place should be looked at again
-    they do not count.
+    view was out of their sight; they do not count so far away from the latest that the place should
+    be looked at again.
     """
     latest = len(sparse_map.keyframes) - 1
     recent, shared = sparse_map.covisible(ids)
