@@ -14,69 +14,69 @@ PACKAGE = 'segfloor_ros'
 MIDDLEWARE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
+ARGUMENTS = {
+    'rate': ('1.0', 'Speed against real time.'),
+    'delay': ('5.0', 'Seconds until the player begins, so that the nodes are connected.'),
+    'namespace': ('', 'Namespace of all nodes and topics.'),
+    'params_file': (['params', 'default.yaml'], 'Parameter file for all nodes.'),
+    'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
+    'log_level': (
+        'info',
+        'From which level on the nodes log.',
+    ),
+    'rviz': ('false', 'Show the map in RViz: true or false.'),
+}
+"""By name default and description; a list is a file of the package."""
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
+HANDED_ON = ('namespace', 'params_file', 'composed', 'log_level', 'rviz')
+
+
 def generate_launch_description() -> LaunchDescription:
     """Return the player, the nodes and the arguments."""
-    share = FindPackageShare(PACKAGE)
-    nodes = PathJoinSubstitution([share, 'launch_configs', 'segfloor.launch.py'])
+    nodes = in_package(['launch_configs', 'segfloor.launch.py'])
+    handed_on = {name: LaunchConfiguration(name) for name in HANDED_ON}
     return LaunchDescription(
         [
             DeclareLaunchArgument('bag', description='Folder of the rosbag2 recording.'),
-            DeclareLaunchArgument(
-                'rate', default_value='1.0', description='Speed against real time.'
-            ),
-            DeclareLaunchArgument(
-                'delay',
-                default_value='5.0',
-                description='Seconds until the player begins, so that the nodes are connected.',
-            ),
-            DeclareLaunchArgument(
-                'namespace', default_value='', description='Namespace of all nodes and topics.'
-            ),
-            DeclareLaunchArgument(
-                'params_file',
-                default_value=PathJoinSubstitution([share, 'params', 'default.yaml']),
-                description='Parameter file for all nodes.',
-            ),
-            DeclareLaunchArgument(
-                'composed',
-                default_value='false',
-                description='Run all nodes in one process, for small machines: true or false.',
-            ),
-            DeclareLaunchArgument(
-                'log_level',
-                default_value='info',
-                choices=['debug', 'info', 'warn', 'error', 'fatal'],
-                description='From which level on the nodes log.',
-            ),
-            DeclareLaunchArgument(
-                'rviz', default_value='false', description='Show the map in RViz: true or false.'
-            ),
+            *(declare(name, default, text) for name, (default, text) in ARGUMENTS.items()),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(nodes),
-                launch_arguments={
-                    'namespace': LaunchConfiguration('namespace'),
-                    'params_file': LaunchConfiguration('params_file'),
-                    'composed': LaunchConfiguration('composed'),
-                    'log_level': LaunchConfiguration('log_level'),
-                    'rviz': LaunchConfiguration('rviz'),
-                    'camera': 'false',
-                    'use_sim_time': 'true',
-                }.items(),
+                launch_arguments={**handed_on, 'camera': 'false', 'use_sim_time': 'true'}.items(),
             ),
-            ExecuteProcess(
-                cmd=[
-                    *('ros2', 'bag', 'play', LaunchConfiguration('bag')),
-                    *('--clock', '--rate', LaunchConfiguration('rate')),
-                    *('--delay', LaunchConfiguration('delay')),
-                ],
-                # Unless the user has named another file; what it is for stands in this one.
-                additional_env={
-                    MIDDLEWARE: EnvironmentVariable(
-                        MIDDLEWARE,
-                        default_value=PathJoinSubstitution([share, 'params', 'fastdds.xml']),
-                    )
-                },
-                output='screen',
-            ),
+            player(),
         ]
     )
+
+
+def player() -> ExecuteProcess:
+    """Return `ros2 bag play` with the clock."""
+    middleware = EnvironmentVariable(
+        MIDDLEWARE, default_value=in_package(['params', 'fastdds.xml'])
+    )
+    return ExecuteProcess(
+        cmd=[
+            *('ros2', 'bag', 'play', LaunchConfiguration('bag')),
+            *('--clock', '--rate', LaunchConfiguration('rate')),
+            *('--delay', LaunchConfiguration('delay')),
+        ],
+        # Unless the user has named another file; what it is for stands in this one.
+        additional_env={MIDDLEWARE: middleware},
+        output='screen',
+    )
+
+
+def declare(name: str, default: str | list[str], description: str) -> DeclareLaunchArgument:
+    """Return an argument."""
+    return DeclareLaunchArgument(
+        name,
+        default_value=in_package(default),
+        description=description,
+        choices=CHOICES.get(name),
+    )
+
+
+def in_package(default: str | list[str]) -> str | PathJoinSubstitution:
+    """Return a text as it is, and the parts of a path as a file of the package."""
+    if isinstance(default, str):
+        return default
+    return PathJoinSubstitution([FindPackageShare(PACKAGE), *default])

@@ -14,82 +14,77 @@ RESPAWN_DELAY_S = 2.0
 YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
 
+ARGUMENTS = {
+    'namespace': ('', 'Namespace of all nodes and topics.'),
+    'params_file': (
+        ['params', 'default.yaml'],
+        'Parameter file for all nodes; arguments win over it.',
+    ),
+    'use_sim_time': ('false', 'Take the time from /clock: true or false.'),
+    'input': (
+        '',
+        'Recording or device to play; empty: a camera driver publishes left/image_raw, '
+        'right/image_raw and their camera_info.',
+    ),
+    'camera': (
+        'auto',
+        'Start the node stereo_camera: true, false, or auto, which does so where input is given; '
+        'with true the input may stand in params_file.',
+    ),
+    'lossless': (
+        'auto',
+        'A recording slows down rather than lose a frame where the nodes cannot follow: true, '
+        'false, or auto, which is true unless input is a device.',
+    ),
+    'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
+    'autostart': (
+        'true',
+        'Nodes begin to work by themselves: true, or false, with which they wait for a lifecycle '
+        'manager.',
+    ),
+    'respawn': (
+        'false',
+        'Start a node again that has died: true or false. It goes on with what it knew.',
+    ),
+    'namespaced_tf': (
+        'false',
+        'Take /tf and /tf_static into the namespace, as Nav2 does for several robots: true or '
+        'false.',
+    ),
+    'log_level': (
+        'info',
+        'From which level on the nodes log.',
+    ),
+    'rviz': ('false', 'Show the map in RViz: true or false.'),
+    'rviz_config': (['launch_configs', 'segfloor.rviz'], 'Layout of RViz.'),
+}
+"""By name default and description; a list is a file of the package."""
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
+
+
 def generate_launch_description() -> LaunchDescription:
     """Return the arguments and the nodes."""
-    share = FindPackageShare(PACKAGE)
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument(
-                'namespace', default_value='', description='Namespace of all nodes and topics.'
-            ),
-            DeclareLaunchArgument(
-                'params_file',
-                default_value=PathJoinSubstitution([share, 'params', 'default.yaml']),
-                description='Parameter file for all nodes; arguments win over it.',
-            ),
-            DeclareLaunchArgument(
-                'use_sim_time',
-                default_value='false',
-                description='Take the time from /clock: true or false.',
-            ),
-            DeclareLaunchArgument(
-                'input',
-                default_value='',
-                description='Recording or device to play; empty: a camera driver publishes '
-                'left/image_raw, right/image_raw and their camera_info.',
-            ),
-            DeclareLaunchArgument(
-                'camera',
-                default_value='auto',
-                description='Start the node stereo_camera: true, false, or auto, which does so '
-                'where input is given; with true the input may stand in params_file.',
-            ),
-            DeclareLaunchArgument(
-                'lossless',
-                default_value='auto',
-                description='A recording slows down rather than lose a frame where the nodes '
-                'cannot follow: true, false, or auto, which is true unless input is a device.',
-            ),
-            DeclareLaunchArgument(
-                'composed',
-                default_value='false',
-                description='Run all nodes in one process, for small machines: true or false.',
-            ),
-            DeclareLaunchArgument(
-                'autostart',
-                default_value='true',
-                description='Nodes begin to work by themselves: true, or false, with which they '
-                'wait for a lifecycle manager.',
-            ),
-            DeclareLaunchArgument(
-                'respawn',
-                default_value='false',
-                description='Start a node again that has died: true or false. It goes on with what '
-                'it knew.',
-            ),
-            DeclareLaunchArgument(
-                'namespaced_tf',
-                default_value='false',
-                description='Take /tf and /tf_static into the namespace, as Nav2 does for several '
-                'robots: true or false.',
-            ),
-            DeclareLaunchArgument(
-                'log_level',
-                default_value='info',
-                choices=['debug', 'info', 'warn', 'error', 'fatal'],
-                description='From which level on the nodes log.',
-            ),
-            DeclareLaunchArgument(
-                'rviz', default_value='false', description='Show the map in RViz: true or false.'
-            ),
-            DeclareLaunchArgument(
-                'rviz_config',
-                default_value=PathJoinSubstitution([share, 'launch_configs', 'segfloor.rviz']),
-                description='Layout of RViz.',
-            ),
-            OpaqueFunction(function=make_nodes),
-        ]
+    arguments = [
+        declare(name, default, description) for name, (default, description) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=make_nodes)])
+
+
+def declare(name: str, default: str | list[str], description: str) -> DeclareLaunchArgument:
+    """Return an argument."""
+    return DeclareLaunchArgument(
+        name,
+        default_value=in_package(default),
+        description=description,
+        choices=CHOICES.get(name),
     )
+
+
+def in_package(default: str | list[str]) -> str | PathJoinSubstitution:
+    """Return a text as it is, and the parts of a path as a file of the package."""
+    if isinstance(default, str):
+        return default
+    return PathJoinSubstitution([FindPackageShare(PACKAGE), *default])
 
 
 def make_nodes(context: LaunchContext) -> list[Node]:

@@ -27,28 +27,31 @@ ARGUMENTS = {
 }  # fmt: skip
 
 
-def calls(tree: ast.AST, name: str) -> list[ast.Call]:
+def named_calls(tree: ast.AST) -> list[ast.Call]:
+    """Return the calls of LaunchConfiguration by a name that stands there."""
     return [
         node
         for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == name
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == 'LaunchConfiguration'
+        and isinstance(node.args[0], ast.Constant)
     ]
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_every_argument_is_described_and_used(path) -> None:
-    tree = ast.parse(path.read_text())
-    declared = set()
-    for call in calls(tree, 'DeclareLaunchArgument'):
-        assert isinstance(call.args[0], ast.Constant)
-        declared.add(call.args[0].value)
-        described = {k.arg: k.value for k in call.keywords}['description']
-        assert isinstance(described, ast.Constant)
-        assert described.value.endswith('.')
-    used = {call.args[0].value for call in calls(tree, 'LaunchConfiguration')}
-    assert declared == used
-    assert {'namespace', 'params_file'} <= declared
-    assert path != SEGFLOOR or declared == ARGUMENTS
+    entities = launch_stand_in.load(path).entities
+    declared = [e for e in entities if isinstance(e, launch_stand_in.DeclareLaunchArgument)]
+    names = {argument.name for argument in declared}
+    assert len(names) == len(declared)
+    assert all(argument.description.endswith('.') for argument in declared)
+    # Named where it is declared, and once more at least.
+    source = path.read_text()
+    assert {name for name in names if source.count(f"'{name}'") > 1} == names
+    assert {call.args[0].value for call in named_calls(ast.parse(source))} <= names
+    assert {'namespace', 'params_file'} <= names
+    assert path != SEGFLOOR or names == ARGUMENTS
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)

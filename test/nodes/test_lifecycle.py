@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from node_makers import MAKERS
 from node_messages import (
     FEATURES,
     MASK,
@@ -24,24 +25,9 @@ from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import NODES, published_by, subscribed_by
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
-from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
-MAKERS = dict(
-    zip(
-        NODES,
-        (
-            StereoCameraNode,
-            StereoSlamNode,
-            FloorSegmentationNode,
-            CloudLabellingNode,
-            OccupancyGridNode,
-        ),
-        strict=True,
-    )
-)
 MANAGED = ('-p', 'autostart:=false')
 
 

@@ -75,6 +75,7 @@ def test_a_lossless_camera_goes_on_after_what_a_node_has_lost(play, monkeypatch)
         return any(words in s.message for s in graph.statuses if s.kind == HEALTH)
 
     graph.until(said, 'the diagnosis')
+    assert len(set(listener.stamps)) == 2 * sent  # it does not send again what was lost
 
 
 def test_a_lossless_camera_waits_while_nobody_listens_and_loses_nothing_then(play) -> None:

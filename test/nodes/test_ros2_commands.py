@@ -13,6 +13,7 @@ from lifecycle_msgs.srv import (
     GetAvailableTransitions,
     GetState,
 )
+from node_makers import MAKERS
 from node_messages import STAMP_NS, grid_messages, publish
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
@@ -31,25 +32,8 @@ from segfloor_ros.configuration import STAGE_SETTINGS
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import NODES, TOPICS
 from segfloor_ros.node_settings import NODE_SETTINGS
-from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
-from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
-MAKERS = dict(
-    zip(
-        NODES,
-        (
-            StereoCameraNode,
-            StereoSlamNode,
-            FloorSegmentationNode,
-            CloudLabellingNode,
-            OccupancyGridNode,
-        ),
-        strict=True,
-    )
-)
 LIFECYCLE = {
     'change_state': 'lifecycle_msgs/srv/ChangeState',
     'get_state': 'lifecycle_msgs/srv/GetState',
