@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,9 +11,17 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
+from segfloor_ros.floor.mirror import (
+    MIRRORED_SHARE,
+    MirrorView,
+    mirror_candidates,
+    mirrored_share,
+)
 from segfloor_ros.floor.plane import (
     PlaneFit,
     Samples,
+    mean_climb,
+    plausible,
     preference,
     propose,
     refine,
@@ -35,6 +44,10 @@ _LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
 """Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
+_MAX_CLIMB = 3.0
+"""Sigmas by which the path may leave the floor: a plane that the robot drives into is none."""
+_NEARER = 0.8
+"""A mirror at so much of the height of what looks like the floor lies clearly above it."""
 _TEXTURE_GREY = 1.2
 """Horizontal grey gradient per pixel below which a disparity is mostly invented."""
 
@@ -73,10 +86,10 @@ class MountEstimator:
         self._camera = camera
         self._known = np.array([pitch_rad, roll_rad, height_m])
         self._offset = (forward_m, left_m)
-        self._frames: list[Samples] = []
+        self._views: list[MirrorView] = []
         self._guesses = np.zeros((0, 3))
         self._matcher = DisparityMatcher(disparity_range(camera, None), FloorSegmentationSettings())
-        self._rng = np.random.default_rng(0)
+        self._rng, self._mirror_rng = (np.random.default_rng(seed) for seed in (0, 1))
         self._fits: list[PlaneFit] = []
         self._settled = False
 
@@ -95,10 +108,11 @@ class MountEstimator:
         """
         if self._settled:
             return
-        samples = self._sample(left, right, T_world_left)
+        view = self._view(left, right, T_world_left)
+        samples = view.samples
         if len(samples.weight) < 50 or samples.weight.sum() < 1:
             return
-        self._frames = [*self._frames, samples][-_MAX_FRAMES:]
+        self._views = [*self._views, view][-_MAX_FRAMES:]
         fresh = propose(samples, _PROPOSALS, self._rng, self._known)
         guesses = np.concatenate([with_known(self._guesses, self._known), fresh])
         if len(guesses) == 0:
@@ -107,19 +121,46 @@ class MountEstimator:
         total = np.maximum(total, 0) * preference(guesses, self._travel())
         order = np.argsort(-total, kind='stable')[:_KEPT]
         self._guesses = guesses[order]
-        # Frames that show the same err together: the prior counts once per frame, too.
-        sigma = _LEVEL_SIGMA / math.sqrt(len(self._frames))
-        fit = refine(
-            self._frames,
-            self._guesses[0],
-            self._known,
-            self._travel(),
-            prior_sigma=sigma,
-            prior_mean=np.zeros(3),
-        )
+        fit = self._refined(self._guesses[0])
         self._guesses = np.concatenate([fit.angles_height[None], self._guesses])
+        fit = self._mirror(fit) or fit
         self._fits.append(fit)
         self._settled = self._suffices(fit)
+
+    @property
+    def _frames(self) -> list[Samples]:
+        return [view.samples for view in self._views]
+
+    def _refined(self, start: Array) -> PlaneFit:
+        # Frames that show the same err together: the prior counts once per frame, too.
+        sigma = _LEVEL_SIGMA / math.sqrt(len(self._views))
+        none, known = np.zeros(3), self._known
+        return refine(
+            self._frames, start, known, self._travel(), prior_sigma=sigma, prior_mean=none
+        )
+
+    def _mirror(self, ordinary: PlaneFit) -> PlaneFit | None:
+        """Return the plane that best mirrors what stands on it: of what is seen below it none
+        speaks against it. It lies above the ordinary one, unless much is seen below that, too.
+        """
+        highest_m = _NEARER * ordinary.angles_height[2]
+        starts = [*mirror_candidates(self._views, self._mirror_rng, self._known, self._travel())]
+        if self._fits and self._fits[-1].is_mirror:
+            starts.append(self._fits[-1].angles_height)
+        if ordinary.violations > _MAX_VIOLATIONS:
+            starts.append(ordinary.angles_height)
+            highest_m = math.inf
+        best, best_share = None, MIRRORED_SHARE
+        for fit in map(self._refined, starts):
+            if fit.angles_height[2] > highest_m:
+                continue
+            share = mirrored_share(self._views, fit.angles_height)
+            if share > best_share:
+                best, best_share = fit, share
+        if best is None:
+            return None
+        seen = best.support / max(1 - best.violations, 1e-6)
+        return replace(best, support=seen, violations=0.0, is_mirror=True)
 
     def _travel(self) -> Array:
         positions = np.array([frame.position_m for frame in self._frames])
@@ -128,6 +169,9 @@ class MountEstimator:
 
     def _suffices(self, fit: PlaneFit) -> bool:
         """Tell whether the floor is plain to see, or weaker evidence has come to rest."""
+        climb = float(mean_climb(fit.angles_height[None], self._travel())[0])
+        if climb > _MAX_CLIMB or not plausible(fit.angles_height):
+            return False
         if fit.violations > _MAX_VIOLATIONS:
             return False
         certain = fit.sigma[2] < 0.015 * fit.angles_height[2]
@@ -144,9 +188,9 @@ class MountEstimator:
             and spread[1] < math.radians(4.0)
         )
 
-    def _sample(
+    def _view(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
-    ) -> Samples:
+    ) -> MirrorView:
         camera = self._camera
         disparity = self._matcher.compute(left, equal_exposure(left, right))
         smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
@@ -157,10 +201,11 @@ class MountEstimator:
         rows, columns = (step // 2 + step * index for index in np.nonzero(grid >= 1))
         rays = camera.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
         grey = texture[rows, columns].astype(np.float64)
-        return Samples(
+        samples = Samples(
             rays=rays @ T_world_left[:3, :3].T,
             position_m=T_world_left[:3, 3].astype(np.float64),
             disparity_px=disparity[rows, columns].astype(np.float64),
             weight=grey**4 / (grey**4 + _TEXTURE_GREY**4),
             disparity_m=camera.disparity_times_depth,
         )
+        return MirrorView.of(camera, left, disparity, samples, T_world_left)

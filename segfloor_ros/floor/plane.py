@@ -63,13 +63,15 @@ class Samples:
 class PlaneFit:
     """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the first camera;
     sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
-    that lies on it; violations: share that lies below it.
+    that lies on it; violations: share that lies below it. is_mirror: what lies below is the mirror
+    image of what stands on it, and is counted in neither.
     """
 
     angles_height: Array
     sigma: Array
     support: float
     violations: float
+    is_mirror: bool = False
 
 
 def plane_of(angles_height: Array) -> Array:
@@ -142,15 +144,25 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
     """
     planes = plane_of(angles_height)
+    on, below, _ = on_and_below(samples, planes)
+    value = samples.weight @ (on - _VIOLATION_WEIGHT * below)
+    above_camera = 1 + planes @ samples.position_m < 0.2
+    return np.where(above_camera, -np.inf, value)
+
+
+def on_and_below(
+    samples: Samples, planes: Array
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return of each sample and each plane m (M, 3) how near it lies to it, in [0, 1], whether
+    it lies clearly below, and whether the plane is visible there at all, each (N, M).
+    """
     expected = plane_disparity(samples, planes)
     error = samples.disparity_px[:, None] - expected
     visible = expected > _MIN_PLANE_PX
     on = np.where(visible, np.maximum(1 - (error / INLIER_PX) ** 2, 0), 0)
     # Matching errs in proportion to nothing, planes in proportion to their disparity.
     below = visible & (error < -(2 * INLIER_PX + 0.05 * expected))
-    value = samples.weight @ (on - _VIOLATION_WEIGHT * below)
-    above_camera = 1 + planes @ samples.position_m < 0.2
-    return np.where(above_camera, -np.inf, value)
+    return on, below, visible
 
 
 def preference(angles_height: Array, travel: Array) -> Array:
@@ -158,13 +170,21 @@ def preference(angles_height: Array, travel: Array) -> Array:
 
     Cameras look roughly ahead, hardly roll, and travel (T, 3), in metres, parallel to the floor.
     """
-    unit = plane_of(np.concatenate([angles_height[:, :2], np.ones((len(angles_height), 1))], 1))
     squares = (angles_height[:, 0] / _PITCH_SIGMA_RAD) ** 2
     squares += (angles_height[:, 1] / _ROLL_SIGMA_RAD) ** 2
-    if len(travel):
-        climb = (unit @ travel.T) / _climb_sigma_m(travel)
-        squares += np.mean(climb**2, axis=1)
+    squares += mean_climb(angles_height, travel) ** 2
     return np.exp(-0.5 * squares)
+
+
+def mean_climb(angles_height: Array, travel: Array) -> Array:
+    """Return how far travel (T, 3) leaves each plane (M, 3), in sigmas of what slopes and swaying
+    explain.
+    """
+    if len(travel) == 0:
+        return np.zeros(len(angles_height))
+    unit = plane_of(np.concatenate([angles_height[:, :2], np.ones((len(angles_height), 1))], 1))
+    climb = (unit @ travel.T) / _climb_sigma_m(travel)
+    return np.sqrt(np.mean(climb**2, axis=1))
 
 
 def _climb_sigma_m(travel: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -26,6 +26,11 @@ class Patch:
     contrast: float = 18.0
     seed: int = 0
 
+    def below(self) -> Patch:
+        """Return its mirror image in the ground."""
+        turned = [(x, y, -z) for x, y, z in (self.corner, self.first, self.second)]
+        return replace(self, corner=turned[0], first=turned[1], second=turned[2])
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -35,6 +40,7 @@ class Scene:
     noise_grey: float = 1.5
     seed: int = 0
     texture_m: float = field(default=0.64)
+    reflectance: float = 0.0
 
     def render(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return left, right (H, W) uint8, the true floor (H, W) bool and the depth of the left
@@ -83,6 +89,10 @@ class Scene:
             grey[inside] = (patch.grey + patch.contrast * texture)[inside]
             floor[inside] = patch.is_floor
             nearest[inside] = depth[inside]
+        if self.reflectance:
+            standing = [patch.below() for patch in self.patches if not patch.is_floor]
+            below = replace(self, patches=standing, reflectance=0.0)._cast(offset_m)[0]
+            grey[floor] += self.reflectance * (below - grey)[floor]
         return grey, floor[n // 2 :: n, n // 2 :: n], nearest[n // 2 :: n, n // 2 :: n]
 
     def _texture(self, patch: Patch, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
