@@ -76,7 +76,7 @@ def se3_log(T: Array) -> Array:
     """Return the twist (6,) = (rho, phi) of one (4, 4) transform; the inverse of `se3_exp` for
     |phi| < pi.
     """
-    phi = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    phi = Rotation.from_matrix(T[:3, :3].copy()).as_rotvec()
     theta = float(np.linalg.norm(phi))
     K = skew(phi)
     if theta < 1e-7:
@@ -90,7 +90,8 @@ def se3_log(T: Array) -> Array:
 
 def quaternion_xyzw(R: Array) -> Array:
     """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
-    quaternion = Rotation.from_matrix(R).as_quat()
+    # SciPy 1.11 takes no array that is read-only.
+    quaternion = Rotation.from_matrix(R.copy()).as_quat()
     return -quaternion if quaternion[3] < 0 else quaternion
 
 
@@ -98,7 +99,7 @@ def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
     """Return the (4, 4) transform of a translation (3,) and a quaternion (4,) in the order x, y,
     z, w.
     """
-    return make_transform(Rotation.from_quat(quat_xyzw).as_matrix(), translation)
+    return make_transform(Rotation.from_quat(quat_xyzw.copy()).as_matrix(), translation)
 
 
 def rotation_angle(R: Array) -> float:

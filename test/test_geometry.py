@@ -101,3 +101,15 @@ def test_mount_round_trip_through_its_transform():
 def test_make_transform():
     T = make_transform(np.eye(3), np.array([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(transform_points(T, np.zeros((1, 3))), [[1, 2, 3]])
+
+
+def test_the_pose_of_a_mount_is_read_only_and_can_be_sent():
+    T_base_left = Mount(height_m=0.3, pitch_rad=0.1).T_base_left
+    with pytest.raises(ValueError, match='read-only'):
+        T_base_left[0, 3] = 1.0
+    quaternion = quaternion_xyzw(T_base_left[:3, :3])
+    translation = T_base_left[:3, 3]
+    quaternion.flags.writeable = False
+    again = transform_from_quaternion(translation, quaternion)
+    np.testing.assert_allclose(again, T_base_left, atol=1e-12)
+    np.testing.assert_allclose(se3_exp(se3_log(T_base_left)), T_base_left, atol=1e-9)

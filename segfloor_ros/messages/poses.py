@@ -124,7 +124,7 @@ def path_of_numbers(stamp_ns: NDArray[np.int64], numbers: Array) -> KeyframePath
         raise MessageError('a path holds poses that are impossible')
     T_map_base = np.zeros((len(numbers), 4, 4))
     if len(numbers):
-        T_map_base[:, :3, :3] = Rotation.from_quat(numbers[:, 3:]).as_matrix()
+        T_map_base[:, :3, :3] = Rotation.from_quat(numbers[:, 3:].copy()).as_matrix()
     T_map_base[:, :3, 3] = numbers[:, :3]
     T_map_base[:, 3, 3] = 1.0
     return KeyframePath(stamp_ns, T_map_base)
@@ -153,7 +153,7 @@ def pose_numbers(T_a_b: Array) -> Array:
     """Return transforms (N, 4, 4) as numbers (N, 7): x y z qx qy qz qw, with qw >= 0."""
     if len(T_a_b) == 0:
         return np.zeros((0, 7))
-    quaternions = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat()
+    quaternions = Rotation.from_matrix(T_a_b[:, :3, :3].copy()).as_quat()
     quaternions *= np.where(quaternions[:, 3:] < 0, -1.0, 1.0)
     return np.concatenate([T_a_b[:, :3, 3], quaternions], axis=1)
 
