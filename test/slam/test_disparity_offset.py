@@ -117,11 +117,14 @@ def test_an_exact_rig_stays_exact():
 
 
 def test_a_turn_on_the_spot_tells_little_and_changes_little():
-    poses = [planar_pose(0.0, 0.0, np.radians(2.0) * k) for k in range(30)]
-    slam, results = room_drive(poses)
-    assert len(slam.map.keyframes) > 5
-    assert abs(slam.disparity_offset_px) < 0.5 * StereoSlamSettings().disparity_offset_sigma_px
-    assert all(result.tracked for result in results)
+    offsets = []
+    for step in np.radians([1.5, 2.0, 2.5]):
+        slam, results = room_drive([planar_pose(0.0, 0.0, step * k) for k in range(30)])
+        assert len(slam.map.keyframes) > 5
+        assert all(result.tracked for result in results)
+        offsets.append(abs(slam.disparity_offset_px))
+    # One drive alone may err by as much as the noise of its matches.
+    assert np.median(offsets) < 0.5 * StereoSlamSettings().disparity_offset_sigma_px
 
 
 def test_switched_off_it_is_zero():
