@@ -64,7 +64,9 @@ class EvidenceFolder:
         hits = draw_hits(free, placed)
         partly = self._draw_partly_free(free, placed)
         near = self._draw_near(cells.shape, placed)
-        in_the_way = self._standing(cells, near) & touched & (1 - cv2.dilate(hits, _AROUND))
+        in_the_way = self._standing(cells, near) & touched
+        if cv2.countNonZero(in_the_way):
+            in_the_way &= 1 - cv2.dilate(hits, _AROUND)
         hidden = self._draw_hidden(in_the_way, placed.fan)
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible

@@ -39,12 +39,12 @@ class LogOddsRaster:
 
     def _include(self, low: tuple[int, int], high: tuple[int, int]) -> None:
         first, last = self.first_cell, self._end()
+        if first[0] <= low[0] and first[1] <= low[1] and high[0] <= last[0] and high[1] <= last[1]:
+            return
         if self.cells.size == 0:
             first, last = low, high
         new_first = tuple(CHUNK * (min(a, b) // CHUNK) for a, b in zip(first, low, strict=True))
         new_last = tuple(-CHUNK * (-max(a, b) // CHUNK) for a, b in zip(last, high, strict=True))
-        if self.cells.size and new_first == self.first_cell and new_last == self._end():
-            return
         shape = (new_last[0] - new_first[0], new_last[1] - new_first[1])
         cells = np.full(shape, ZERO, np.uint8)
         if self.cells.size:
