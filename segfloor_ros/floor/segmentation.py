@@ -42,6 +42,8 @@ DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _ROWS_ABOVE_HORIZON = 16
 """The matcher's paths get a run-up, and the horizon some play."""
 _TEXTURE_WINDOW_PX = 11
+_BORDER_BLOCKS = 2
+"""So near to the border of the right image, in blocks that are matched, matches are unsure."""
 _PLANE_SAMPLES = 4000
 _PLANE_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 _FAITH = 2.0
@@ -323,7 +325,8 @@ class FloorSegmentation:
         v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
-        shared = u * view.step >= floor_px
+        border_px = np.float32(_BORDER_BLOCKS * self._settings.block_size_px)
+        shared = u * view.step >= floor_px + border_px
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
