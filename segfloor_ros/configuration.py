@@ -1,5 +1,6 @@
 """The settings of all stages together: defaults < parameter file < command line.
- A parameter file is a plain ROS 2 parameter file; the nodes and the `segfloor` command read
+
+A parameter file is a plain ROS 2 parameter file; the nodes and the `segfloor` command read
 the same one.
 """
 

@@ -1,5 +1,6 @@
 """Rigid motions and axes shared by all stages.
- `T_a_b` is a (4, 4) float64 matrix that maps points of frame b into frame a. Optical frames have
+
+`T_a_b` is a (4, 4) float64 matrix that maps points of frame b into frame a. Optical frames have
 x right, y down, z forward; ROS frames have x forward, y left, z up (REP-103).
 """
 

@@ -26,11 +26,10 @@ KeyframeListener = Callable[[Keyframe, FloorObservation], None]
 
 
 class Pipeline:
-    """SLAM on the calling thread; segmentation, labelling and grid follow on one worker,
-        keyframe by keyframe.
+    """SLAM on the calling thread; segmentation, labelling and grid on one worker, in the order of
+    the keyframes.
 
-    The worker sees the keyframes in order and nothing flows back, so the result does not depend
-    on timing.
+    Nothing flows back from the worker to SLAM, so the result does not depend on timing.
     """
 
     def __init__(

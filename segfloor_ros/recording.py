@@ -1,5 +1,6 @@
 """The results folder of a run: maps, trajectories, cloud, masks, summary and settings.
- Everything is written to a hidden folder beside the target and moved in at the end, so that a
+
+Everything is written to a hidden folder beside the target and moved in at the end, so that a
 run that fails leaves nothing half-written.
 """
 

@@ -1,5 +1,6 @@
 """Settings of the stages: one frozen dataclass per stage is the only source of names and defaults.
- A stage declares its settings once, with `setting(...)` fields carrying description, unit and
+
+A stage declares its settings once, with `setting(...)` fields carrying description, unit and
 range. The ROS parameters (names, descriptors, ranges), the checks of YAML files and of the
 command line, and the tables in docs/ are all derived from that declaration.
 """

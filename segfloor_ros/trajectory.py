@@ -41,8 +41,8 @@ class TrackedPose:
 
 
 def corrected_trajectory(poses: Sequence[TrackedPose], path: KeyframePath) -> Trajectory:
-    """Return the tracked frames in frame `map`, each carried along by its reference keyframe's
-        final pose.
+    """Return the tracked frames in frame `map`, moved with the final pose of their reference
+    keyframe.
 
     T_map_base = T_map_keyframe(final) · T_odom_keyframe⁻¹ · T_odom_base, as the motion since the
     keyframe is what tracking measured. A frame whose keyframe is not in the path goes with the
