@@ -1,5 +1,6 @@
-# make        everything needed, in .venv        make test   style, types and all tests
+# make        everything needed, in .venv        make test   style, types and the fast tests
 # make demo   record a drive, map it, score it   make lint   style and types only
+# make test-slow    the tests left out of make test
 # make test-noble   the tests with the versions of Ubuntu 24.04, in .venv-noble
 # PYTHON=/path/to/python chooses the interpreter (3.10 or newer), PYTHON312=... that of test-noble.
 
@@ -17,9 +18,11 @@ APART_FROM := nodes/test_faults nodes/test_restarts nodes/test_two_hosts nodes/t
   nodes/test_launched nodes/test_losses nodes/test_lossless nodes/test_middleware \
   nodes/test_ros2_commands
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
+# Tests of one module stay together where they can: its fixtures are made once.
+PARALLEL := -n 2 --dist worksteal
 CODE := segfloor_ros test launch_configs docs tools setup.py
 
-.PHONY: all test test-noble noble-python demo lint format docs clean
+.PHONY: all test test-slow test-noble noble-python demo lint format docs clean
 
 all: $(STAMP) $(TF)
 
@@ -44,10 +47,13 @@ $(TF): $(wildcard tools/tf2_msgs/*) $(STAMP)
 	@touch $@
 
 test: $(STAMP) $(TF) lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL) -m 'not slow'
+
+test-slow: $(STAMP) $(TF)
+	$(BIN)/python -m pytest -m slow
 
 test-noble: $(NOBLE)/.installed
-	$(NOBLE)/bin/python -m pytest $(APART_FROM:%=--ignore=test/%.py)
+	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(APART_FROM:%=--ignore=test/%.py)
 
 noble-python:
 	@for python in $(NOBLE_CANDIDATES); do \

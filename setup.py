@@ -61,12 +61,13 @@ setup(
         'cli': ['typer>=0.12', 'rich>=13', 'rosbags>=0.10', 'evo>=1.28', 'matplotlib>=3.6'],
         'sim': ['mujoco>=3.3'],
         # colcon takes the tests to be pytest's by this name.
-        'test': ['pytest', 'pytest-timeout'],
+        'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
             'colcon-common-extensions',
             'mypy',
             'pytest',
             'pytest-timeout',
+            'pytest-xdist',
             'ruff',
             "scipy-stubs; python_version >= '3.11'",
             'setuptools<80',

@@ -15,6 +15,9 @@ FIRST_PORT, PORTS_PER_DOMAIN, DOMAINS = 7400, 250, 101
 PARTICIPANT_OFFSET = 10
 PARTICIPANTS_TRIED = 8
 
+_reservation: socket.socket | None = None
+"""Holds the last port of the domain that this process was told."""
+
 STATUS_LISTENERS = 2
 """The camera, to pace its frames, and the replay itself."""
 
@@ -41,11 +44,19 @@ def isolated_environment() -> dict[str, str]:
 
 
 def free_domain() -> int:
-    """Return a ROS domain id without participants on this machine."""
+    """Return a ROS domain id without participants on this machine.
+
+    It is reserved for this process until the next call: no other process is told the same one.
+    """
+    global _reservation
     for attempt in range(DOMAINS):
         domain = 1 + (os.getpid() + attempt) % DOMAINS
-        first = FIRST_PORT + PORTS_PER_DOMAIN * domain + PARTICIPANT_OFFSET
-        if all(_is_free(first + 2 * i) for i in range(PARTICIPANTS_TRIED)):
+        first = FIRST_PORT + PORTS_PER_DOMAIN * domain
+        reservation = _bind(first + PORTS_PER_DOMAIN - 1, socket.SOCK_STREAM)
+        if reservation is None:
+            continue
+        if all(_is_free(first + PARTICIPANT_OFFSET + 2 * i) for i in range(PARTICIPANTS_TRIED)):
+            _reservation = reservation
             return domain
     raise SegfloorError('every ROS domain id is in use on this machine; set ROS_DOMAIN_ID')
 
@@ -82,9 +93,17 @@ def _listeners_of(topic: str) -> int:
 
 
 def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(('', port))
-        except OSError:
-            return False
-    return True
+    probe = _bind(port, socket.SOCK_DGRAM)
+    if probe is not None:
+        probe.close()
+    return probe is not None
+
+
+def _bind(port: int, kind: socket.SocketKind) -> socket.socket | None:
+    bound = socket.socket(socket.AF_INET, kind)
+    try:
+        bound.bind(('', port))
+    except OSError:
+        bound.close()
+        return None
+    return bound
