@@ -1,7 +1,7 @@
 """The settings of all stages together: defaults < parameter file < command line.
 
-A parameter file is a plain ROS 2 parameter file; the nodes and the `segfloor` command read
-the same one.
+A parameter file is a plain ROS 2 parameter file; the nodes and the `segfloor` command read the
+same one. The robot is one for all stages, whichever of them it was set for.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from segfloor_ros.errors import SettingsError
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.node_settings import is_node_parameter
+from segfloor_ros.robot import RobotSettings
 from segfloor_ros.settings import StageSettings, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 
@@ -63,6 +64,9 @@ STAGE_SETTINGS: dict[str, type[StageSettings]] = {
     )
 }
 
+ROBOT_STAGES = [name for name, cls in STAGE_SETTINGS.items() if issubclass(cls, RobotSettings)]
+ROBOT_PARAMETERS = [spec.name for spec in RobotSettings.specs()]
+
 
 def resolve(
     params_file: Path | None = None,
@@ -72,14 +76,17 @@ def resolve(
     """Build the configuration: defaults < `params_file` < `assignments` (`stage.name=value`) <
     changes.
 
+    A value of the robot holds for all stages that know it; `--set` takes it without a stage, too.
     Raises SettingsError naming the parameter, the value and what is accepted.
     """
     values: dict[str, dict[str, Any]] = {name: {} for name in STAGE_SETTINGS}
     if params_file is not None:
-        _merge(values, read_params_file(params_file))
+        _merge(values, _with_one_robot(read_params_file(params_file), str(params_file)))
+    assigned: dict[str, dict[str, Any]] = {}
     for assignment in assignments:
-        stage, name, value = _parse_assignment(assignment)
-        values[stage][name] = value
+        for stage, name, value in _parse_assignment(assignment):
+            assigned.setdefault(stage, {})[name] = value
+    _merge(values, _with_one_robot(assigned, '--set'))
     _merge(values, stage_changes)
     stages: dict[str, Any] = {
         name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()
@@ -103,7 +110,9 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(document, dict):
         raise SettingsError(f'{path}: expected node names with ros__parameters below them')
     values: dict[str, dict[str, Any]] = {}
-    for node, content in document.items():
+    # What is said of one node wins over what is said of all, as in ROS.
+    of_all_first = sorted(document.items(), key=lambda item: not str(item[0]).endswith('**'))
+    for node, content in of_all_first:
         parameters = content.get('ros__parameters') if isinstance(content, dict) else None
         if not isinstance(parameters, dict):
             raise SettingsError(f'{path}: {node} has no ros__parameters')
@@ -134,14 +143,38 @@ def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, di
     return values
 
 
-def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
+def _parse_assignment(assignment: str) -> list[tuple[str, str, Any]]:
+    """Return stage, name and value; of the robot's parameters, which need no stage, for each."""
     key, separator, text = assignment.partition('=')
     stage, dot, name = key.strip().partition('.')
-    if not separator or not dot:
+    if not separator or not (dot or stage in ROBOT_PARAMETERS):
         raise SettingsError(f'--set {assignment}: expected stage.parameter=value')
+    value = yaml.safe_load(text)
+    if not dot:
+        return [(owner, stage, value) for owner in ROBOT_STAGES]
     if stage not in STAGE_SETTINGS:
         raise SettingsError(f'unknown stage {stage}{suggestion(stage, list(STAGE_SETTINGS))}')
-    return stage, name, yaml.safe_load(text)
+    return [(stage, name, value)]
+
+
+def _with_one_robot(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:
+    """Return values by stage with those of the robot in all stages that know it. Raises
+    SettingsError where two of them differ.
+    """
+    result = {stage: dict(parameters) for stage, parameters in values.items()}
+    for name in ROBOT_PARAMETERS:
+        given = {stage: values[stage][name] for stage in values if name in values[stage]}
+        given = {stage: value for stage, value in given.items() if stage in ROBOT_STAGES}
+        for stage, value in given.items():
+            first = next(iter(given))
+            if value != given[first]:
+                raise SettingsError(
+                    f'{where}: {first}.{name} = {given[first]!r}, but {stage}.{name} = {value!r}: '
+                    'there is one robot; set it once, in a file under /**'
+                )
+            for owner in ROBOT_STAGES:
+                result.setdefault(owner, {})[name] = value
+    return result
 
 
 def _merge(values: dict[str, dict[str, Any]], changes: Mapping[str, Mapping[str, Any]]) -> None:

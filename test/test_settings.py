@@ -144,3 +144,40 @@ def test_assignments_need_stage_name_and_value(assignment):
 def test_unknown_stage_gets_a_suggestion():
     with pytest.raises(SettingsError, match='did you mean stereo_slam'):
         resolve(None, ['stereo_slm.num_features=3'])
+
+
+@pytest.mark.parametrize(
+    'assignment',
+    [
+        'robot_height_m=0.4',
+        'cloud_labelling.robot_height_m=0.4',
+        'floor_segmentation.robot_height_m=0.4',
+    ],
+)
+def test_there_is_one_robot_whichever_stage_it_is_set_for(assignment):
+    configuration = resolve(None, [assignment])
+    robot = {'robot_height_m': 0.4, 'step_height_m': 0.03, 'drop_height_m': 0.04}
+    assert configuration.floor_segmentation.robot == robot
+    assert configuration.cloud_labelling.robot == robot
+
+
+def test_the_robot_of_a_file_is_that_of_both_stages_and_the_command_line_wins(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    step_height_m: 0.05\n    robot_height_m: 2\n')
+    configuration = resolve(file, ['cloud_labelling.robot_height_m=0.4'])
+    assert configuration.floor_segmentation.robot == configuration.cloud_labelling.robot
+    assert configuration.floor_segmentation.step_height_m == 0.05
+    assert configuration.floor_segmentation.robot_height_m == 0.4
+
+
+def test_two_robots_in_one_place_are_refused(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text(
+        '/**/cloud_labelling:\n  ros__parameters:\n    drop_height_m: 0.1\n'
+        '/**:\n  ros__parameters:\n    drop_height_m: 0.04\n'
+    )
+    with pytest.raises(SettingsError, match=r'params\.yaml: .*0\.04.*0\.1: there is one robot'):
+        resolve(file)
+    both = ['floor_segmentation.step_height_m=0.02', 'cloud_labelling.step_height_m=0.05']
+    with pytest.raises(SettingsError, match=r'--set: .*step_height_m = 0\.02.*= 0\.05'):
+        resolve(None, both)

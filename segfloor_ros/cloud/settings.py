@@ -4,37 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from segfloor_ros.settings import StageSettings, setting
+from segfloor_ros.robot import RobotSettings
+from segfloor_ros.settings import setting
 
 
 @dataclass(frozen=True)
-class CloudLabellingSettings(StageSettings):
+class CloudLabellingSettings(RobotSettings):
     """Evidence for floor and obstacle."""
 
-    robot_height_m: float = setting(
-        1.0,
-        'Points higher than this above the floor do not concern the robot.',
-        unit='m',
-        minimum=0.05,
-        maximum=10.0,
-        live=True,
-    )
-    step_height_m: float = setting(
-        0.03,
-        'Points higher than this above the floor speak for an obstacle, lower ones for floor.',
-        unit='m',
-        minimum=0.005,
-        maximum=0.5,
-        live=True,
-    )
-    drop_height_m: float = setting(
-        0.10,
-        'Points deeper than this below the floor are mismatches: neither floor nor obstacle.',
-        unit='m',
-        minimum=0.02,
-        maximum=2.0,
-        live=True,
-    )
     height_sigma_m: float = setting(
         0.02,
         'Error of a point height close to the robot, one sigma.',

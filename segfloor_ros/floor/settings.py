@@ -4,37 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from segfloor_ros.settings import StageSettings, setting
+from segfloor_ros.robot import RobotSettings
+from segfloor_ros.settings import setting
 
 
 @dataclass(frozen=True)
-class FloorSegmentationSettings(StageSettings):
+class FloorSegmentationSettings(RobotSettings):
     """Disparity, floor profile, mask and scan."""
 
-    step_height_m: float = setting(
-        0.03,
-        'What stands higher than this above the floor is not floor.',
-        unit='m',
-        minimum=0.005,
-        maximum=0.5,
-        live=True,
-    )
-    robot_height_m: float = setting(
-        1.0,
-        'What hangs higher than this above the floor does not end the scan.',
-        unit='m',
-        minimum=0.05,
-        maximum=10.0,
-        live=True,
-    )
-    drop_height_m: float = setting(
-        0.04,
-        'What lies deeper than this below the floor is not floor.',
-        unit='m',
-        minimum=0.005,
-        maximum=0.5,
-        live=True,
-    )
     disparity_noise_px: float = setting(
         0.5,
         'Error of a disparity; widens the height tolerance of far floor.',
