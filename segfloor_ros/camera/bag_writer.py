@@ -146,7 +146,9 @@ class BagWriter:
                 f'/{side}/camera_info', pair.stamp_ns, self._info_message(header, eye)
             )
             self.write_message(
-                self._image_topic(side), pair.stamp_ns, self._image_message(header, image)
+                self._image_topic(side),
+                pair.stamp_ns,
+                self._picture_message(pair.stamp_ns, frame_id, image),
             )
 
     def write_message(self, topic: str, stamp_ns: int, message: Any) -> None:
@@ -172,23 +174,30 @@ class BagWriter:
         suffix = '' if self._coding is ImageCoding.raw else '/compressed'
         return f'/{side}/{image}{suffix}'
 
-    def _image_message(self, header: Any, image: NDArray[np.uint8]) -> Any:
+    def image_message(
+        self, stamp_ns: int, image: NDArray[Any], encoding: str, frame_id: str = FRAME_IDS[0]
+    ) -> Any:
+        """Return a sensor_msgs/Image of an image (H, W) of one channel."""
         pixels = np.ascontiguousarray(image)
-        if self._coding is not ImageCoding.raw:
-            suffix, options = self._encoders[self._coding]
-            _, data = cv2.imencode(suffix, pixels, options)
-            words = f'mono8; {self._coding.value} compressed mono8'
-            return self.types[COMPRESSED](header=header, format=words, data=data.ravel())
         height, width = pixels.shape
         return self.types[IMAGE](
-            header=header,
+            header=self.header(stamp_ns, frame_id),
             height=height,
             width=width,
-            encoding='mono8',
+            encoding=encoding,
             is_bigendian=0,
-            step=width,
-            data=pixels.ravel(),
+            step=width * pixels.itemsize,
+            data=pixels.ravel().view(np.uint8),
         )
+
+    def _picture_message(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Any:
+        if self._coding is ImageCoding.raw:
+            return self.image_message(stamp_ns, image, 'mono8', frame_id)
+        suffix, options = self._encoders[self._coding]
+        _, data = cv2.imencode(suffix, np.ascontiguousarray(image), options)
+        words = f'mono8; {self._coding.value} compressed mono8'
+        header = self.header(stamp_ns, frame_id)
+        return self.types[COMPRESSED](header=header, format=words, data=data.ravel())
 
     def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
         whole_image = self.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)

@@ -86,6 +86,8 @@ def develop(
 
 
 def brightness(scene: Scene, time_s: float) -> float:
-    """Return the brightness of the lights at a time."""
+    """Return the brightness of what the lenses let through at a time."""
+    if any(start <= time_s < end for start, end in scene.camera.covered):
+        return 0.0
     levels = np.array(scene.lighting.levels)
     return float(np.interp(time_s, levels[:, 0], levels[:, 1])) if len(levels) else 1.0

@@ -15,13 +15,18 @@ import numpy as np
 import yaml
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.geometry import Array, invert
+from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.simulation.rig import RawCamera
 from segfloor_ros.simulation.simulation import SimulatedFrame, Simulation
 
 DISPARITY_SCALE = 256
 """Disparity files are 16-bit PNG in units of 1/256 px, as in KITTI's stereo benchmark."""
+
+IMU_COLUMNS = (
+    '#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],'
+    'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]'
+)
 
 PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
 
@@ -47,8 +52,9 @@ def record(
     """Write a drive to a new folder, complete or not at all.
 
     Rectified images go to image_0/ and image_1/ with calib.txt (KITTI odometry layout), others to
-    left/ and right/ with ROS calibrations left.yaml and right.yaml. open_sink: makes a
-    further receiver of the frames in the folder, e.g. a bag. Raises InputError when `out` holds
+    left/ and right/ with ROS calibrations left.yaml and right.yaml; what wheels, IMU and depth
+    camera tell goes beside them. open_sink: makes a further receiver of the frames in the folder,
+    e.g. a bag. Raises InputError when `out` holds
     something already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -86,6 +92,7 @@ def _record_into(
     write_truth(folder, simulation)
     if options.images:
         _write_calibration(folder, simulation)
+        _write_sensors(folder, simulation)
     poses = []
     with ExitStack() as stack:
         sink = stack.enter_context(open_sink(folder)) if open_sink is not None else None
@@ -161,10 +168,27 @@ def _matrix(values: Array) -> dict:
     }
 
 
+def _write_sensors(folder: Path, simulation: Simulation) -> None:
+    """Write wheel_odometry.txt (TUM) and imu.csv (the columns of EuRoC's data.csv)."""
+    wheels, imu = simulation.wheels(), simulation.imu()
+    if wheels is not None:
+        turns = np.stack([quaternion_xyzw(T[:3, :3]) for T in wheels.T_odom_base])
+        table = np.column_stack([wheels.times_s, wheels.T_odom_base[:, :3, 3], turns])
+        np.savetxt(folder / 'wheel_odometry.txt', table, fmt='%.6f' + ' %.9f' * 7)
+    if imu is not None:
+        rows = (
+            f'{round(t * 1e9)},' + ','.join(f'{v:.9g}' for v in (*gyro, *accel))
+            for t, gyro, accel in zip(imu.times_s, imu.gyro_rad_s, imu.accel_m_s2, strict=True)
+        )
+        (folder / 'imu.csv').write_text('\n'.join([IMU_COLUMNS, *rows]) + '\n')
+
+
 def _write_images(folder: Path, frame: SimulatedFrame, rectified: bool) -> None:
     names = ('image_0', 'image_1') if rectified else ('left', 'right')
     for name, image in zip(names, (frame.left, frame.right), strict=True):
         _write_png(folder / name / f'{frame.index:06d}.png', image)
+    if frame.depth_mm is not None:
+        _write_png(folder / 'depth' / f'{frame.index:06d}.png', frame.depth_mm)
 
 
 def _write_frame_truth(

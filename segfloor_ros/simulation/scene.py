@@ -132,7 +132,8 @@ class CameraRig:
     down, roll to the right. fov_x_deg: of the rectified image. distortion: k1 k2 p1 p2 k3 of the
     raw images; with it, or with misalignment_deg (rotation of either raw camera against the
     rectified pair), the images are written unrectified. exposure_s: motion blur. right_gain:
-    brightness of the right image over that of the left.
+    brightness of the right image over that of the left. covered: when something hides the lenses,
+    pairs of start and end in seconds.
     """
 
     width: int = 640
@@ -149,12 +150,64 @@ class CameraRig:
     misalignment_deg: float = 0.0
     right_gain: float = 1.0
     exposure_s: float = 0.0
+    covered: tuple[Point, ...] = ()
     vibration: Vibration = field(default_factory=Vibration)
 
     @property
     def rectified(self) -> bool:
         """Whether the images come out of the camera rectified."""
         return not any(self.distortion) and self.misalignment_deg == 0.0
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """The wheel odometry of a differential drive; without a rate there is none. scale: metres told
+    per metre driven. track_m: between the wheels. noise_m: standard deviation of what a wheel
+    tells of one metre. slips: (start s, end s, left, right), factors on what each wheel tells.
+    """
+
+    rate_hz: float = 0.0
+    scale: float = 1.0
+    track_m: float = 0.3
+    noise_m: float = 0.003
+    slips: tuple[tuple[float, float, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Imu:
+    """A gyroscope and accelerometer on the left camera; without a rate there is none. Noise is the
+    standard deviation of a sample, a bias the length of a constant error in a random direction.
+    """
+
+    rate_hz: float = 0.0
+    gyro_noise_deg_s: float = 0.1
+    gyro_bias_deg_s: float = 0.5
+    accel_noise_m_s2: float = 0.03
+    accel_bias_m_s2: float = 0.05
+
+
+@dataclass(frozen=True)
+class DepthSensor:
+    """A depth image aligned with the rectified left image; without a maximum there is none. It is
+    measured as a disparity over `baseline_m` with noise, in steps of `step_px`. hole_share: of the
+    image without a measurement, in patches.
+    """
+
+    max_m: float = 0.0
+    min_m: float = 0.3
+    baseline_m: float = 0.05
+    noise_px: float = 0.08
+    step_px: float = 0.0625
+    hole_share: float = 0.02
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the robot has besides its stereo camera."""
+
+    wheel_odometry: Wheels = field(default_factory=Wheels)
+    imu: Imu = field(default_factory=Imu)
+    depth: DepthSensor = field(default_factory=DepthSensor)
 
 
 @dataclass(frozen=True)
@@ -193,6 +246,7 @@ class Scene:
     people: tuple[Person, ...] = ()
     lighting: Lighting = field(default_factory=Lighting)
     camera: CameraRig = field(default_factory=CameraRig)
+    sensors: Sensors = field(default_factory=Sensors)
     resolution_m: float = 0.05
     raster_phase: float = 0.5
     robot_height_m: float = 1.0

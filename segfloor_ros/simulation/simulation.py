@@ -17,6 +17,14 @@ from segfloor_ros.simulation.imaging import Picture, develop, plan_imaging
 from segfloor_ros.simulation.renderer import WorldRenderer
 from segfloor_ros.simulation.rig import RigMotion, rectified_camera
 from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.sensors import (
+    ImuReadings,
+    WheelReadings,
+    depth_reading_mm,
+    imu_readings,
+    smooth_motion,
+    wheel_readings,
+)
 from segfloor_ros.simulation.solids import floors, obstacles
 from segfloor_ros.simulation.truth_map import true_map
 from segfloor_ros.simulation.world import CAMERAS, build_world
@@ -26,8 +34,8 @@ BLUR_SAMPLES = 6
 
 @dataclass(frozen=True)
 class SimulatedFrame:
-    """One pair of images (H, W) uint8 as the cameras deliver them, and where the rectified left
-    optical frame was (4, 4).
+    """One pair of images (H, W) uint8 as the cameras deliver them, where the rectified left
+    optical frame was (4, 4), and the depth image (H, W) uint16 in mm, where there is a sensor.
     """
 
     index: int
@@ -35,6 +43,7 @@ class SimulatedFrame:
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
     T_world_left: Array
+    depth_mm: NDArray[np.uint16] | None = None
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,8 @@ class Simulation:
         self.drive: Drive = plan_drive(scene.path, scene.camera.rate_hz)
         self.camera = rectified_camera(scene.camera)
         self.imaging = plan_imaging(scene)
+        if scene.sensors.depth.max_m and not scene.camera.rectified:
+            raise InputError('a depth sensor needs a camera without distortion and misalignment')
         solids, ground = obstacles(scene), floors(scene)
         self.motion = RigMotion(scene, self.drive, ground)
         self.true_map: OccupancyGrid = true_map(scene, solids, ground, self.drive.xy_yaw[0, :2])
@@ -98,7 +109,8 @@ class Simulation:
             develop(picture, self.imaging, self.scene, side, index, time_s)
             for side, picture in enumerate(self._exposed(time_s))
         )
-        return SimulatedFrame(index, time_s, left, right, self.motion.T_world_left(time_s))
+        pose = self.motion.T_world_left(time_s)
+        return SimulatedFrame(index, time_s, left, right, pose, self._depth_mm(index))
 
     def truth(self, index: int) -> FrameTruth:
         """Render what is true of one frame's rectified left image."""
@@ -107,6 +119,25 @@ class Simulation:
         depth_m = self._truth.depth_m(CAMERAS[0])
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
         return FrameTruth(self._truth.floor_mask(CAMERAS[0]), depth_m, disparity_px)
+
+    def wheels(self) -> WheelReadings | None:
+        """Return what the wheels tell of the whole drive, where the scene has such."""
+        if not self.scene.sensors.wheel_odometry.rate_hz:
+            return None
+        return wheel_readings(self.scene, smooth_motion(self.motion))
+
+    def imu(self) -> ImuReadings | None:
+        """Return what the IMU tells of the whole drive, where the scene has one."""
+        if not self.scene.sensors.imu.rate_hz:
+            return None
+        return imu_readings(self.scene, smooth_motion(self.motion))
+
+    def _depth_mm(self, index: int) -> NDArray[np.uint16] | None:
+        if not self.scene.sensors.depth.max_m:
+            return None
+        true_m = self.truth(index).depth_m
+        time_s = float(self.drive.times_s[index])
+        return depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
 
     def _exposed(self, time_s: float) -> list[Picture]:
         """Return the ideal left and right pictures, averaged over the exposure around a time."""
