@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.evidence import height_evidence, local_floor_m, mask_evidence
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.point_evidence import height_evidence, local_floor_m, mask_evidence
 from segfloor_ros.cloud.point_table import PointTable
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.geometry import Array

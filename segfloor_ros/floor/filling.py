@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.contact import fill_to_contact
-from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.pixel_evidence import Comparison
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.runs import Runs, pixels_where
 from segfloor_ros.floor.view import FloorView

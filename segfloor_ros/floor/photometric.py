@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.evidence import Comparison
+from segfloor_ros.floor.pixel_evidence import Comparison
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView

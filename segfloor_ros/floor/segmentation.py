@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, equal_exposure
-from segfloor_ros.floor.evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.filling import (
     drop_islands,
     fill_gaps,
@@ -18,7 +17,6 @@ from segfloor_ros.floor.filling import (
     trim_to_edges,
 )
 from segfloor_ros.floor.histograms import filtered_v_disparity, rising
-from segfloor_ros.floor.memory import FloorMemory
 from segfloor_ros.floor.observation import (
     FLOOR,
     NOT_FLOOR,
@@ -28,8 +26,10 @@ from segfloor_ros.floor.observation import (
 )
 from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
+from segfloor_ros.floor.pixel_evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, propose, refine, scores
 from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
+from segfloor_ros.floor.remembered_floor import FloorMemory
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings

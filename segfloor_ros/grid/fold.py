@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.grid.blocking import nearest_cells
-from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
 from segfloor_ros.grid.hits import draw_hits, draw_rays
+from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 from segfloor_ros.grid.log_odds import ZERO, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings

@@ -7,8 +7,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fold import EvidenceFolder
+from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 from segfloor_ros.grid.log_odds import LogOddsRaster
 from segfloor_ros.grid.placing import Pose2d
 

@@ -9,9 +9,9 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.evidence import gather_evidence
 from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.history import EvidenceHistory
+from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.grid.settings import OccupancyGridSettings

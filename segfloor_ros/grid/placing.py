@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.evidence import KeyframeEvidence
 from segfloor_ros.grid.fan import Fan, find_jumps, unit_vectors
+from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""

@@ -41,6 +41,16 @@ def plain(size: int, rng: np.random.Generator) -> Image:
     return np.full((size, size), 175, np.float32)
 
 
+def plain_dark(size: int, rng: np.random.Generator) -> Image:
+    """Dark paint without any structure."""
+    return np.full((size, size), 85, np.float32)
+
+
+def plain_light(size: int, rng: np.random.Generator) -> Image:
+    """Light paint without any structure."""
+    return np.full((size, size), 235, np.float32)
+
+
 def plaster(size: int, rng: np.random.Generator) -> Image:
     """Painted wall: hardly any texture."""
     return 178 + 2.2 * fractal_noise(size, 0.6, rng) + 4 * fractal_noise(size, 1.6, rng)
@@ -162,6 +172,8 @@ def metal(size: int, rng: np.random.Generator) -> Image:
 
 GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, float]] = {
     'plain': (plain, 64, 1.0),
+    'plain_dark': (plain_dark, 64, 1.0),
+    'plain_light': (plain_light, 64, 1.0),
     'plaster': (plaster, 1024, 3.0),
     'rough_plaster': (rough_plaster, 1024, 2.5),
     'concrete': (concrete, 1024, 3.0),

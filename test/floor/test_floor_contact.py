@@ -5,8 +5,8 @@ import pytest
 from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.floor.contact import fill_to_contact
-from segfloor_ros.floor.evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.pixel_evidence import Comparison
 from segfloor_ros.floor.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.view import FloorView
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.memory import FloorMemory
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.remembered_floor import FloorMemory
 from segfloor_ros.floor.view import FloorView
 
 FIRST_ROW = 220
