@@ -1,7 +1,8 @@
 """ORB features spread over the image.
- Rublee et al., ORB: an efficient alternative to SIFT or SURF (ICCV 2011). The strongest
-corners alone would all lie on posters and shelves; the budget is dealt out over image cells
-instead, so that the floor gets its share.
+
+Rublee et al., ORB: an efficient alternative to SIFT or SURF (ICCV 2011). The strongest corners
+alone would all lie on posters and shelves; the budget is dealt out over image cells instead, so
+that the floor gets its share.
 """
 
 from __future__ import annotations
@@ -16,6 +17,13 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 
 OVERSAMPLING = 4
 """Corners detected per feature kept; the surplus is what the cells choose from."""
+
+CELL_SIZE_PX = 16
+"""Side of the image cells over which features are spread: about as many cells as features."""
+
+PYRAMID_LEVELS = 8
+PYRAMID_SCALE = 1.2
+"""The pyramid of ORB as published: sizes up to 3.6 times as large are recognised."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +49,10 @@ class FeatureExtractor:
 
     def __init__(self, settings: StereoSlamSettings) -> None:
         self._budget = settings.num_features
-        self._cell_px = settings.cell_size_px
-        self._scale = settings.pyramid_scale
         self._orb = cv2.ORB_create(
             nfeatures=OVERSAMPLING * settings.num_features,
-            scaleFactor=settings.pyramid_scale,
-            nlevels=settings.pyramid_levels,
+            scaleFactor=PYRAMID_SCALE,
+            nlevels=PYRAMID_LEVELS,
             edgeThreshold=19,
             fastThreshold=settings.fast_threshold,
         )
@@ -60,7 +66,7 @@ class FeatureExtractor:
             )
         uv = cv2.KeyPoint_convert(corners)
         response = np.array([corner.response for corner in corners], np.float32)
-        chosen = spread(uv, response, self._cell_px, self._budget)
+        chosen = spread(uv, response, CELL_SIZE_PX, self._budget)
         kept, descriptor = self._orb.compute(image, [corners[i] for i in chosen])
         octave = np.array([corner.octave & 0xFF for corner in kept], np.uint8)
         uv = np.asarray(cv2.KeyPoint_convert(kept), np.float32).reshape(-1, 2)
@@ -73,7 +79,7 @@ class FeatureExtractor:
         level by the nominal scale; but levels have whole sizes, and what scales is the
         distance from the image's outer edge, half a pixel before the first pixel's centre.
         """
-        nominal = self._scale ** octave.astype(np.float64)[:, None]
+        nominal = PYRAMID_SCALE ** octave.astype(np.float64)[:, None]
         size = np.array(image.shape[::-1], np.float64)
         level_size = np.rint(size / nominal)
         return (((uv / nominal) + 0.5) * (size / level_size) - 0.5).astype(np.float32)

@@ -8,8 +8,6 @@ ICRA 2014). The patches come from keyframes: errors do not add up from frame to 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +19,8 @@ from segfloor_ros.slam.optical_flow import follow_pixels
 from segfloor_ros.slam.point_measurement import align_pixels, measure_disparity
 from segfloor_ros.slam.pose import PoseEstimate, refine_pose
 from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.track import MIN_TRACKED, Track
 from segfloor_ros.slam.visibility import Prediction, predict_points
 
 MAX_FOLLOWED = 250
@@ -31,46 +29,36 @@ MIN_FOUND = 0.15
 """Share of the selected points that must be found and agree, else the frame is searched anew."""
 
 
-@dataclass(frozen=True)
-class Sighting:
-    """What is known of the last frame: its shrunk left image, and map points ids (N,) at its
-    pixels (N, 2).
-    """
-
-    small: NDArray[np.uint8]
-    ids: NDArray[np.int32]
-    uv_px: Array
-
-    def take(self, chosen: NDArray[np.bool_]) -> Sighting:
-        """Return it with the chosen points (N,)."""
-        return Sighting(self.small, self.ids[chosen], self.uv_px[chosen])
-
-
-@dataclass(frozen=True)
-class Track:
-    """A frame with a pose.
-
-    point_ids, uv_px: (N,), (N, 2) the points that were found and agree. visible_ids: those that
-    were looked for.
-    """
-
-    T_camera_world: Array
-    covariance: Array
-    point_ids: NDArray[np.int32]
-    uv_px: Array
-    visible_ids: NDArray[np.int32]
-
-
 class Follower:
     """Finds the pose of a frame from the one before."""
 
-    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
+    def __init__(self, camera: StereoCamera, tracked_points: int) -> None:
         self._camera = camera
-        self._settings = settings
+        self._tracked_points = tracked_points
+        self.reset()
+
+    def reset(self) -> None:
+        """Know no frame before."""
+        self._small: NDArray[np.uint8] | None = None
+        self._ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._uv_px: Array = np.zeros((0, 2))
+
+    def see(self, images: Images, ids: NDArray[np.int32], uv_px: Array) -> None:
+        """Take in a frame that shows map points `ids` (N,) at pixels (N, 2)."""
+        self._small, self._ids, self._uv_px = images.small, ids, uv_px
+
+    @property
+    def seen_ids(self) -> NDArray[np.int32]:
+        """The points (N,) of the last frame."""
+        return self._ids
+
+    def drop_dead(self, sparse_map: SparseMap) -> None:
+        """Forget points that are not part of the map any more."""
+        alive = sparse_map.alive[self._ids]
+        self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
 
     def follow(
         self,
-        last: Sighting,
         images: Images,
         sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
@@ -81,7 +69,7 @@ class Follower:
 
         offset_px: the known error of all disparities, measured minus true.
         """
-        estimate = self._by_flow(last, images.small, sparse_map, T_predicted)
+        estimate = self._by_flow(images.small, sparse_map, T_predicted)
         if estimate is None:
             return None
         pose = estimate.T_camera_world
@@ -92,7 +80,7 @@ class Follower:
         measure_disparity(
             images.left, images.right, observations, rows, seen.uvd_px[rows, 2] + offset_px
         )
-        if len(rows) < self._settings.min_tracked:
+        if len(rows) < MIN_TRACKED:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
@@ -111,22 +99,23 @@ class Follower:
 
     def _by_flow(
         self,
-        last: Sighting,
         small: NDArray[np.uint8],
         sparse_map: SparseMap,
         T_predicted: Array,
     ) -> PoseEstimate | None:
         """Find the pose to about a pixel from where the last frame's points went."""
-        step = -(-len(last.ids) // MAX_FOLLOWED)
-        ids, uv_last = last.ids[::step], last.uv_px[::step]
+        if self._small is None or len(self._ids) < MIN_TRACKED:
+            return None
+        step = -(-len(self._ids) // MAX_FOLLOWED)
+        ids, uv_last = self._ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, sparse_map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
-        if len(ids) < self._settings.min_tracked:
+        if len(ids) < MIN_TRACKED:
             return None
         guess = self._camera.project(points)[:, :2]
-        uv, found = follow_pixels(last.small, small, self._camera.width, uv_last, guess)
-        if found.sum() < self._settings.min_tracked:
+        uv, found = follow_pixels(self._small, small, self._camera.width, uv_last, guess)
+        if found.sum() < MIN_TRACKED:
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
@@ -139,8 +128,8 @@ class Follower:
         self, sparse_map: SparseMap, local_ids: NDArray[np.int32], T_camera_world: Array
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._camera, self._settings, sparse_map, local_ids, T_camera_world)
-        budget = self._settings.tracked_points
+        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world)
+        budget = self._tracked_points
         if len(seen.ids) <= budget:
             return seen
         area = self._camera.width * self._camera.height
@@ -151,5 +140,5 @@ class Follower:
     def _believable(self, estimate: PoseEstimate, looked_for: int) -> bool:
         """Whether enough points agree: a wrong pose has followers too, but not most."""
         agreeing = int(estimate.inliers.sum())
-        enough = max(self._settings.min_tracked, MIN_FOUND * looked_for)
+        enough = max(MIN_TRACKED, MIN_FOUND * looked_for)
         return agreeing >= enough and 2 * agreeing >= len(estimate.inliers)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.slam.matching import hamming, one_to_one
+from segfloor_ros.slam.matching import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.visibility import predict_points
 
@@ -30,12 +29,11 @@ Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 def fuse_duplicates(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     sparse_map: SparseMap,
     keyframe: KeyframeRecord,
 ) -> int:
     """Merge points of a new keyframe with those of its neighbours; return how many merged."""
-    a, b = find_duplicates(camera, settings, sparse_map, keyframe)
+    a, b = find_duplicates(camera, sparse_map, keyframe)
     separate = ~sparse_map.seen_together(a, b)
     a, b = a[separate], b[separate]
     older = sparse_map.stable_id[a] < sparse_map.stable_id[b]
@@ -45,7 +43,6 @@ def fuse_duplicates(
 
 def find_duplicates(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     sparse_map: SparseMap,
     keyframe: KeyframeRecord,
 ) -> Pairs:
@@ -57,8 +54,8 @@ def find_duplicates(
     around = sparse_map.points_of(order[:NEIGHBOUR_KEYFRAMES])
     others = around[~np.isin(around, own)]
     pose = keyframe.T_camera_world
-    here = predict_points(camera, settings, sparse_map, own, pose)
-    there = predict_points(camera, settings, sparse_map, others, pose)
+    here = predict_points(camera, sparse_map, own, pose)
+    there = predict_points(camera, sparse_map, others, pose)
     if len(here.ids) == 0 or len(there.ids) == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     neighbours = [k + 1 for k in range(min(CANDIDATES, len(here.ids)))]
@@ -68,7 +65,7 @@ def find_duplicates(
     j, column = np.nonzero(np.isfinite(reach))
     i = np.asarray(near)[j, column]
     distance = hamming(sparse_map.descriptor[here.ids[i]], sparse_map.descriptor[there.ids[j]])
-    alike = (distance <= settings.max_hamming) & (
+    alike = (distance <= MAX_HAMMING) & (
         np.abs(here.octave[i] - there.octave[j]) <= MAX_OCTAVES_APART
     )
     i, j = one_to_one(i[alike], j[alike], distance[alike])

@@ -12,6 +12,12 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 SEEN_BY_SEVERAL = 2
 """Keyframes that must observe a point for it to count as reliable."""
 
+TRACKED_RATIO = 0.25
+"""Condition A3 as published: a keyframe is due when fewer of the reliable points are tracked."""
+
+MIN_TRACKED = 15
+"""Condition B as published: with fewer points the pose is too poor to make points from."""
+
 MUCH_NEW = 2.5
 """Novelty at which condition A2 does not count frames any more."""
 
@@ -41,8 +47,8 @@ def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
     due = view.frames_since >= settings.keyframe_min_frames or view.novelty > MUCH_NEW
     a1 = view.frames_since >= settings.keyframe_max_frames and new_view
     a2 = view.mapper_idle and due and new_view
-    a3 = view.num_tracked < settings.keyframe_tracked_ratio * view.num_reliable
-    b = view.num_tracked > settings.keyframe_min_tracked
+    a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable
+    b = view.num_tracked > MIN_TRACKED
     return b and (a1 or a2 or a3)
 
 

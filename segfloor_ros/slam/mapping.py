@@ -28,6 +28,14 @@ MIN_SHARED_POINTS = 15
 SETTLING_KEYFRAMES = 2
 MIN_FOUND_RATIO = 0.25
 
+LOCAL_KEYFRAMES = 10
+FIXED_KEYFRAMES = 10
+"""Keyframes that move in a local adjustment, and those that hold them: what is solved well within
+the time between two keyframes."""
+
+BUNDLE_STEPS = 5
+"""Steps of a local adjustment; it mostly converges in three."""
+
 
 @dataclass(frozen=True)
 class Adjustment:
@@ -54,10 +62,7 @@ class LocalMapper:
 
     def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
         self._camera = camera
-        self._settings = settings
-        self.offset = DisparityOffset(
-            settings.disparity_offset_sigma_px, 1.0 / settings.local_keyframes
-        )
+        self.offset = DisparityOffset(settings.disparity_offset_sigma_px, 1.0 / LOCAL_KEYFRAMES)
 
     def measure_stereo(
         self, frame: StereoFrame, images: Images, observations: Observations
@@ -87,13 +92,11 @@ class LocalMapper:
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
         for other in self._partners(sparse_map, keyframe):
-            new = triangulate_between(
-                self._camera, self._settings, keyframe, other, self.offset.value_px
-            )
+            new = triangulate_between(self._camera, keyframe, other, self.offset.value_px)
             sparse_map.add_points_between(
                 keyframe, new.rows, other, new.other_rows, new.xyz_world, patches
             )
-        fuse_duplicates(self._camera, self._settings, sparse_map, keyframe)
+        fuse_duplicates(self._camera, sparse_map, keyframe)
 
     def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
         """Return the covisible keyframes with which rays cross best: the farthest away of them, and
@@ -102,7 +105,7 @@ class LocalMapper:
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = sparse_map.covisible(own)
         near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
-        views = [sparse_map.keyframes[k] for k in near[: self._settings.local_keyframes]]
+        views = [sparse_map.keyframes[k] for k in near[:LOCAL_KEYFRAMES]]
         centre = keyframe.T_world_camera[:3, 3]
         views.sort(key=lambda k: float(np.linalg.norm(k.T_world_camera[:3, 3] - centre)))
         return [views[-1], views[len(views) // 2]][: len(views)] if views else []
@@ -147,7 +150,7 @@ class LocalMapper:
 
     def solve(self, adjustment: Adjustment) -> BundleResult:
         """Adjust the copy; safe on another thread, since it shares nothing with the map."""
-        return adjust(self._camera, adjustment.problem, self._settings.bundle_iterations)
+        return adjust(self._camera, adjustment.problem, BUNDLE_STEPS)
 
     def apply(self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
@@ -172,10 +175,10 @@ class LocalMapper:
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = sparse_map.covisible(own)
         near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
-        free = np.append(keyframe.index, near[: self._settings.local_keyframes - 1])
+        free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
         free = free[free != 0]
         around, _ = sparse_map.covisible(sparse_map.points_of(free))
-        fixed = around[~np.isin(around, free)][: self._settings.fixed_keyframes]
+        fixed = around[~np.isin(around, free)][:FIXED_KEYFRAMES]
         if len(fixed) == 0:
             fixed, free = free[-1:], free[:-1]
         return free, fixed

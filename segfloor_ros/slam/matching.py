@@ -12,6 +12,13 @@ from segfloor_ros.slam.features import Features
 _BITS = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
 _BITS16 = (_BITS[:, None] + _BITS[None, :]).ravel()
 
+MAX_HAMMING = 80
+"""Largest distance of a match, of 256 bits: descriptors of different corners are about 128 apart,
+and one in a billion pairs is as near as this by chance."""
+
+MAX_RATIO = 0.85
+"""A match must be so much nearer than the second best (Lowe, Distinctive Image Features, 2004)."""
+
 NEIGHBOURS = 12
 """Features looked at around a predicted pixel; a radius holds about ten."""
 
@@ -33,8 +40,6 @@ def match_predicted(
     predicted_octave: NDArray[np.floating],
     descriptor: NDArray[np.uint8],
     radius_px: NDArray[np.floating],
-    max_hamming: int,
-    ratio: float = 0.85,
 ) -> Matches:
     """Match map points to the features around their predicted pixels.
 
@@ -59,12 +64,12 @@ def match_predicted(
     rival = (distance < 512) & (np.abs(octave - octave[index, best][:, None]) < 0.5)
     rival[index, best] = False
     second = np.where(rival, distance, 512).min(axis=1)
-    accepted = (best_distance <= max_hamming) & (best_distance <= ratio * second)
+    accepted = (best_distance <= MAX_HAMMING) & (best_distance <= MAX_RATIO * second)
     points = np.flatnonzero(accepted)
     return one_to_one(points, near[points, best[points]], best_distance[points])
 
 
-def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8], max_hamming: int) -> Matches:
+def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8]) -> Matches:
     """Match descriptors (N, 32) and (M, 32) by mutual nearest neighbours; returns (query rows,
     train rows).
     """
@@ -72,7 +77,7 @@ def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8], max_hammi
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(query, train)
     pairs = np.array(
-        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_hamming], np.intp
+        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= MAX_HAMMING], np.intp
     ).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
 

@@ -86,7 +86,7 @@ def refine_pose(
     max_noise_factor: float = MAX_NOISE_FACTOR,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
-        between rounds.
+    between rounds.
 
     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
     and a poor calibration make errors larger than the single measurements tell; the median

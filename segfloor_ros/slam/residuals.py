@@ -1,5 +1,6 @@
 """The measurement model of a stereo feature, shared by pose refinement and bundle adjustment.
- A feature measures (u, v, d): its pixel in the left image and its disparity. The disparity is
+
+A feature measures (u, v, d): its pixel in the left image and its disparity. The disparity is
 found by correlating the patch around (u, v) with the right image, so its error is independent
 of the error of (u, v), and smaller; (u, v, u_right) would not have that property.
 """

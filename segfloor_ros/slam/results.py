@@ -24,7 +24,7 @@ class KeyframeFeatures:
 
     uv_px: NDArray[np.float32]
     point_id: NDArray[np.int32]
-    xyz_map: NDArray[np.float32]
+    xyz_map: Array
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class SparseCloud:
     """
 
     point_id: NDArray[np.int32]
-    xyz_map: NDArray[np.float32]
+    xyz_map: Array
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.growing_array import GrowingArray
 from segfloor_ros.slam.patch_alignment import SIDE_PX
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
@@ -54,41 +55,6 @@ class KeyframeRecord:
     def T_world_camera(self) -> Array:
         """The camera's pose (4, 4)."""
         return invert(self.T_camera_world)
-
-
-class GrowingArray:
-    """An array that grows along its first axis; appending is amortised constant time."""
-
-    def __init__(self, row_shape: tuple[int, ...], dtype: type) -> None:
-        self._buffer: NDArray[Any] = np.zeros((1024, *row_shape), dtype)
-        self._length = 0
-
-    @property
-    def rows(self) -> NDArray[Any]:
-        """A view of the rows in use; writing to it writes to the array."""
-        return self._buffer[: self._length]
-
-    def extend(self, rows: NDArray[Any]) -> None:
-        """Append rows (N, ...)."""
-        needed = self._length + len(rows)
-        if needed > len(self._buffer):
-            grown = np.zeros(
-                (max(needed, 2 * len(self._buffer)), *self._buffer.shape[1:]), self._buffer.dtype
-            )
-            grown[: self._length] = self.rows
-            self._buffer = grown
-        self._buffer[self._length : needed] = rows
-        self._length = needed
-
-    def lengthen(self, count: int) -> None:
-        """Append rows of zeros."""
-        self.extend(np.zeros((count, *self._buffer.shape[1:]), self._buffer.dtype))
-
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Drop the rows that are not chosen (N,)."""
-        kept = self.rows[chosen]
-        self._buffer[: len(kept)] = kept
-        self._length = len(kept)
 
 
 class SparseMap:
@@ -170,6 +136,12 @@ class SparseMap:
     def observer_count(self) -> NDArray[np.int32]:
         """Number of keyframes (P,) that observe each point."""
         return self._observer_count.rows
+
+    def living(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return point rows (N,) with `NO_POINT` in place of points that are gone."""
+        known = rows != NO_POINT
+        known[known] = self.alive[rows[known]]
+        return np.where(known, rows, NO_POINT).astype(np.int32)
 
     def add_keyframe(
         self,

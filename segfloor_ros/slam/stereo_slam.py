@@ -2,50 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import (
-    Array,
-    invert,
-    make_transform,
-    rotation_angle,
-    se3_exp,
-    se3_log,
-    transform_points,
-)
+from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.features import FeatureExtractor, Features
-from segfloor_ros.slam.following import Follower, Sighting, Track
+from segfloor_ros.slam.following import Follower
+from segfloor_ros.slam.held_results import HeldResults
 from segfloor_ros.slam.image_check import FrozenCheck, image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
-from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
+from segfloor_ros.slam.local_map import LocalMap
 from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.motion import CameraMotion
 from segfloor_ros.slam.mount_meter import MountMeter
-from segfloor_ros.slam.outcome import MapSnapshot, Outcome, in_map, take_snapshot
 from segfloor_ros.slam.patch_alignment import sample_patches
-from segfloor_ros.slam.places import view_novelty, views_near
-from segfloor_ros.slam.residuals import MIN_DEPTH_M
-from segfloor_ros.slam.results import NO_POINT, FrameResult
+from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.snapshot import take_snapshot
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking import FeatureTrack, Tracker
+from segfloor_ros.slam.track import ObservedFeatures, Track
+from segfloor_ros.slam.tracking import Tracker
 from segfloor_ros.timing import StageTimes
 
-LOCAL_MAP_KEYFRAMES = 20
-PLACE_KEYFRAMES = 10
-"""Keyframes of the local map that belong to it by where they are."""
-
 RECOVERY_KEYFRAMES = 3
+RECOVERY_RATIO = 0.15
+"""Share of the points expected in view that a camera which was lost must find: far points alone
+fit many places."""
+
 UNKNOWN_COVARIANCE = 1e6
-MAX_HELD_KEYFRAMES = 50
-"""Keyframes that wait with their images for the mount to be known."""
 
 
 class StereoSlam:
@@ -70,26 +57,20 @@ class StereoSlam:
         self.mount = mount
         self._mount_meter = mount_meter
         self._camera = camera
-        self._settings = settings
         self._background = background
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
-        self._tracker = Tracker(camera, settings)
-        self._follower = Follower(camera, settings)
+        self._motion = CameraMotion(settings.max_speed_mps)
+        self._local = LocalMap(camera, settings, self.map)
+        self._follower = Follower(camera, settings.tracked_points)
+        self._tracker = Tracker(camera)
         self._mapper = LocalMapper(camera, settings)
         self._adjusting = AdjustmentRunner(self._mapper, background)
-        self._held: list[Outcome] = []
-        self._T_camera_world: Array = np.eye(4)
-        self._velocity: Array = np.zeros(6)
-        self._sighting: Sighting | None = None
-        self._last_stamp_ns = 0
-        self._lost = False
+        self._held = HeldResults()
         self._recovery_turn = 0
-        self._T_world_odom: Array = np.eye(4)
         self._frames_since_keyframe = 0
-        self._local_ids: NDArray[np.int32] = np.zeros(0, np.int32)
 
     @property
     def disparity_offset_px(self) -> float:
@@ -102,17 +83,12 @@ class StereoSlam:
             self._take_adjustment(wait=False)
             fault = self._fault(frame)
             images = Images.of(frame)
-            track = None
-            if not fault and self.map.keyframes:
-                track = self._track(frame, images)
-        snapshot = None
-        if not fault and (not self.map.keyframes or (track and self._wants_keyframe(track))):
+            track = self._track(frame, images) if self.map.keyframes and not fault else None
+        keyframe = None
+        if not fault and self._wants_keyframe(track):
             with self._times.measure('mapping'):
-                snapshot = self._add_keyframe(frame, images, track)
-        outcome = self._outcome(frame, track, fault, snapshot)
-        if outcome.tracked:
-            self._last_stamp_ns = frame.stamp_ns
-        return self._release(outcome)
+                keyframe = self._add_keyframe(frame, images, track)
+        return self._held.release(self._result(frame, track, fault, keyframe), self.mount)
 
     def close(self) -> None:
         """End the background thread, if there is one."""
@@ -128,73 +104,62 @@ class StereoSlam:
 
     def _expected_shift(self, stamp_ns: int) -> float:
         """Return how far the picture should have moved since the last pose, in image widths."""
-        if self._sighting is None or len(self._sighting.ids) == 0:
+        ids = self._follower.seen_ids
+        if len(ids) == 0:
             return 0.0
-        dt_s = (stamp_ns - self._last_stamp_ns) * 1e-9
-        steady = se3_exp(self._velocity * dt_s) @ self._T_camera_world
-        points = self.map.xyz_world[self._sighting.ids]
+        points = self.map.xyz_world[ids]
         now, then = (
             self._camera.project(transform_points(T, points))[:, :2]
-            for T in (steady, self._T_camera_world)
+            for T in (self._motion.predict(stamp_ns), self._motion.T_camera_world)
         )
         return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def _track(self, frame: StereoFrame, images: Images) -> Track | None:
-        dt_s = max((frame.stamp_ns - self._last_stamp_ns) * 1e-9, 1e-3)
-        steady: Array = se3_exp(self._velocity * dt_s) @ self._T_camera_world
-        self._rotation.see(images.left)
-        track: Track | None = None
-        if self._sighting is not None:
-            track = self._follower.follow(
-                self._sighting,
-                images,
-                self.map,
-                self._local_ids,
-                steady,
-                self.disparity_offset_px,
-            )
+        """Find the pose of a frame: from the one before, else by its features."""
+        predictions = self._predict_poses(frame, images)
+        track = self._follower.follow(
+            images, self.map, self._local.point_ids, predictions[0], self.disparity_offset_px
+        )
         if track is None:
-            track = self._search(frame, images, steady)
-        if track is None or not (self._lost or self._plausible(track, dt_s)):
-            self._lost = True
-            self._velocity = np.zeros(6)
-            self._sighting = None
+            track = self._search(frame, images, predictions)
+        motion = self._motion
+        if track is None or not (
+            motion.is_lost or motion.is_plausible(track.T_camera_world, frame.stamp_ns)
+        ):
+            motion.stop()
+            self._follower.reset()
             return None
-        motion = se3_log(track.T_camera_world @ invert(self._T_camera_world))
-        velocity: Array = np.zeros(6) if self._lost else motion / dt_s
-        self._velocity = velocity
-        self._lost = False
-        self._T_camera_world = track.T_camera_world
-        self._sighting = Sighting(images.small, track.point_ids, track.uv_px)
-        self._local_ids = self._choose_local_points(track.point_ids, track.T_camera_world)
+        motion.take(track.T_camera_world, frame.stamp_ns)
+        self._follower.see(images, track.point_ids, track.uv_px)
+        self._local.move_to(track.point_ids, track.T_camera_world)
         self.map.note_tracking(track.visible_ids, track.point_ids)
         self._frames_since_keyframe += 1
         return track
 
-    def _search(
-        self,
-        frame: StereoFrame,
-        images: Images,
-        steady: Array,
-    ) -> FeatureTrack | None:
+    def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
+        """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
+        self._rotation.see(images.left)
+        turned = self._rotation.turn_since_last() @ self._motion.T_camera_world
+        return [self._motion.predict(frame.stamp_ns), turned]
+
+    def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
         """Find the pose by the features of the frame, without its predecessor."""
         features = self._extractor.extract(frame.left)
-        turned = self._rotation.turn_since_last() @ self._T_camera_world
         track = self._tracker.track(
             images,
             features,
             self.map,
-            self._local_ids,
-            [steady, turned],
+            self._local.point_ids,
+            predictions,
             self.disparity_offset_px,
         )
-        if not self._lost:
+        if not self._motion.is_lost:
             return track
-        if track is None or not self._recognised(track):
+        if track is None or not _recognised(track):
             track = self._recover(images, features)
-        return track if track and self._recognised(track) else None
+        return track if track and _recognised(track) else None
 
-    def _recover(self, images: Images, features: Features) -> FeatureTrack | None:
+    def _recover(self, images: Images, features: Features) -> Track | None:
         """Look for the view among the keyframes, a few per frame, the latest ones first."""
         views = [k.index for k in self.map.keyframes if k.retired is None]
         count = len(views)
@@ -207,133 +172,84 @@ class StereoSlam:
         estimate = self._tracker.locate(features, tree, observations, self.map, ids)
         if estimate is None:
             return None
+        pose = estimate.T_camera_world
+        around = self._local.points_around(ids, pose)
         return self._tracker.track_at(
-            images,
-            features,
-            self.map,
-            self._choose_local_points(ids, estimate.T_camera_world),
-            estimate.T_camera_world,
-            self.disparity_offset_px,
+            images, features, self.map, around, pose, self.disparity_offset_px
         )
 
-    def _recognised(self, track: Track) -> bool:
-        """Whether a camera that was lost sees enough of what it should see there: far points alone
-        fit many places.
-        """
-        return len(track.point_ids) >= self._settings.recovery_ratio * len(track.visible_ids)
-
-    def _plausible(self, track: Track, dt_s: float) -> bool:
-        motion = track.T_camera_world @ invert(self._T_camera_world)
-        speed = float(np.linalg.norm(motion[:3, 3])) / dt_s
-        turn = rotation_angle(motion[:3, :3]) / dt_s
-        return speed <= self._settings.max_speed_mps and turn <= self._settings.max_turn_radps
-
-    def _choose_local_points(
-        self, ids: NDArray[np.int32], T_camera_world: Array
-    ) -> NDArray[np.int32]:
-        """Return the points of keyframes that share points with a view, or stand where it is."""
-        order, _ = self.map.covisible(ids)
-        depth_m = self._median_depth(ids, T_camera_world)
-        here = views_near(self.map, T_camera_world, depth_m, PLACE_KEYFRAMES)
-        local = self.map.points_of(np.append(order[:LOCAL_MAP_KEYFRAMES], here))
-        # The oldest first: of two points that fit a feature equally well it is the one to keep.
-        return local[np.argsort(self.map.stable_id[local])]
-
-    def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
-        depth = transform_points(T_camera_world, self.map.xyz_world[ids])[:, 2]
-        return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
-
-    def _wants_keyframe(self, track: Track) -> bool:
-        order, _ = self.map.covisible(track.point_ids)
-        reference = self.map.keyframes[order[0]]
-        known = reference.point_id[reference.point_id != NO_POINT]
-        reliable = known[self.map.observer_count[known] >= SEEN_BY_SEVERAL]
-        depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
-        view = View(
-            self._frames_since_keyframe,
-            len(track.point_ids),
-            min(len(reliable), self._settings.tracked_points),
-            view_novelty(
-                self._camera,
-                self._settings,
-                self.map,
-                track.point_ids,
-                track.T_camera_world,
-                depth_m,
-            ),
-            self._adjusting.idle,
-        )
-        return is_keyframe(view, self._settings)
+    def _wants_keyframe(self, track: Track | None) -> bool:
+        if track is None:
+            return not self.map.keyframes
+        return self._local.wants_keyframe(track, self._frames_since_keyframe, self._adjusting.idle)
 
     def _add_keyframe(
-        self,
-        frame: StereoFrame,
-        images: Images,
-        track: Track | None,
-    ) -> MapSnapshot | None:
+        self, frame: StereoFrame, images: Images, track: Track | None
+    ) -> Keyframe | None:
         """Make the frame a keyframe; None where its features do not show what was tracked."""
-        if isinstance(track, FeatureTrack):
-            matched: FeatureTrack | None = track
-            features = track.features
-        else:
-            features = self._extractor.extract(frame.left)
-            matched = self._match_features(images, features) if track else None
-            if track and matched is None:
-                return None
+        observed = self._observe(frame, images, track)
+        if observed is None:
+            return None
         self._take_adjustment(wait=True)
-        point_id = np.full(len(features), NO_POINT, np.int32)
-        if matched is None:
-            observations = self._tracker.pixel_observations(features)
-        else:
-            observations = matched.observations
-            alive = self.map.alive[matched.point_ids]
-            point_id[matched.feature_rows[alive]] = matched.point_ids[alive]
-        self._mapper.measure_stereo(frame, images, observations)
+        self._mapper.measure_stereo(frame, images, observed.observations)
         keyframe = KeyframeRecord(
             len(self.map.keyframes),
             frame.index,
             frame.stamp_ns,
-            self._T_camera_world,
-            features,
-            observations,
-            point_id,
+            self._motion.T_camera_world,
+            observed.features,
+            observed.observations,
+            self.map.living(observed.point_id),
         )
-        patches = sample_patches(images.left, observations.uvd_px[:, :2]).astype(np.uint8)
+        patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
+        self._adjust(keyframe)
+        self._go_on_from(images, keyframe)
+        self._measure_mount(frame, keyframe)
+        return take_snapshot(self.map, keyframe, frame)
+
+    def _observe(
+        self, frame: StereoFrame, images: Images, track: Track | None
+    ) -> ObservedFeatures | None:
+        """Return the features of a frame and which of them show map points, now that the pose is
+        known; it is refined by all of them. None where too few do.
+        """
+        if track is not None and track.observed is not None:
+            return track.observed
+        features = self._extractor.extract(frame.left)
+        if track is None:
+            self._motion.take(self._motion.T_camera_world, frame.stamp_ns)
+            none = np.full(len(features), NO_POINT, np.int32)
+            return ObservedFeatures(features, self._tracker.pixel_observations(features), none)
+        pose = self._motion.T_camera_world
+        matched = self._tracker.track_at(
+            images, features, self.map, self._local.point_ids, pose, self.disparity_offset_px
+        )
+        if matched is None:
+            return None
+        self._motion.T_camera_world = matched.T_camera_world
+        self.map.note_tracking(matched.visible_ids, matched.point_ids)
+        return matched.observed
+
+    def _adjust(self, keyframe: KeyframeRecord) -> None:
+        """Adjust the neighbourhood of a new keyframe."""
         if keyframe.index > 0:
             self._adjusting.submit(self._mapper.plan_adjustment(self.map, keyframe))
             if not self._background:
                 self._take_adjustment(wait=True)
+
+    def _go_on_from(self, images: Images, keyframe: KeyframeRecord) -> None:
+        """Track on from the points of a keyframe, old and new."""
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        ids = keyframe.point_id[rows]
+        self._follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
+        self._local.move_to(ids, keyframe.T_camera_world)
         self._frames_since_keyframe = 0
-        self._see_keyframe(images, keyframe)
+
+    def _measure_mount(self, frame: StereoFrame, keyframe: KeyframeRecord) -> None:
         if self.mount is None and self._mount_meter is not None:
             self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera)
             self.mount = self._mount_meter.mount
-        return take_snapshot(self.map, keyframe, frame)
-
-    def _match_features(self, images: Images, features: Features) -> FeatureTrack | None:
-        """Find which features show map points, now that the pose is known; it is refined by all
-        of them.
-        """
-        matched = self._tracker.track_at(
-            images,
-            features,
-            self.map,
-            self._local_ids,
-            self._T_camera_world,
-            self.disparity_offset_px,
-        )
-        if matched is not None:
-            self._T_camera_world = matched.T_camera_world
-            self.map.note_tracking(matched.visible_ids, matched.point_ids)
-        return matched
-
-    def _see_keyframe(self, images: Images, keyframe: KeyframeRecord) -> None:
-        """Go on from the points of a keyframe, old and new."""
-        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-        ids = keyframe.point_id[rows]
-        self._sighting = Sighting(images.small, ids, keyframe.observations.uvd_px[rows, :2])
-        self._local_ids = self._choose_local_points(ids, keyframe.T_camera_world)
 
     def _take_adjustment(self, wait: bool) -> None:
         """Bring a finished adjustment into the map. The camera, and with it `odom`, moves along
@@ -343,57 +259,32 @@ class StereoSlam:
         if finished is None:
             return
         reference = self.map.keyframes[-1]
-        T_camera_reference = self._T_camera_world @ reference.T_world_camera
-        T_odom_camera = invert(self._T_world_odom) @ invert(self._T_camera_world)
+        before = reference.T_camera_world
         self._mapper.apply(self.map, *finished)
-        self._T_camera_world = _without_drift(T_camera_reference @ reference.T_camera_world)
-        self._T_world_odom = _without_drift(invert(self._T_camera_world) @ invert(T_odom_camera))
-        self._local_ids = self._local_ids[self.map.alive[self._local_ids]]
-        if self._sighting is not None:
-            self._sighting = self._sighting.take(self.map.alive[self._sighting.ids])
+        self._motion.move_map(before, reference.T_camera_world)
+        self._local.drop_dead()
+        self._follower.drop_dead(self.map)
 
-    def _outcome(
-        self, frame: StereoFrame, track: Track | None, fault: str, snapshot: MapSnapshot | None
-    ) -> Outcome:
-        tracked = track is not None or snapshot is not None
-        covariance: Array = np.eye(6) * UNKNOWN_COVARIANCE
-        if track is not None:
-            covariance = track.covariance
-        elif tracked:
-            covariance = np.zeros((6, 6))
-        state = 'tracking' if tracked else f'lost: {fault or "too few known points in view"}'
-        return Outcome(
+    def _result(
+        self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None
+    ) -> FrameResult:
+        """Return the outcome of a frame in optical axes."""
+        tracked = track is not None or keyframe is not None
+        covariance: Array = np.eye(6) * (0.0 if tracked else UNKNOWN_COVARIANCE)
+        return FrameResult(
             frame.index,
             frame.stamp_ns,
             tracked,
-            invert(self._T_world_odom) @ invert(self._T_camera_world),
-            self._T_world_odom,
-            covariance,
+            self._motion.T_odom_camera,
+            self._motion.T_world_odom,
+            track.covariance if track else covariance,
             len(track.point_ids) if track else 0,
-            state,
+            'tracking' if tracked else f'lost: {fault or "too few known points in view"}',
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
-            snapshot,
+            keyframe,
         )
 
-    def _release(self, outcome: Outcome) -> list[FrameResult]:
-        self._held.append(outcome)
-        if self.mount is None:
-            self._let_go_of_old_snapshots()
-            return []
-        ready, self._held = self._held, []
-        return [in_map(outcome, self.mount.T_base_left) for outcome in ready]
 
-    def _let_go_of_old_snapshots(self) -> None:
-        """Keep the images of the latest keyframes only: a camera that never sees the floor must not
-        fill the memory. The poses of all frames are kept.
-        """
-        holders = [i for i, held in enumerate(self._held) if held.snapshot is not None]
-        for i in holders[:-MAX_HELD_KEYFRAMES]:
-            self._held[i] = replace(self._held[i], snapshot=None)
-
-
-def _without_drift(T: Array) -> Array:
-    """Return a product of poses (4, 4) with its rotation orthonormal again: `invert` transposes,
-    so the rounding errors of repeated products would grow threefold each time.
-    """
-    return make_transform(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+def _recognised(track: Track) -> bool:
+    """Whether a camera that was lost sees enough of what it should see there."""
+    return len(track.point_ids) >= RECOVERY_RATIO * len(track.visible_ids)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +10,15 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.features import Features
-from segfloor_ros.slam.following import Track
+from segfloor_ros.slam.features import PYRAMID_SCALE, Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.matching import Matches, match_predicted, match_unguided
 from segfloor_ros.slam.point_measurement import align_pixels, measure_disparity
 from segfloor_ros.slam.pose import PoseEstimate, refine_pose, solve_pnp
 from segfloor_ros.slam.residuals import Observations
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.track import MIN_TRACKED, ObservedFeatures, Track
 from segfloor_ros.slam.visibility import Prediction, predict_points
 
 SIGMA_PIXEL = 0.6
@@ -33,6 +32,9 @@ MIN_AGREEMENT = 0.5
 MAX_CORNER_NOISE_FACTOR = 2.0
 """Corners are not worse than this times `SIGMA_PIXEL`; beyond it the matches are wrong."""
 
+MATCH_RADIUS_PX = 15.0
+"""Search radius around a predicted pixel, at the finest pyramid level."""
+
 WIDE_SEARCH = 3.0
 """Factor on the search radius when the first search finds too little."""
 
@@ -43,32 +45,18 @@ NARROW_SEARCH = 0.4
 """Factor on the search radius once a pose is known from this very frame."""
 
 
-@dataclass(frozen=True)
-class FeatureTrack(Track):
-    """A frame with a pose, found by its features.
-
-    features: all (F) of the frame. feature_rows: (N,) those of the points found. observations: of
-    all features, (F, 3) px, with a disparity where one was measured.
-    """
-
-    features: Features
-    feature_rows: NDArray[np.intp]
-    observations: Observations
-
-
 class Tracker:
     """Finds the pose of frames against the local map."""
 
-    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
+    def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
-        self._settings = settings
 
     def pixel_observations(self, features: Features) -> Observations:
         """Return the observations of features (N) before any disparity is known."""
         uvd = np.full((len(features), 3), np.nan)
         uvd[:, :2] = features.uv_px
         sigma = np.full((len(features), 3), 1.0)
-        scale = self._settings.pyramid_scale ** features.octave.astype(np.float64)
+        scale = PYRAMID_SCALE ** features.octave.astype(np.float64)
         sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
         return Observations(uvd, sigma)
 
@@ -80,7 +68,7 @@ class Tracker:
         local_ids: NDArray[np.int32],
         predictions: Sequence[Array],
         offset_px: float = 0.0,
-    ) -> FeatureTrack | None:
+    ) -> Track | None:
         """Find the pose of a frame near one of the predicted ones, tried in order.
 
         offset_px: the known error of all disparities, measured minus true; the returned
@@ -107,7 +95,7 @@ class Tracker:
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
         offset_px: float = 0.0,
-    ) -> FeatureTrack | None:
+    ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
         `track` for the rest.
         """
@@ -117,7 +105,7 @@ class Tracker:
         seen = self._predict(sparse_map, local_ids, T_camera_world)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
-        if len(rows) < self._settings.min_tracked:
+        if len(rows) < MIN_TRACKED:
             return None
         ids = seen.ids[points]
         align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
@@ -132,15 +120,17 @@ class Tracker:
         if not self._agree(estimate):
             return None
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
-        return FeatureTrack(
+        point_id = np.full(len(features), NO_POINT, np.int32)
+        point_id[rows] = ids
+        return Track(
             estimate.T_camera_world,
             estimate.covariance,
             ids,
             observations.uvd_px[rows, :2],
             seen.ids,
-            features,
-            rows,
-            observations.with_noise_factor(estimate.noise_factor),
+            ObservedFeatures(
+                features, observations.with_noise_factor(estimate.noise_factor), point_id
+            ),
         )
 
     def _coarse_pose(
@@ -175,9 +165,7 @@ class Tracker:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
-        points, rows = match_unguided(
-            sparse_map.descriptor[ids], features.descriptor, self._settings.max_hamming
-        )
+        points, rows = match_unguided(sparse_map.descriptor[ids], features.descriptor)
         found = solve_pnp(self._camera, sparse_map.xyz_world[ids[points]], features.uv_px[rows])
         if found is None or found[1].sum() < MIN_PNP_INLIERS:
             return None
@@ -194,7 +182,7 @@ class Tracker:
         T_start: Array,
     ) -> PoseEstimate | None:
         """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
-        if len(rows) < self._settings.min_tracked:
+        if len(rows) < MIN_TRACKED:
             return None
         estimate = refine_pose(
             self._camera,
@@ -207,12 +195,12 @@ class Tracker:
 
     def _agree(self, estimate: PoseEstimate) -> bool:
         agreeing = int(estimate.inliers.sum())
-        return agreeing >= max(self._settings.min_tracked, MIN_AGREEMENT * len(estimate.inliers))
+        return agreeing >= max(MIN_TRACKED, MIN_AGREEMENT * len(estimate.inliers))
 
     def _predict(
         self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
     ) -> Prediction:
-        return predict_points(self._camera, self._settings, sparse_map, ids, T_camera_world)
+        return predict_points(self._camera, sparse_map, ids, T_camera_world)
 
     def _search(
         self,
@@ -222,13 +210,12 @@ class Tracker:
         seen: Prediction,
         radius_factor: float,
     ) -> Matches:
-        scale = self._settings.pyramid_scale ** np.clip(seen.octave, 0, None)
+        scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
         return match_predicted(
             features,
             tree,
             seen.uvd_px[:, :2],
             seen.octave,
             sparse_map.descriptor[seen.ids],
-            radius_factor * self._settings.match_radius_px * scale,
-            self._settings.max_hamming,
+            radius_factor * MATCH_RADIUS_PX * scale,
         )

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
-from segfloor_ros.slam.matching import hamming, one_to_one
+from segfloor_ros.slam.features import PYRAMID_SCALE
+from segfloor_ros.slam.matching import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord
 
 MIN_PARALLAX_RAD = 0.02
@@ -40,7 +40,6 @@ class NewPoints:
 
 def triangulate_between(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     keyframe: KeyframeRecord,
     other: KeyframeRecord,
     offset_px: float,
@@ -51,7 +50,7 @@ def triangulate_between(
     offset_px: the known error of all disparities, measured minus true.
     """
     rows, other_rows = (np.flatnonzero(k.point_id == NO_POINT) for k in (keyframe, other))
-    i, j = _match_along_epipolar_lines(camera, settings, keyframe, other, rows, other_rows)
+    i, j = _match_along_epipolar_lines(camera, keyframe, other, rows, other_rows)
     points, parallax = _midpoints(camera, keyframe, other, i, j)
     sound = (parallax > MIN_PARALLAX_RAD) & (parallax < MAX_PARALLAX_RAD)
     size = np.ones(len(i))
@@ -59,8 +58,8 @@ def triangulate_between(
         sound &= _projects_to(camera, k, feature, points, offset_px)
         distance = np.linalg.norm(points - k.T_world_camera[:3, 3], axis=1)
         octave = k.features.octave[feature].astype(np.float64)
-        size *= (np.maximum(distance, MIN_DEPTH_M) / settings.pyramid_scale**-octave) ** sign
-    sound &= np.abs(np.log(size)) < np.log(MAX_RANGE_RATIO * settings.pyramid_scale)
+        size *= (np.maximum(distance, MIN_DEPTH_M) / PYRAMID_SCALE**-octave) ** sign
+    sound &= np.abs(np.log(size)) < np.log(MAX_RANGE_RATIO * PYRAMID_SCALE)
     return NewPoints(i[sound], j[sound], points[sound])
 
 
@@ -77,7 +76,6 @@ def fundamental_matrix(camera: StereoCamera, a: KeyframeRecord, b: KeyframeRecor
 
 def _match_along_epipolar_lines(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     keyframe: KeyframeRecord,
     other: KeyframeRecord,
     rows: NDArray[np.intp],
@@ -98,7 +96,7 @@ def _match_along_epipolar_lines(
     i, j = np.nonzero(near)
     bits = hamming(keyframe.features.descriptor[rows[i]], other.features.descriptor[other_rows[j]])
     # A line crosses much of the image: only what looks very much alike, to be sure.
-    alike = bits <= settings.max_hamming // 2
+    alike = bits <= MAX_HAMMING // 2
     i, j = one_to_one(i[alike], j[alike], bits[alike])
     return rows[i], other_rows[j]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.features import PYRAMID_LEVELS, PYRAMID_SCALE
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
 
 MIN_VIEW_COSINE = 0.5
@@ -34,7 +34,6 @@ class Prediction:
 
 def predict_points(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     sparse_map: SparseMap,
     ids: NDArray[np.int32],
     T_camera_world: Array,
@@ -50,7 +49,7 @@ def predict_points(
     direction = points @ T_camera_world[:3, :3] / distance[:, None]
     cosine = (direction * sparse_map.viewing_direction[ids]).sum(axis=1)
     zoom = np.log(sparse_map.viewing_distance_m[ids] / distance)
-    octave = sparse_map.viewing_octave[ids] + zoom / np.log(settings.pyramid_scale)
+    octave = sparse_map.viewing_octave[ids] + zoom / np.log(PYRAMID_SCALE)
     visible = (
         (uvr[:, 0] >= 0)
         & (uvr[:, 0] < camera.width)
@@ -58,7 +57,7 @@ def predict_points(
         & (uvr[:, 1] < camera.height)
         & (cosine > MIN_VIEW_COSINE)
         & (octave > -1.5)
-        & (octave < settings.pyramid_levels + 0.5)
+        & (octave < PYRAMID_LEVELS + 0.5)
     )
     uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
     return Prediction(ids[visible], uvd[visible], octave[visible])

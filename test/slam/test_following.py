@@ -7,7 +7,6 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.following import Follower, Sighting
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.optical_flow import follow_pixels, shrink
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -42,9 +41,8 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all():
     truth = planar_pose(0.03, 0, 0.02) @ MOUNT.T_base_left
 
     def follow(frame):
-        follower = Follower(CAMERA, SETTINGS)
-        last, ids = slam._sighting, slam._local_ids
-        return follower.follow(last, Images.of(frame), slam.map, ids, np.eye(4), 0.0)
+        ids = slam._local.point_ids
+        return slam._follower.follow(Images.of(frame), slam.map, ids, np.eye(4), 0.0)
 
     track = follow(frame)
     error = MOUNT.T_base_left @ invert(track.T_camera_world) @ invert(truth)
@@ -54,11 +52,16 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all():
     assert follow(other) is None
 
 
-def test_a_sighting_forgets_points_that_are_gone():
-    sighting = Sighting(np.zeros((2, 2), np.uint8), np.array([4, 7, 9]), np.eye(3)[:, :2])
-    kept = sighting.take(np.array([True, False, True]))
-    np.testing.assert_array_equal(kept.ids, [4, 9])
-    np.testing.assert_array_equal(kept.uv_px, [[1, 0], [0, 0]])
+def test_points_that_are_gone_are_not_followed():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam.process(ROOM.frame(0, planar_pose(0, 0, 0)))
+    follower, ids = slam._follower, slam._follower.seen_ids
+    slam.map.remove_points(ids[::2])
+    follower.drop_dead(slam.map)
+    np.testing.assert_array_equal(follower.seen_ids, ids[1::2])
+    images = Images.of(ROOM.frame(1, planar_pose(0.03, 0, 0.02)))
+    track = follower.follow(images, slam.map, ids[1::2], np.eye(4), 0.0)
+    assert not np.isin(track.point_ids, ids[::2]).any()
 
 
 def test_only_keyframes_need_features(monkeypatch):

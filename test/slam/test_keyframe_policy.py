@@ -11,8 +11,6 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 SETTINGS = StereoSlamSettings(
     keyframe_max_frames=30,
     keyframe_min_frames=3,
-    keyframe_tracked_ratio=0.25,
-    keyframe_min_tracked=15,
     keyframe_motion_ratio=0.05,
     keyframe_turn_rad=0.1,
 )

@@ -51,7 +51,7 @@ def test_predicted_matches_need_nearness_and_a_clear_winner():
     tree = cKDTree(seen.uv_px)
     near = np.array([[52.0, 51.0], [150.0, 150.0]])
     wanted = seen.descriptor[[0, 2]]
-    points, rows = match_predicted(seen, tree, near, np.zeros(2), wanted, np.full(2, 15.0), 80)
+    points, rows = match_predicted(seen, tree, near, np.zeros(2), wanted, np.full(2, 15.0))
     np.testing.assert_array_equal(points, [0])
     np.testing.assert_array_equal(rows, [0])
     # Two features alike but for a few bits, both at a small distance: no telling which it is.
@@ -60,7 +60,7 @@ def test_predicted_matches_need_nearness_and_a_clear_winner():
     twin[0, 0] ^= 0xFF
     twin[1, 1] ^= 0xFF
     twins = Features(seen.uv_px, seen.octave, twin)
-    points, _ = match_predicted(twins, tree, near, np.zeros(2), wanted, np.full(2, 15.0), 80)
+    points, _ = match_predicted(twins, tree, near, np.zeros(2), wanted, np.full(2, 15.0))
     assert len(points) == 0
 
 
@@ -68,22 +68,18 @@ def test_predicted_matches_respect_the_pyramid_level():
     seen = features([[50, 50]], octave=[4])
     tree = cKDTree(seen.uv_px)
     at, radius = np.array([[50.0, 50.0]]), np.array([15.0])
-    assert (
-        len(match_predicted(seen, tree, at, np.array([4.0]), seen.descriptor, radius, 80)[0]) == 1
-    )
-    assert (
-        len(match_predicted(seen, tree, at, np.array([1.0]), seen.descriptor, radius, 80)[0]) == 0
-    )
+    assert len(match_predicted(seen, tree, at, np.array([4.0]), seen.descriptor, radius)[0]) == 1
+    assert len(match_predicted(seen, tree, at, np.array([1.0]), seen.descriptor, radius)[0]) == 0
 
 
 def test_unguided_matches_are_mutual_and_bounded():
     base = descriptors(20)
     shuffled = np.random.default_rng(1).permutation(20)
-    query, train = match_unguided(base, base[shuffled], 40)
+    query, train = match_unguided(base, base[shuffled])
     np.testing.assert_array_equal(shuffled[train], query)
     assert len(query) == 20
-    assert len(match_unguided(base, descriptors(20, seed=9), 40)[0]) == 0
-    assert len(match_unguided(base, np.zeros((0, 32), np.uint8), 40)[0]) == 0
+    assert len(match_unguided(base, descriptors(20, seed=9))[0]) == 0
+    assert len(match_unguided(base, np.zeros((0, 32), np.uint8))[0]) == 0
 
 
 def test_extractor_places_features_of_every_level_exactly():

@@ -178,8 +178,9 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
     assert np.linalg.norm((invert(far) @ pose_of(result))[:3, 3]) < 0.02
 
 
-def test_who_was_lost_must_find_what_should_be_there(frames):
-    slam = StereoSlam(CAMERA, SETTINGS.replaced(recovery_ratio=1.0), MOUNT)
+def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
+    monkeypatch.setattr('segfloor_ros.slam.stereo_slam.RECOVERY_RATIO', 1.0)
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     black = np.zeros_like(frames[0].left)
     tracked = []
     for frame in frames[:8]:
@@ -235,7 +236,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.stereo_slam.MAX_HELD_KEYFRAMES', 3)
+    monkeypatch.setattr('segfloor_ros.slam.held_results.MAX_HELD_KEYFRAMES', 3)
     slam = StereoSlam(CAMERA, SETTINGS)
     for frame in frames[:-1]:
         assert slam.process(frame) == []

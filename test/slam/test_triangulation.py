@@ -9,12 +9,10 @@ from segfloor_ros.geometry import invert, make_transform, transform_points
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.triangulation import fundamental_matrix, triangulate_between
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
-SETTINGS = StereoSlamSettings()
 POINTS = np.random.default_rng(1).uniform([-3, -2, 6], [3, 2, 14], (60, 3))
 LOOK = np.random.default_rng(2).integers(0, 256, (60, 32), dtype=np.uint8)
 OCTAVE = np.ones(60, np.uint8)
@@ -50,7 +48,7 @@ def test_the_fundamental_matrix_joins_pixels_of_the_same_point(pair):
 
 
 def test_rays_with_parallax_cross_at_the_point(pair):
-    new = triangulate_between(CAMERA, SETTINGS, *pair, 0.0)
+    new = triangulate_between(CAMERA, *pair, 0.0)
     assert len(new.rows) > 50
     np.testing.assert_array_equal(new.rows, new.other_rows)
     np.testing.assert_allclose(new.xyz_world, POINTS[new.rows], atol=1e-6)
@@ -60,24 +58,22 @@ def test_no_point_without_parallax():
     turned = view(1, moved(0.0, 0.0, 0.1))
     barely = view(1, moved(0.03, 0.0, 0.0))
     for keyframe in (turned, barely):
-        assert (
-            len(triangulate_between(CAMERA, SETTINGS, keyframe, view(0, np.eye(4)), 0.0).rows) == 0
-        )
+        assert len(triangulate_between(CAMERA, keyframe, view(0, np.eye(4)), 0.0).rows) == 0
 
 
 def test_a_disparity_that_contradicts_and_a_size_that_does_not_fit_are_refused():
     other = view(0, np.eye(4))
     # True disparities lie between 2.1 and 5 px.
     wrong = view(1, moved(), disparity=20.0)
-    assert len(triangulate_between(CAMERA, SETTINGS, wrong, other, 0.0).rows) == 0
-    assert len(triangulate_between(CAMERA, SETTINGS, view(1, moved()), other, 0.0).rows) > 50
+    assert len(triangulate_between(CAMERA, wrong, other, 0.0).rows) == 0
+    assert len(triangulate_between(CAMERA, view(1, moved()), other, 0.0).rows) > 50
     smaller = view(1, moved(), octave=OCTAVE + 5)
-    assert len(triangulate_between(CAMERA, SETTINGS, smaller, other, 0.0).rows) == 0
+    assert len(triangulate_between(CAMERA, smaller, other, 0.0).rows) == 0
 
 
 def test_features_of_known_points_are_left_alone(pair):
     pair[0].point_id[:30] = 7
-    new = triangulate_between(CAMERA, SETTINGS, *pair, 0.0)
+    new = triangulate_between(CAMERA, *pair, 0.0)
     assert (new.rows >= 30).all()
 
 

@@ -1,0 +1,86 @@
+"""Results wait here for the mount of the camera.
+
+Tracking and mapping work in optical axes from the first camera pose. Frame `map` lies on the
+floor, so it is known only when the mount is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.geometry import Array, invert, skew, transform_points
+from segfloor_ros.slam.results import FrameResult, Keyframe
+
+MAX_HELD_KEYFRAMES = 50
+"""Keyframes that wait with their images for the mount to be known."""
+
+
+class HeldResults:
+    """Holds results in optical axes back until the mount is known, then turns all of them."""
+
+    def __init__(self) -> None:
+        self._held: list[FrameResult] = []
+
+    def release(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
+        """Take in the next result; returns those that are ready, in ROS frames, oldest first."""
+        self._held.append(result)
+        if mount is None:
+            self._drop_old_keyframes()
+            return []
+        ready, self._held = self._held, []
+        return [in_map(held, mount.T_base_left) for held in ready]
+
+    def _drop_old_keyframes(self) -> None:
+        """Keep the images of the latest keyframes only: a camera that never sees the floor must not
+        fill the memory. The poses of all frames are kept.
+        """
+        holders = [i for i, held in enumerate(self._held) if held.keyframe is not None]
+        for i in holders[:-MAX_HELD_KEYFRAMES]:
+            self._held[i] = replace(self._held[i], keyframe=None)
+
+
+def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
+    """Turn a result in optical axes into ROS frames; `map` is the base at the first pose, so
+    T_map_world = T_base_left.
+    """
+    T_left_base = invert(T_map_world)
+    return replace(
+        result,
+        T_odom_base=T_map_world @ result.T_odom_base @ T_left_base,
+        T_map_odom=T_map_world @ result.T_map_odom @ T_left_base,
+        covariance=_covariance_of_base(result, T_map_world),
+        keyframe=_keyframe_in_map(result.keyframe, T_map_world) if result.keyframe else None,
+    )
+
+
+def _covariance_of_base(result: FrameResult, T_base_left: Array) -> Array:
+    """Carry the covariance of the camera twist to the base, in odom axes (Barfoot 2017, eq.
+    7.49: adjoint).
+    """
+    R, t = T_base_left[:3, :3], T_base_left[:3, 3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[:3, 3:] = skew(t) @ R
+    T_odom_base = T_base_left @ result.T_odom_base @ invert(T_base_left)
+    axes = np.zeros((6, 6))
+    axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
+    A = axes @ adjoint
+    return A @ result.covariance @ A.T
+
+
+def _keyframe_in_map(keyframe: Keyframe, T_map_world: Array) -> Keyframe:
+    T_left_base = invert(T_map_world)
+    features, path, cloud = keyframe.features, keyframe.path, keyframe.cloud
+    features_xyz, cloud_xyz = (
+        transform_points(T_map_world, part.xyz_map).astype(np.float32) for part in (features, cloud)
+    )
+    return replace(
+        keyframe,
+        T_map_base=T_map_world @ keyframe.T_map_base @ T_left_base,
+        features=replace(features, xyz_map=features_xyz),
+        path=replace(path, T_map_base=T_map_world @ path.T_map_base @ T_left_base),
+        cloud=replace(cloud, xyz_map=cloud_xyz),
+    )

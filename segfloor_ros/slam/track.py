@@ -1,0 +1,43 @@
+"""What tracking hands to mapping: a frame with a pose, and what was seen in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.residuals import Observations
+
+MIN_TRACKED = 20
+"""Fewest points that must agree for a pose to be believed; chance gives five or six."""
+
+
+@dataclass(frozen=True)
+class ObservedFeatures:
+    """The features (F) of a frame as measured. observations: (F, 3) px, with a disparity where one
+    was measured. point_id: (F,) int32, the row of each feature's map point or `NO_POINT`.
+    """
+
+    features: Features
+    observations: Observations
+    point_id: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A frame with a pose.
+
+    T_camera_world: (4, 4). covariance: (6, 6) of its twist. point_ids, uv_px: (N,), (N, 2) the map
+    points that were found and agree. visible_ids: those that were looked for. observed: set when
+    the pose was found by features.
+    """
+
+    T_camera_world: Array
+    covariance: Array
+    point_ids: NDArray[np.int32]
+    uv_px: Array
+    visible_ids: NDArray[np.int32]
+    observed: ObservedFeatures | None = None
