@@ -51,6 +51,17 @@ def read_kitti_calibration(
     return StereoCalibration(*eyes)
 
 
+def read_body_pose(path: Path) -> Array:
+    """Return T_BS (4, 4) of an EuRoC sensor.yaml: from the sensor's frame to the body's.
+
+    Raises CalibrationError.
+    """
+    document = _read_yaml(path)
+    if 'T_BS' not in document:
+        raise CalibrationError(f'{path}: T_BS is missing; an EuRoC sensor.yaml has it')
+    return _matrix(document['T_BS'], 16, f'{path}, T_BS').reshape(4, 4)
+
+
 def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:
     """Write one eye as a ROS camera calibration file; numbers are exact."""
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from segfloor_ros.errors import SettingsError
 from segfloor_ros.settings import StageSettings, setting
+
+SENSORS = ('wheel_odometry', 'imu')
+"""Sensors of a recording that can be left out."""
 
 
 @dataclass(frozen=True)
@@ -41,3 +45,21 @@ class StereoCameraSettings(StageSettings):
     )
     left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
     right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')
+    wheel_odometry_topic: str = setting(
+        '', 'Wheel odometry topic in a bag; empty: found by its type.'
+    )
+    imu_topic: str = setting('', 'IMU topic in a bag; empty: found by its type.')
+    ignore: str = setting(
+        '', 'Sensors of the recording to leave out, with commas: wheel_odometry, imu.'
+    )
+
+    @property
+    def ignored_sensors(self) -> frozenset[str]:
+        """The names in `ignore`. Raises SettingsError for one that is no sensor."""
+        names = frozenset(self.ignore.replace(',', ' ').split())
+        unknown = sorted(names - set(SENSORS))
+        if unknown:
+            raise SettingsError(
+                f'stereo_camera.ignore: {unknown[0]} is no sensor; known are {", ".join(SENSORS)}'
+            )
+        return names

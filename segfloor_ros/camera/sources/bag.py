@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,14 @@ from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed, decode_raw
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
+from segfloor_ros.camera.sources.bag_sensors import bag_sensors, stamp_ns
 from segfloor_ros.camera.sources.bag_topics import StereoTopics, find_topics
 from segfloor_ros.camera.sources.found_calibration import given_calibration
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
 from segfloor_ros.camera.sources.stamps import rate_of
 from segfloor_ros.errors import CalibrationError, InputError
+from segfloor_ros.measurements import RecordedSensor
 
 STAMPS_FOR_RATE = 20
 
@@ -35,10 +37,11 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> BagSource:
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
         calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
         first = islice(bag.messages([topics.left]), STAMPS_FOR_RATE)
-        rate_hz = rate_of(sorted(_stamp_ns(message) for _, message in first))
-    if topics.is_rectified:
-        calibration = calibration.rectified()
-    return BagSource(path, topics, calibration, count, rate_hz, settings)
+        rate_hz = rate_of(sorted(stamp_ns(message) for _, message in first))
+        if topics.is_rectified:
+            calibration = calibration.rectified()
+        sensors = bag_sensors(path, bag, topics.left, calibration.left.R, settings)
+    return BagSource(path, topics, calibration, count, rate_hz, settings, sensors)
 
 
 class BagSource(StereoSource):
@@ -52,6 +55,7 @@ class BagSource(StereoSource):
         count: int,
         rate_hz: float,
         settings: StereoCameraSettings,
+        sensors: Sequence[RecordedSensor] = (),
     ) -> None:
         self._path = path
         self._topics = topics
@@ -62,6 +66,7 @@ class BagSource(StereoSource):
             frame_count=count,
             rate_hz=rate_hz,
             bit_depth=settings.bit_depth,
+            sensors=sensors,
         )
 
     def _entries(self) -> Iterator[PairEntry]:
@@ -80,7 +85,7 @@ class BagSource(StereoSource):
     ) -> Iterator[tuple[Stamped[Any], Stamped[Any]]]:
         sides = {self._topics.left: 0, self._topics.right: 1}
         for topic, message in bag.messages(list(sides)):
-            yield from pairing.add(sides[topic], _stamp_ns(message), message)
+            yield from pairing.add(sides[topic], stamp_ns(message), message)
         yield from pairing.finish()
 
 
@@ -106,11 +111,6 @@ def _decode(topic: str, message: Any) -> Grey:
         raise CorruptImageError(f'{topic}: {error}') from None
     except InputError as error:
         raise InputError(f'{topic}: {error}') from None
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _read_calibration(path: Path, bag: BagFile, topics: StereoTopics) -> StereoCalibration:

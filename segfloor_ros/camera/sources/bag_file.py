@@ -11,6 +11,7 @@ from segfloor_ros.errors import InputError
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
+TF_DEFINITION = 'geometry_msgs/TransformStamped[] transforms'
 MISSING_LIBRARY = (
     'bags are read and written by the package rosbags; install it with pip install '
     "'segfloor_ros[cli]'"
@@ -58,7 +59,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a rosbag2 folder, an mcap or sqlite3 file, or a ROS 1 bag. Raises InputError."""
     try:
         from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise InputError(f'{path}: {MISSING_LIBRARY}') from None
     path = _bag_path(path)
@@ -66,6 +67,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         if path.suffix == '.bag':
             reader: Any = rosbag1.Reader(path)
             typestore = get_typestore(Stores.ROS1_NOETIC)
+            typestore.register(get_types_from_msg(TF_DEFINITION, 'tf2_msgs/msg/TFMessage'))
         else:
             reader, typestore = rosbag2.Reader(path), get_typestore(Stores.ROS2_JAZZY)
         reader.open()

@@ -5,15 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.calibration_files import read_calibration
+from segfloor_ros.camera.calibration_files import read_body_pose, read_calibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.files import FilePair, FilePairSource, images_in
 from segfloor_ros.camera.sources.found_calibration import given_calibration
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
+from segfloor_ros.camera.sources.sensor_files import IMU, folder_sensors
 from segfloor_ros.camera.sources.stamps import check_forward
 from segfloor_ros.errors import InputError
+from segfloor_ros.measurements import RecordedSensor
 
 CAMERAS = ('cam0', 'cam1')
+IMU_FOLDER = 'imu0'
 INDEX = 'data.csv'
 SENSOR = 'sensor.yaml'
 
@@ -42,7 +45,9 @@ def open_euroc(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
     pairs = [
         FilePair(i, one.stamp_ns, one.item, other.item) for i, (one, other) in enumerate(matches)
     ]
-    return FilePairSource(str(folder), pairs, _calibration(root, settings), settings.bit_depth)
+    calibration = _calibration(root, settings)
+    sensors = _sensors(root, calibration, settings)
+    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
 def _root(folder: Path) -> Path:
@@ -53,6 +58,18 @@ def _calibration(root: Path, settings: StereoCameraSettings) -> StereoCalibratio
     given = given_calibration(settings)
     left, right = (root / camera / SENSOR for camera in CAMERAS)
     return given if given is not None else read_calibration(left, right)
+
+
+def _sensors(
+    root: Path, calibration: StereoCalibration, settings: StereoCameraSettings
+) -> list[RecordedSensor]:
+    """The IMU of imu0 is turned into the rectified left optical frame by both `T_BS`."""
+    imu, ignored = root / IMU_FOLDER / INDEX, settings.ignored_sensors
+    if not imu.exists() or IMU in ignored:
+        return folder_sensors(root, ignored, None, imu)
+    T_body_left, T_body_imu = (read_body_pose(root / n / SENSOR) for n in (CAMERAS[0], IMU_FOLDER))
+    R_left_imu = calibration.left.R @ T_body_left[:3, :3].T @ T_body_imu[:3, :3]
+    return folder_sensors(root, ignored, R_left_imu, imu)
 
 
 def _read_index(camera: Path) -> list[Stamped[Path]]:

@@ -9,9 +9,11 @@ from pathlib import Path
 
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed
+from segfloor_ros.camera.sources.sensor_files import check_shared_clock
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
 from segfloor_ros.camera.sources.stamps import rate_of
 from segfloor_ros.errors import InputError
+from segfloor_ros.measurements import RecordedSensor
 
 IMAGE_SUFFIXES = {'.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff', '.webp'}
 
@@ -30,7 +32,12 @@ class FilePairSource(StereoSource):
     """A recording of image files."""
 
     def __init__(
-        self, name: str, pairs: Sequence[FilePair], calibration: StereoCalibration, bit_depth: int
+        self,
+        name: str,
+        pairs: Sequence[FilePair],
+        calibration: StereoCalibration,
+        bit_depth: int,
+        sensors: Sequence[RecordedSensor] = (),
     ) -> None:
         self._pairs = pairs
         stamps = [pair.stamp_ns for pair in pairs]
@@ -40,7 +47,9 @@ class FilePairSource(StereoSource):
             frame_count=len(pairs),
             rate_hz=rate_of(stamps),
             bit_depth=bit_depth,
+            sensors=sensors,
         )
+        check_shared_clock(sensors, stamps)
 
     def _entries(self) -> Iterator[PairEntry]:
         last_ns = None

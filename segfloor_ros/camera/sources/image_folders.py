@@ -14,6 +14,7 @@ from segfloor_ros.camera.sources.files import (
     images_in,
 )
 from segfloor_ros.camera.sources.found_calibration import find_calibration
+from segfloor_ros.camera.sources.sensor_files import folder_sensors
 from segfloor_ros.camera.sources.sides import is_side, side_pairs
 from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
 from segfloor_ros.errors import InputError
@@ -35,7 +36,8 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> FilePair
     pairs = [FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))]
     places = (folder, left[0].parent, left[0].parent.parent)
     calibration = find_calibration(str(folder), places, settings)
-    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth)
+    sensors = folder_sensors(folder, settings.ignored_sensors)
+    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
 def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:

@@ -18,6 +18,7 @@ from segfloor_ros.camera.sources.files import (
     images_in,
 )
 from segfloor_ros.camera.sources.found_calibration import given_calibration
+from segfloor_ros.camera.sources.sensor_files import folder_sensors
 from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
 from segfloor_ros.errors import InputError
 
@@ -38,7 +39,8 @@ def open_kitti(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
     indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
     pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
     calibration = _calibration(folder, settings, left, cameras)
-    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth)
+    sensors = folder_sensors(folder, settings.ignored_sensors)
+    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
 def _cameras(folder: Path) -> tuple[int, int]:

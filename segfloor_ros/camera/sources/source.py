@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.rectification import StereoRectifier
 from segfloor_ros.camera.sources.prefetch import prefetched
 from segfloor_ros.errors import InputError
+from segfloor_ros.measurements import RecordedSensor
 
 DEFAULT_RATE_HZ = 10.0
 """Frame rate of a recording that has no stamps."""
@@ -52,7 +53,7 @@ class StereoSource(ABC):
     name: of the recording, for messages. calibration: of the raw pairs. camera: the rectified
     one. frame_count: pairs expected, None when unknown. rate_hz: frames per second.
     skipped_frames: pairs left out so far because an image was damaged or the stamp was there
-    before.
+    before. sensors: what else was found in the recording.
     """
 
     def __init__(
@@ -63,8 +64,10 @@ class StereoSource(ABC):
         frame_count: int | None,
         rate_hz: float,
         bit_depth: int = 0,
+        sensors: Sequence[RecordedSensor] = (),
     ) -> None:
         self.name = name
+        self.sensors = sensors
         self.calibration = calibration
         self.frame_count = frame_count
         self.rate_hz = rate_hz

@@ -1,0 +1,134 @@
+"""Wheel odometry and IMU files beside the images of a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import ImuSample, Measurement, RecordedSensor, WheelPose
+
+WHEEL_ODOMETRY, IMU = 'wheel_odometry', 'imu'
+WHEEL_FILE, IMU_FILE = 'wheel_odometry.txt', 'imu.csv'
+TUM_COLUMNS = 't x y z qx qy qz qw'
+IMU_COLUMNS = 'stamp in ns, angular velocity x y z in rad/s, acceleration x y z in m/s²'
+ACCEL_RANGE_M_S2 = (7.0, 13.0)
+"""Median acceleration felt on earth; outside of it the unit or the columns are wrong."""
+
+
+def folder_sensors(
+    folder: Path, ignored: Collection[str], R_left_imu: Array | None = None, imu: Path | None = None
+) -> list[RecordedSensor]:
+    """Return the sensors whose files lie in a folder. R_left_imu: (3, 3) turns what the file `imu`
+    holds into the rectified left optical frame. Raises InputError when a file that is used is bad.
+    """
+    files: list[tuple[str, Path, Callable[[Path], Sequence[Measurement]]]] = [
+        (WHEEL_ODOMETRY, folder / WHEEL_FILE, read_wheel_odometry),
+        (IMU, imu or folder / IMU_FILE, lambda path: read_imu(path, R_left_imu)),
+    ]
+    return [
+        _sensor(name, path, read, name not in ignored)
+        for name, path, read in files
+        if path.exists()
+    ]
+
+
+def _sensor(
+    name: str, path: Path, read: Callable[[Path], Sequence[Measurement]], used: bool
+) -> RecordedSensor:
+    if not used:
+        lines = path.read_text(errors='replace').splitlines()
+        count = sum(1 for line in lines if line.strip() and not line.startswith('#'))
+        return RecordedSensor(name, str(path), count, False)
+    measurements = read(path)
+    return RecordedSensor(name, str(path), len(measurements), True, lambda: measurements)
+
+
+def read_wheel_odometry(path: Path) -> list[WheelPose]:
+    """Return the poses of a file in the TUM format. Raises InputError naming file and line."""
+    table, stamps_ns = _read_table(path, ' ', 8, TUM_COLUMNS, stamp_factor=1_000_000_000)
+    norms = np.linalg.norm(table[:, 3:7], axis=1)
+    bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
+    if len(bad):
+        raise InputError(
+            f'{path}, pose {bad[0] + 1}: the quaternion has length {norms[bad[0]]:.3g}, not 1; '
+            f'expected {TUM_COLUMNS}'
+        )
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(table[:, 3:7]).as_matrix()
+    poses[:, :3, 3] = table[:, :3]
+    return [WheelPose(int(stamp), pose) for stamp, pose in zip(stamps_ns, poses, strict=True)]
+
+
+def read_imu(path: Path, R_left_imu: Array | None = None) -> list[ImuSample]:
+    """Return the samples of a file with the columns of EuRoC's data.csv, turned by R_left_imu.
+
+    Raises InputError naming file and line.
+    """
+    table, stamps_ns = _read_table(path, ',', 7, IMU_COLUMNS, stamp_factor=1)
+    check_gravity(str(path), table[:, 3:6])
+    R = np.eye(3) if R_left_imu is None else R_left_imu
+    gyro, accel = table[:, :3] @ R.T, table[:, 3:6] @ R.T
+    return [ImuSample(int(t), w, a) for t, w, a in zip(stamps_ns, gyro, accel, strict=True)]
+
+
+def check_gravity(where: str, accel_m_s2: Array) -> None:
+    """Raise InputError unless accelerations (N, 3) are about those on earth."""
+    felt = float(np.median(np.linalg.norm(accel_m_s2, axis=1)))
+    if not ACCEL_RANGE_M_S2[0] <= felt <= ACCEL_RANGE_M_S2[1]:
+        raise InputError(
+            f'{where}: the median acceleration is {felt:.3g}, but gravity alone is 9.81 m/s²; '
+            'correct the unit or the columns, or leave it out with --ignore imu'
+        )
+
+
+def check_shared_clock(sensors: Sequence[RecordedSensor], stamps_ns: Sequence[int]) -> None:
+    """Raise InputError when a sensor that is used measured at no time of the images."""
+    for sensor in sensors:
+        times = [m.stamp_ns for m in sensor.read()] if sensor.used else []
+        if times and (times[-1] < stamps_ns[0] or times[0] > stamps_ns[-1]):
+            raise InputError(
+                f'{sensor.where}: its stamps, {times[0] / 1e9:.3f} to {times[-1] / 1e9:.3f} s, do '
+                f'not meet those of the images, {stamps_ns[0] / 1e9:.3f} to '
+                f'{stamps_ns[-1] / 1e9:.3f} s; bring them to one clock, or leave it out with '
+                f'--ignore {sensor.name}'
+            )
+
+
+def _read_table(
+    path: Path, separator: str, columns: int, expected: str, stamp_factor: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the numbers (N, columns - 1) after the stamps, and the stamps (N,) in ns, ascending;
+    of several lines with the same stamp the first counts.
+    """
+    rows: dict[int, list[float]] = {}
+    for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith('#'):
+            continue
+        words = line.split(',') if separator == ',' else line.replace(',', ' ').split()
+        try:
+            values = [float(word) for word in words[1:columns]]
+            stamp_ns = _stamp_ns(words[0].strip(), stamp_factor)
+        except (ValueError, OverflowError):
+            values = []
+        if len(values) != columns - 1 or not np.isfinite(values).all():
+            raise InputError(f'{path}, line {number}: expected {expected}')
+        rows.setdefault(stamp_ns, values)
+    if not rows:
+        raise InputError(f'{path}: holds no measurement; expected {expected}')
+    stamps = sorted(rows)
+    return np.array([rows[stamp] for stamp in stamps]), np.array(stamps, np.int64)
+
+
+def _stamp_ns(word: str, factor: int) -> int:
+    if factor == 1:
+        return int(word)
+    seconds, _, fraction = word.partition('.')
+    if seconds.isdigit() and (not fraction or fraction.isdigit()):
+        return int(seconds) * factor + int((fraction + '0' * 9)[:9])
+    return round(float(word) * factor)

@@ -1,0 +1,74 @@
+"""What a robot measures besides images: wheel odometry and an IMU, by stamp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+
+
+@dataclass(frozen=True)
+class WheelPose:
+    """Where wheel odometry has the base at a time: (4, 4) in a frame of its own."""
+
+    stamp_ns: int
+    T_wheels_base: Array
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """Angular velocity and specific force (3,) at a time, in the rectified left optical frame."""
+
+    stamp_ns: int
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+Measurement = WheelPose | ImuSample
+
+
+@dataclass(frozen=True)
+class RecordedSensor:
+    """A sensor that was found in a recording: its name, as in `--ignore`, file or topic, number of
+    messages, and whether it is used. read: returns the measurements; depth images have none.
+    """
+
+    name: str
+    where: str
+    messages: int
+    used: bool
+    read: Callable[[], Sequence[Measurement]] = tuple
+
+
+class MeasurementLog:
+    """All measurements of a recording, handed out as the frames come."""
+
+    def __init__(self, sensors: Sequence[RecordedSensor]) -> None:
+        self._streams = [
+            _Stream(sorted(sensor.read(), key=lambda m: m.stamp_ns))
+            for sensor in sensors
+            if sensor.used
+        ]
+
+    def until(self, stamp_ns: int) -> Iterator[Measurement]:
+        """Yield what has not been handed out yet, up to the first measurement of each sensor at or
+        after a time, so that poses can be interpolated there.
+        """
+        for stream in self._streams:
+            yield from stream.until(stamp_ns)
+
+
+class _Stream:
+    def __init__(self, measurements: Sequence[Measurement]) -> None:
+        self._measurements = measurements
+        self._stamps_ns: NDArray[np.int64] = np.array([m.stamp_ns for m in measurements], np.int64)
+        self._next = 0
+
+    def until(self, stamp_ns: int) -> Sequence[Measurement]:
+        end = int(np.searchsorted(self._stamps_ns, stamp_ns)) + 1
+        begin, self._next = self._next, max(self._next, end)
+        return self._measurements[begin:end]
