@@ -16,9 +16,9 @@ from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.memory import MemoryLog
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.recording import OutputFolder, RunResult, RunSummary, lost_intervals
+from segfloor_ros.resident_memory import MemoryLog
+from segfloor_ros.results_folder import OutputFolder, RunResult, RunSummary, lost_intervals
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
 
@@ -74,7 +74,8 @@ class LockstepRun:
         finally:
             self._pipeline.close()
         wall_s = time.perf_counter() - start
-        mount, labelled, path = self._pipeline.mount, self._pipeline.labelled, self._path
+        stages = self._pipeline.keyframe_stages
+        mount, labelled, path = self._pipeline.mount, stages.labelled, self._path
         if grid is None or mount is None or labelled is None or path is None:
             raise MapError(self._why_no_map())
         poses = [
@@ -158,7 +159,7 @@ class LockstepRun:
             lost_intervals=lost_intervals([r.index for r in self._results], tracked),
             keyframes=len(self._pipeline.slam.map.keyframes),
             loops=0,
-            map_updates=self._pipeline.map_updates,
+            map_updates=self._pipeline.keyframe_stages.map_updates,
             wall_s=round(wall_s, 3),
             frames_per_s=round(self._frames / wall_s, 2),
             camera_height_m=round(mount.height_m, 4),

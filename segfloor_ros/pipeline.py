@@ -7,16 +7,26 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.observation import FloorObservation
+from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.occupancy import OccupancyGrid
-from segfloor_ros.slam.results import FrameResult, Keyframe
+from segfloor_ros.slam.results import (
+    FrameResult,
+    Keyframe,
+    KeyframeFeatures,
+    KeyframePath,
+    SparseCloud,
+)
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 
@@ -25,9 +35,66 @@ MAX_PENDING_KEYFRAMES = 4
 KeyframeListener = Callable[[Keyframe, FloorObservation], None]
 
 
+@dataclass(frozen=True)
+class MapInput:
+    """What labelling and grid need of a keyframe. mask: (H, W) uint8, its floor mask."""
+
+    stamp_ns: int
+    features: KeyframeFeatures
+    path: KeyframePath
+    cloud: SparseCloud
+    mask: NDArray[np.uint8]
+    scan: FloorScan
+
+
+class KeyframeStages:
+    """The three stages behind SLAM, keyframe by keyframe: the one place that knows their order."""
+
+    def __init__(
+        self, camera: StereoCamera, configuration: Configuration, times: StageTimes
+    ) -> None:
+        self.labelled: LabelledPoints | None = None
+        self.map_updates = 0
+        self._times = times
+        self._floor = FloorSegmentation(camera, configuration.floor_segmentation)
+        self._labelling = CloudLabelling(configuration.cloud_labelling)
+        self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
+
+    def process(self, keyframe: Keyframe, mount: Mount) -> FloorObservation:
+        """Take in one keyframe."""
+        with self._times.measure('floor_segmentation'):
+            floor = self._floor.process(keyframe.left, keyframe.right, mount, keyframe.T_map_base)
+        self.update_map(
+            MapInput(
+                keyframe.stamp_ns,
+                keyframe.features,
+                keyframe.path,
+                keyframe.cloud,
+                floor.mask,
+                floor.scan,
+            )
+        )
+        return floor
+
+    def update_map(self, keyframe: MapInput) -> None:
+        """Take in one keyframe whose floor is segmented."""
+        with self._times.measure('cloud_labelling'):
+            self.labelled = self._labelling.update(
+                keyframe.cloud, keyframe.features, keyframe.mask, keyframe.path.T_map_base[-1]
+            )
+        with self._times.measure('occupancy_grid'):
+            self._mapper.update(
+                keyframe.stamp_ns, self.labelled, keyframe.features, keyframe.path, keyframe.scan
+            )
+        self.map_updates += 1
+
+    def grid(self) -> OccupancyGrid | None:
+        """Return the map so far, None before the first keyframe."""
+        return self._mapper.grid() if self.map_updates else None
+
+
 class Pipeline:
-    """SLAM on the calling thread; segmentation, labelling and grid on one worker, in the order of
-    the keyframes.
+    """SLAM on the calling thread, the other stages on one worker, in the order of the keyframes.
 
     Nothing flows back from the worker to SLAM, so the result does not depend on timing.
     """
@@ -39,12 +106,8 @@ class Pipeline:
         on_keyframe: KeyframeListener | None = None,
     ) -> None:
         self.times = StageTimes()
-        self.map_updates = 0
-        self.labelled: LabelledPoints | None = None
         self.slam = make_slam(camera, configuration.stereo_slam, times=self.times)
-        self._floor = FloorSegmentation(camera, configuration.floor_segmentation)
-        self._labelling = CloudLabelling(configuration.cloud_labelling)
-        self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
+        self.keyframe_stages = KeyframeStages(camera, configuration, self.times)
         self._on_keyframe = on_keyframe
         self._worker = ThreadPoolExecutor(1, 'keyframes')
         self._pending: deque[Future[None]] = deque()
@@ -67,7 +130,7 @@ class Pipeline:
         while self._pending:
             self._pending.popleft().result()
         self._worker.shutdown()
-        return self._mapper.grid() if self.map_updates else None
+        return self.keyframe_stages.grid()
 
     def close(self) -> None:
         """Drop what is pending, e.g. after an error."""
@@ -80,18 +143,6 @@ class Pipeline:
 
     def _process_keyframe(self, keyframe: Keyframe) -> None:
         assert self.mount is not None
-        with self.times.measure('floor_segmentation'):
-            floor = self._floor.process(
-                keyframe.left, keyframe.right, self.mount, keyframe.T_map_base
-            )
-        with self.times.measure('cloud_labelling'):
-            self.labelled = self._labelling.update(
-                keyframe.cloud, keyframe.features, floor.mask, keyframe.T_map_base
-            )
-        with self.times.measure('occupancy_grid'):
-            self._mapper.update(
-                keyframe.stamp_ns, self.labelled, keyframe.features, keyframe.path, floor.scan
-            )
-        self.map_updates += 1
+        floor = self.keyframe_stages.process(keyframe, self.mount)
         if self._on_keyframe is not None:
             self._on_keyframe(keyframe, floor)

@@ -63,6 +63,7 @@ def test_a_module_keeps_to_the_rules(path) -> None:
         assert 'nodes' not in rooms_imported(path)
     if room != 'cli':
         assert 'cli' not in rooms_imported(path)
+    assert not any(name.split('.')[0] in ('tools', 'test') for name in names)
     if room in ROS_FREE_ROOMS:
         assert 'messages' not in rooms_imported(path)
         assert 'pipeline' not in rooms_imported(path)

@@ -6,7 +6,7 @@ import pytest
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.recording import OutputFolder, lost_intervals
+from segfloor_ros.results_folder import OutputFolder, lost_intervals
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum

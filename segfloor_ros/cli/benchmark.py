@@ -1,29 +1,20 @@
-"""`segfloor benchmark`: what the stages cost here, and the published evaluation once more."""
+"""`segfloor benchmark`: what the stages cost here, or the five node processes."""
 
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
-from rich.progress import Progress as ProgressBar
 
-from segfloor_ros.cli.benchmark_tables import published_table, stage_table, workload_table
+from segfloor_ros.benchmark.stages import BenchmarkPlan, as_document, parse_sizes, run_benchmark
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.benchmark_tables import stage_table, workload_table
 from segfloor_ros.cli.options import ParamsOption, SetOption
-from segfloor_ros.cli.output import console, progress_bar
+from segfloor_ros.cli.output import announcing, console
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation import benchmark as generated
-from segfloor_ros.evaluation import benchmark_scenes as published
-from segfloor_ros.evaluation.benchmark import Announce, BenchmarkPlan, parse_sizes
-from segfloor_ros.evaluation.benchmark_apart import Progress
-from segfloor_ros.evaluation.benchmark_published import PUBLISHED, parse_scenes
-from segfloor_ros.evaluation.benchmark_scenes import SceneResult
-from segfloor_ros.simulation.any_scene import open_scene
+from segfloor_ros.errors import InputError, SettingsError
 
 DEFAULT = BenchmarkPlan()
 
@@ -39,69 +30,51 @@ def benchmark(
     threads: Annotated[
         int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
     ] = DEFAULT.threads,
-    json_file: Annotated[
-        Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
-        typer.Option('--json', help='Write all figures to this file.'),
+    nodes: Annotated[
+        Optional[str],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        typer.Option(
+            metavar='RECORDING',
+            help='Play this recording through the five node processes instead: latency from image '
+            'to map, CPU, memory and losses.',
+        ),
     ] = None,
-    published_scenes: Annotated[
-        bool, typer.Option('--published', help='Simulate, map and score the published scenes.')
-    ] = False,
-    scenes: Annotated[str, typer.Option(help='Which of the published scenes.')] = ','.join(
-        PUBLISHED
-    ),
-    workdir: Annotated[
+    rate: Annotated[
+        float, typer.Option(min=0.01, help='Speed of --nodes against real time.')
+    ] = 1.0,
+    json_file: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help='Keep renderings, maps and overlays here; what is there is used again.'),
+        typer.Option('--json', help='Write all figures of the stages to this file.'),
     ] = None,
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
     """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload."""
+    if nodes is not None:
+        print_node_figures(resolve(params, assignments or (), stereo_camera={'input': nodes}), rate)
+        return
     configuration = resolve(params, assignments or ())
     _make_folder_of(json_file)
-    if published_scenes:
-        results = _run_published(parse_scenes(scenes), workdir, configuration, threads)
-        _write_json(json_file, published.as_document(results))
-        return
     plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
     with announcing() as announce:
-        workloads = generated.run_benchmark(plan, configuration, announce)
+        workloads = run_benchmark(plan, configuration, announce)
     console.print(stage_table(workloads))
     console.print(workload_table(workloads))
-    _write_json(json_file, generated.as_document(plan, workloads))
+    write_json(json_file, as_document(plan, workloads))
 
 
-def _run_published(
-    names: list[str], workdir: Path | None, configuration: Configuration, threads: int
-) -> list[SceneResult]:
-    with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary:
-        folder = workdir or Path(temporary)
-        with announcing() as announce:
-            results = [
-                published.run_scene(
-                    name, open_scene(name), folder / name, configuration, threads, announce
-                )
-                for name in names
-            ]
-    console.print(stage_table([result.workload for result in results]))
-    console.print(workload_table([result.workload for result in results]))
-    console.print(published_table(results))
-    if workdir is not None:
-        console.print(f'maps on the truth: {workdir}/*/overlay.png', highlight=False)
-    return results
-
-
-@contextmanager
-def announcing() -> Iterator[Announce]:
-    """Show a progress bar whose task is replaced by the next announced one."""
-    with progress_bar('starting', None) as bar:
-        yield lambda description, total: _next_task(bar, description, total)
-
-
-def _next_task(bar: ProgressBar, description: str, total: int) -> Progress:
-    task = bar.task_ids[-1]
-    bar.reset(task, description=description, total=total or None, note='')
-    return lambda done: bar.update(task, completed=done)
+def print_node_figures(configuration: Configuration, rate: float, lossless: bool = False) -> None:
+    """Play the recording of the configuration through the nodes and print what it cost. lossless:
+    lose no frame, as opposed to keeping to the clock.
+    """
+    try:
+        from segfloor_ros.cli.replay_measured import figures_table, measure_nodes
+    except ImportError as error:
+        raise SettingsError(f'to measure the nodes needs ROS 2 ({error})') from None
+    frames = open_source(configuration.stereo_camera).frame_count
+    with announcing() as announce:
+        progress = announce('playing', frames or 0)
+        figures = measure_nodes(configuration, rate, lossless, lambda done, state: progress(done))
+    console.print(figures_table(figures))
 
 
 def _make_folder_of(path: Path | None) -> None:
@@ -117,7 +90,8 @@ def _make_folder_of(path: Path | None) -> None:
         raise InputError(f'{path}: cannot be written ({reason}); choose another --json') from None
 
 
-def _write_json(path: Path | None, document: dict[str, Any]) -> None:
+def write_json(path: Path | None, document: dict[str, Any]) -> None:
+    """Write figures to a file and say where."""
     if path is None:
         return
     path.write_text(json.dumps(document, indent=2) + '\n')

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
 
 import typer
 
 from segfloor_ros.cli.benchmark import benchmark
-from segfloor_ros.cli.benchmark_floor import benchmark_floor
-from segfloor_ros.cli.benchmark_nodes import benchmark_nodes
-from segfloor_ros.cli.benchmark_slam import benchmark_slam
 from segfloor_ros.cli.calibrate import calibrate
 from segfloor_ros.cli.convert import convert
 from segfloor_ros.cli.demo import demo
@@ -27,8 +25,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-benchmarks = (benchmark, benchmark_floor, benchmark_slam, benchmark_nodes)
-for command in (run, replay, simulate, calibrate, convert, *benchmarks, demo):
+for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
     app.command()(command)
 app.add_typer(evaluate, name='evaluate')
 
@@ -39,12 +36,25 @@ def _options() -> None:
 
 
 def main() -> None:
-    """Run the command line; known errors print one line. Status 2: bad input; 1: no map came
-    of it.
+    """Run the command line."""
+    run_app(app)
+
+
+def run_command(command: Callable[..., None]) -> None:
+    """Run a single command as a program of its own."""
+    program = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    program.command()(command)
+    run_app(program)
+
+
+def run_app(program: typer.Typer) -> None:
+    """Run a command line; known errors print one line.
+
+    Status 2: bad input; 1: no map came of it.
     """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     try:
-        app()
+        program()
     except MapError as error:
         print_error(str(error))
         sys.exit(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,10 +18,13 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from segfloor_ros.recording import RunSummary, summary_rows
+from segfloor_ros.results_folder import RunSummary, summary_rows
 
 console = Console()
 error_console = Console(stderr=True, soft_wrap=True)
+
+Announce = Callable[[str, int], Callable[[int], None]]
+"""Told the name of a task and its number of steps; returns whom to tell how many are done."""
 
 
 @contextmanager
@@ -38,6 +41,29 @@ def progress_bar(description: str, total: int | None) -> Iterator[Progress]:
     with Progress(*columns, console=error_console, transient=not sys.stderr.isatty()) as progress:
         progress.add_task(description, total=total, note='')
         yield progress
+
+
+@contextmanager
+def announcing() -> Iterator[Announce]:
+    """Show a progress bar whose task is replaced by the next announced one."""
+    with progress_bar('starting', None) as bar:
+        yield lambda description, total: _next_task(bar, description, total)
+
+
+def _next_task(bar: Progress, description: str, total: int) -> Callable[[int], None]:
+    task = bar.task_ids[-1]
+    bar.reset(task, description=description, total=total or None, note='')
+    return lambda done: bar.update(task, completed=done)
+
+
+def figure_table(names: str, *numbers: str) -> Table:
+    """Return an empty table whose first column holds names and whose others hold numbers."""
+    table = Table(names, *numbers, padding=0)
+    for column in table.columns:
+        column.no_wrap = True
+    for column in table.columns[1:]:
+        column.justify = 'right'
+    return table
 
 
 def print_summary(title: str, summary: RunSummary) -> None:

@@ -21,7 +21,7 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import SaveMasks
 from segfloor_ros.node_settings import StereoCameraNodeSettings
-from segfloor_ros.recording import OutputFolder
+from segfloor_ros.results_folder import OutputFolder
 
 
 def replay(

@@ -13,7 +13,7 @@ from types import TracebackType
 
 from segfloor_ros.cli.interrupts import interrupts_deferred
 from segfloor_ros.errors import MapError
-from segfloor_ros.memory import rss_mb
+from segfloor_ros.resident_memory import rss_mb
 
 INTERRUPT_S = 1.2
 TERMINATE_S = 0.5

@@ -27,7 +27,7 @@ from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
-from segfloor_ros.recording import RunResult, RunSummary, lost_intervals
+from segfloor_ros.results_folder import RunResult, RunSummary, lost_intervals
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 
 DISCOVERY_S = 30.0

@@ -18,7 +18,7 @@ from segfloor_ros.cli.options import (
 from segfloor_ros.cli.output import finish_run, print_summary, progress_bar
 from segfloor_ros.configuration import resolve
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
-from segfloor_ros.recording import OutputFolder
+from segfloor_ros.results_folder import OutputFolder
 
 
 def run(

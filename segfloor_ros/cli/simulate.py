@@ -15,7 +15,7 @@ from segfloor_ros.cli.options import OutOption
 from segfloor_ros.cli.output import console, progress_bar
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.bag import SimulatedBag
-from segfloor_ros.simulation.recording import RecordingOptions, record
+from segfloor_ros.simulation.drive_files import RecordingOptions, record
 from segfloor_ros.simulation.simulation import Simulation
 
 

@@ -12,7 +12,6 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.memory import rss_mb
 from segfloor_ros.messages.diagnostics import (
     CONNECTIONS,
     HEALTH,
@@ -29,6 +28,7 @@ from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic
 from segfloor_ros.nodes.hand_over import HandOver, LocalPublisher
 from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.qos_check import incompatible_topics
+from segfloor_ros.resident_memory import rss_mb
 
 CONNECTION_CHECK_S = 0.1
 FALLS_BEHIND_S = 2.0

@@ -16,7 +16,7 @@ from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.geometry import transform_points
 from segfloor_ros.grid.occupancy import OCCUPIED
-from segfloor_ros.simulation.recording import RecordingOptions, record
+from segfloor_ros.simulation.drive_files import RecordingOptions, record
 from segfloor_ros.simulation.renderer import RenderingError
 from segfloor_ros.simulation.scene_file import scene_from_mapping
 from segfloor_ros.simulation.simulation import Simulation

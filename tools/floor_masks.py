@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOptions
+from segfloor_ros.simulation.render_once import render_once
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.simulation import FrameTruth, Simulation
+from segfloor_ros.simulation.simulation import FrameTruth
+from tools.driving import open_recording
 
 SCENES = (
     'lane',
@@ -57,30 +64,50 @@ def mount_of(scene: Scene) -> Mount:
     return Mount(rig.height_m, float(pitch), float(roll), rig.forward_m)
 
 
-def score_scene(
-    name: str, scene: Scene, configuration: Configuration, on_progress: Callable[[int], None]
-) -> SceneScore:
-    """Render some stretches of a scene's drive and score the masks of their last frames. Raises
-    RenderingError where nothing can be rendered.
+def render_floor(name: str, scene: Scene, folder: Path, announce: Announce) -> Path:
+    """Render a scene's drive, one frame for each keyframe of a robot, each with its true mask and
+    disparity, and return its folder. Raises RenderingError where nothing can be rendered.
     """
+    camera = dataclasses.replace(scene.camera, rate_hz=1 / KEYFRAME_S)
+    recording = folder / name
+    render_once(
+        dataclasses.replace(scene, camera=camera),
+        recording,
+        RecordingOptions(floor_every=1, disparity=True),
+        lambda frames: announce(f'rendering {name}', frames),
+    )
+    return recording
+
+
+def score_recording(
+    name: str, recording: Path, mount: Mount, configuration: Configuration
+) -> SceneScore:
+    """Segment all frames of a rendered drive, pose and mount known, and score some of the masks."""
     counts = np.zeros(8, np.int64)
-    with Simulation(scene) as simulation:
-        mount = mount_of(scene)
-        stage = FloorSegmentation(simulation.camera, configuration.floor_segmentation)
-        T_left_base = np.linalg.inv(mount.T_base_left)
-        step = max(1, round(KEYFRAME_S * scene.camera.rate_hz))
-        indices = np.arange(0, simulation.frame_count, step)
-        scored = set(indices[:: -(-len(indices) // MASKS)].tolist())
-        for done, index in enumerate(indices.tolist(), start=1):
-            frame = simulation.frame(index)
-            T_map_base = frame.T_world_left @ T_left_base
-            mask = stage.process(frame.left, frame.right, mount, T_map_base).mask
-            if index in scored:
-                truth = simulation.truth(index)
-                counts += count(mask, truth, simulation.camera, mount.T_base_left)
-            on_progress(done)
+    source = open_recording(recording, configuration)
+    stage = FloorSegmentation(source.camera, configuration.floor_segmentation)
+    poses = read_trajectory(recording / 'poses.txt')[1]
+    T_map_base = mount.T_base_left @ poses @ invert(mount.T_base_left)
+    scored = range(0, len(poses), -(-len(poses) // MASKS))
+    for frame, T in zip(source.frames(), T_map_base, strict=True):
+        mask = stage.process(frame.left, frame.right, mount, T).mask
+        if frame.index in scored:
+            truth = read_truth(recording, frame.index, source.camera)
+            counts += count(mask, truth, source.camera, mount.T_base_left)
     shares = [_ratio(counts[i], counts[i + 1]) for i in range(0, 8, 2)]
     return SceneScore(name, len(scored), *shares)
+
+
+def read_truth(recording: Path, index: int, camera: StereoCamera) -> FrameTruth:
+    """Read the true mask and disparity of a frame; where nothing is seen the depth is infinite."""
+    floor, scaled = (
+        cv2.imread(str(recording / what / f'{index:06d}.png'), cv2.IMREAD_UNCHANGED)
+        for what in ('floor', 'disparity')
+    )
+    disparity_px = (scaled / DISPARITY_SCALE).astype(np.float32)
+    with np.errstate(divide='ignore'):
+        depth_m = (camera.disparity_times_depth / disparity_px).astype(np.float32)
+    return FrameTruth(floor, depth_m, disparity_px)
 
 
 def count(

@@ -4,21 +4,20 @@ memory, time and error stay what they are.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 import numpy as np
 
-from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.endless_drive import place_of
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.memory import rss_mb
+from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.resident_memory import rss_mb
 from segfloor_ros.slam.results import FrameResult
-from segfloor_ros.slam.stereo_slam import StereoSlam
+from tools.driving import drive
+from tools.endless_drive import place_of
 
 PARTS = 8
 
@@ -42,33 +41,14 @@ class SoakPart:
     rss_mb: float
 
 
-class Stages(Protocol):
-    """What is soaked: the pipeline in lockstep."""
-
-    slam: StereoSlam
-
-    @property
-    def mount(self) -> Mount | None:
-        """Where the camera sits on the base, once it is known."""
-
-    def process(self, frame: StereoFrame) -> list[FrameResult]:
-        """Take in the next frame."""
-
-    def finish(self) -> object | None:
-        """Return the map, or None when there is none."""
-
-    def close(self) -> None:
-        """Drop what is pending."""
-
-
 class Soak:
     """Drives an endless drive (see `endless_drive`) of a recording.
 
     truth: (N, 4, 4) of the left camera in its first pose, for each frame of the recording.
     """
 
-    def __init__(self, pipeline: Stages, drive: StereoSource, truth: Array) -> None:
-        self._drive = drive
+    def __init__(self, pipeline: Pipeline, recording: StereoSource, truth: Array) -> None:
+        self._recording = recording
         self._pipeline = pipeline
         self._truth = truth
         self._seconds: list[float] = []
@@ -78,21 +58,16 @@ class Soak:
     def run(self, on_progress: Callable[[int], None]) -> list[SoakPart]:
         """Return the parts in order. Raises MapError when there is no map."""
         parts: list[SoakPart] = []
-        length = max((self._drive.frame_count or 0) // PARTS, 1)
-        try:
-            for frame in self._drive.frames():
-                start = time.thread_time()
-                results = self._pipeline.process(frame)
-                self._seconds.append(time.thread_time() - start)
+        length = max((self._recording.frame_count or 0) // PARTS, 1)
+        with contextlib.closing(self._pipeline):
+            for step in drive(self._pipeline, self._recording.frames(), on_progress):
+                self._seconds.append(step.cpu_s)
                 self._frames += 1
-                self._note(results)
-                on_progress(self._frames)
+                self._note(step.results)
                 if self._frames % length == 0:
-                    parts.append(self._end_part(frame.stamp_ns))
+                    parts.append(self._end_part(step.frame.stamp_ns))
             if self._pipeline.finish() is None:
-                raise MapError(f'{self._drive.name}: no map came of {self._frames} frames')
-        finally:
-            self._pipeline.close()
+                raise MapError(f'{self._recording.name}: no map came of {self._frames} frames')
         return parts
 
     def _note(self, results: Sequence[FrameResult]) -> None:

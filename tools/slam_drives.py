@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
@@ -17,6 +17,7 @@ from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
+from tools.driving import drive, open_recording
 
 DRIVES = ('corridor1', 'corridor2', 'ramp', 'rolling', 'exposure_difference')
 """Shipped scenes: weak texture, a narrow corridor, a slope, a shaking and an uneven camera."""
@@ -43,23 +44,21 @@ def measure_drive(
     Raises InputError for a recording without truth, MapError when fewer than two keyframes came.
     """
     truth = read_trajectory(recording / 'poses.txt')
-    settings = dataclasses.replace(configuration.stereo_camera, input=str(recording))
-    source, times = open_source(settings), StageTimes()
+    source, times = open_recording(recording, configuration), StageTimes()
     slam = make_slam(source.camera, configuration.stereo_slam, times=times)
     poses: list[TrackedPose] = []
     path: KeyframePath | None = None
     frames = 0
-    for frame in source.frames():
-        frames += 1
-        for result in slam.process(frame):
-            if result.tracked:
-                pose = TrackedPose(
-                    result.stamp_ns, result.T_odom_base, result.reference_keyframe_ns
-                )
-                poses.append(pose)
-            path = result.keyframe.path if result.keyframe is not None else path
-        on_progress(frames)
-    slam.close()
+    with contextlib.closing(slam):
+        for step in drive(slam, source.frames(), on_progress):
+            frames += 1
+            for result in step.results:
+                if result.tracked:
+                    pose = TrackedPose(
+                        result.stamp_ns, result.T_odom_base, result.reference_keyframe_ns
+                    )
+                    poses.append(pose)
+                path = result.keyframe.path if result.keyframe is not None else path
     if path is None or slam.mount is None or len(path.stamp_ns) < 2:
         raise MapError(f'{name}: no path came of {frames} frames')
     tracked = corrected_trajectory(poses, path).seen_from(slam.mount.T_base_left)

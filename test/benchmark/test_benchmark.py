@@ -8,30 +8,22 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from rich.console import Console
 from typer.testing import CliRunner
 
+from segfloor_ros.benchmark.chain import MeasuredStages
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, floor_mask
+from segfloor_ros.benchmark.corridor_images import CorridorImages
+from segfloor_ros.benchmark.figures import UpdateTimes
+from segfloor_ros.benchmark.processes import run_apart
+from segfloor_ros.benchmark.stages import BenchmarkPlan, measure_map
 from segfloor_ros.cli.benchmark import benchmark
-from segfloor_ros.cli.benchmark_tables import published_table
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError
-from segfloor_ros.evaluation.benchmark import BenchmarkPlan, measure_map
-from segfloor_ros.evaluation.benchmark_apart import run_apart
-from segfloor_ros.evaluation.benchmark_chain import ImageChain
-from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT, Corridor, floor_mask
-from segfloor_ros.evaluation.benchmark_figures import UpdateTimes
-from segfloor_ros.evaluation.benchmark_images import CorridorImages
-from segfloor_ros.evaluation.benchmark_published import PUBLISHED
-from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
-from segfloor_ros.evaluation.benchmark_scenes import as_document, run_scene
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, sample_states, states
-from segfloor_ros.evaluation.truth import read_map
+from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert, transform_points
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.renderer import RenderingError
-from segfloor_ros.simulation.scene_file import shipped_scenes
 
 CONFIGURATION = resolve()
 CHAIN_FRAMES = 12
@@ -127,7 +119,7 @@ def test_the_floor_in_the_images_has_the_disparity_of_the_floor():
 
 
 def test_the_chain_makes_the_map_of_the_pipeline():
-    chain = ImageChain(CAMERA, CONFIGURATION, MOUNT)
+    chain = MeasuredStages(CAMERA, CONFIGURATION, MOUNT)
     settings = {'camera_height_m': 0.3, 'camera_pitch_rad': 0.12, 'camera_roll_rad': 0.0}
     pipeline = Pipeline(CAMERA, resolve(stereo_slam=settings))
     for frame in CorridorImages(CHAIN_FRAMES, seed=0).drive():
@@ -136,10 +128,10 @@ def test_the_chain_makes_the_map_of_the_pipeline():
     grid = pipeline.finish()
     np.testing.assert_array_equal(chain.grid.cells, grid.cells)
     assert chain.grid.origin_xy_m == grid.origin_xy_m
-    workload = chain.workload('here', chain.frames, chain.tracked, reference_ms=10.0)
+    workload = chain.workload('here')
     assert (workload.items, workload.tracked) == (CHAIN_FRAMES, CHAIN_FRAMES)
-    assert workload.map_updates == pipeline.map_updates
-    assert workload.points == len(pipeline.labelled.point_id)
+    assert workload.map_updates == pipeline.keyframe_stages.map_updates
+    assert workload.points == len(pipeline.keyframe_stages.labelled.point_id)
     # The corridor is 3 m wide.
     places = np.array([[2.0, 0.0], [2.5, 1.2], [2.5, -1.2]])
     assert sample_states(states(grid), grid, places).tolist() == [FREE] * 3
@@ -187,7 +179,7 @@ def test_map_stages_alone():
     workload = measure_map(BenchmarkPlan(), 30, CONFIGURATION, done.append)
     assert done == list(range(1, 31))
     assert workload.map_updates == workload.items == 30
-    assert set(workload.stages) == {'cloud_labelling', 'occupancy_grid'}
+    assert set(workload.stages) == {'cloud_labelling', 'occupancy_grid', 'map'}
     # Known: a strip 3 m wide, 30 strides of 0.25 m and some of what lies ahead.
     assert workload.cells * 0.05**2 > 3 * 30 * 0.25
     assert workload.points == pytest.approx(400 * (29 * 0.25 + 6), rel=0.05)
@@ -249,6 +241,7 @@ def test_benchmark_prints_tables_and_writes_json(tmp_path):
         'floor_segmentation',
         'cloud_labelling',
         'occupancy_grid',
+        'map',
     ]
     assert 1 < images['map_updates'] < 8
     assert more['points'] > few['points']
@@ -275,62 +268,3 @@ def test_bad_sizes(sizes):
 def test_what_cannot_be_done_is_said_at_once(tmp_path):
     with pytest.raises(InputError, match='choose another --json'):
         run('--json', tmp_path, fails=True)
-    with pytest.raises(SettingsError, match='did you mean corridor2'):
-        run('--published', '--scenes', 'corridor1,coridor2', fails=True)
-
-
-# The published scenes
-
-
-def test_the_published_scenes_are_shipped():
-    assert set(PUBLISHED) <= set(shipped_scenes())
-
-
-def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
-    steps = []
-
-    def announce(description, total):
-        steps.append((description, total))
-        return lambda done: None
-
-    def scene_result(*changes):
-        steps.clear()
-        small = ('camera.width=320', 'camera.height=240', *changes)
-        scene = open_scene('corridor2', small)
-        return run_scene('corridor2', scene, tmp_path, CONFIGURATION, 1, announce)
-
-    way = 'path.waypoints=[[0, 0], [0.6, 0]]'
-    try:
-        first = scene_result(way)
-    except RenderingError as error:
-        pytest.skip(str(error))
-    frames = first.workload.items
-    assert steps == [('rendering corridor2', frames), ('mapping corridor2', frames)]
-    assert first.workload.tracked == frames
-    assert first.score.nodes == 20
-    assert first.cell_m == read_map(tmp_path / 'map.yaml').resolution_m == 0.01
-    assert read_map(tmp_path / 'recording' / 'map.yaml').resolution_m == 0.01
-    assert first.score.observable_only
-    assert first.score.raw.precision.mean > 0.8
-    assert read_map(tmp_path / 'map.yaml').cells.size == first.workload.cells
-    assert cv2.imread(str(tmp_path / 'overlay.png')) is not None
-
-    second = scene_result(way)
-    assert steps == [('mapping corridor2', frames)]
-    assert second.score == first.score
-
-    other = scene_result('path.waypoints=[[0, 0], [0.5, 0]]')
-    assert [description for description, _ in steps] == ['rendering corridor2', 'mapping corridor2']
-    assert other.workload.items < frames
-
-    console = Console(record=True, width=80)
-    console.print(published_table([first]))
-    text = console.export_text()
-    assert '…' not in text
-    row = next(line for line in text.split('\n') if 'Segfloor *' in line)
-    assert [cell.strip() for cell in row.split('│')[2:6]] == ['99.64', '97.23', '0.190', '0.073']
-    row = next(line for line in text.split('\n') if 'here, raw' in line)
-    assert float(row.split('│')[2]) == round(100 * first.score.raw.precision.mean, 2)
-    document = json.loads(json.dumps(as_document([first])))
-    assert document['scenes'][0]['score']['nodes'] == 20
-    assert document['scenes'][0]['published']['figures'][0]['method'] == 'Segfloor'

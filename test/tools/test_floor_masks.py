@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.evaluation.benchmark_floor_scenes import SCENES, count, mount_of, score_scene
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.renderer import RenderingError
 from segfloor_ros.simulation.simulation import FrameTruth
+from tools.floor_masks import SCENES, count, mount_of, read_truth, render_floor, score_recording
 
 CAMERA = StereoCamera(4, 3, 100.0, 100.0, 1.5, 1.0, 0.1)
 
@@ -52,13 +54,22 @@ def test_scenes_can_be_opened(name):
     assert np.degrees(mount.roll_rad) == pytest.approx(scene.camera.roll_deg)
 
 
-def test_a_low_box_is_not_floor():
-    done: list[int] = []
+def test_a_low_box_is_not_floor(tmp_path):
+    scene, started = open_scene('low_box'), []
+
+    def announce(description, frames):
+        started.append((description, frames))
+        return lambda done: None
+
     try:
-        score = score_scene('low_box', open_scene('low_box'), Configuration(), done.append)
+        recording = render_floor('low_box', scene, tmp_path, announce)
     except RenderingError as error:
         pytest.skip(str(error))
-    assert done == list(range(1, len(done) + 1))
+    assert [description for description, _ in started] == ['rendering low_box']
+    assert len(list((recording / 'floor').iterdir())) == started[0][1]
+    truth = read_truth(recording, 0, open_source(StereoCameraSettings(input=str(recording))).camera)
+    assert truth.depth_m[truth.floor > 0].max() < truth.depth_m.max()
+    score = score_recording('low_box', recording, mount_of(scene), Configuration())
     assert score.precision > 0.99
     assert score.recall > 0.97
     assert score.low_called_floor < 0.08

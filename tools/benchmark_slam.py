@@ -1,8 +1,9 @@
-"""`segfloor benchmark-slam`: the error of the path and the cost of a frame, over several drives."""
+"""The error of the path and the cost of a frame, over several drives, or over hours of one:
+`python -m tools.benchmark_slam`.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from pathlib import Path
 from typing import Annotated, Optional
@@ -11,19 +12,16 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.benchmark import announcing
+from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.options import ParamsOption, SetOption
-from segfloor_ros.cli.output import console
+from segfloor_ros.cli.output import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.evaluation.benchmark import Announce
-from segfloor_ros.evaluation.benchmark_rendering import render_once
-from segfloor_ros.evaluation.benchmark_slam import DRIVES, DriveResult, measure_drive
-from segfloor_ros.evaluation.endless_drive import write_endless_drive
-from segfloor_ros.evaluation.soak import Soak, SoakPart
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.simulation.any_scene import open_scene
+from tools.driving import open_recording, recordings
+from tools.endless_drive import write_endless_drive
+from tools.slam_drives import DRIVES, DriveResult, measure_drive
+from tools.soak import Soak, SoakPart
 
 
 def benchmark_slam(
@@ -61,7 +59,7 @@ def benchmark_slam(
         folder = workdir or Path(temporary)
         with announcing() as announce:
             for drive in drives or DRIVES:
-                for name, recording in _recordings(drive, seeds, folder, announce):
+                for name, recording in recordings(drive, seeds, folder, announce):
                     if soak_minutes:
                         parts = _soak(name, recording, configuration, soak_minutes, rate, announce)
                         console.print(soak_table(name, parts))
@@ -80,23 +78,21 @@ def _soak(
     rate_hz: float,
     announce: Announce,
 ) -> list[SoakPart]:
-    settings = dataclasses.replace(configuration.stereo_camera, input=str(recording))
-    source = open_source(settings)
+    source = open_recording(recording, configuration)
     truth = read_trajectory(recording / 'poses.txt')[1]
     with tempfile.TemporaryDirectory(prefix='segfloor-soak-') as folder:
         path = write_endless_drive(source, Path(folder) / 'drive', 60 * minutes, rate_hz=rate_hz)
-        drive = open_source(dataclasses.replace(settings, input=str(path)))
-        report = announce(f'soaking {name}', drive.frame_count or 0)
-        pipeline = Pipeline(drive.camera, configuration)
-        return Soak(pipeline, drive, truth).run(report)
+        endless = open_recording(path, configuration)
+        report = announce(f'soaking {name}', endless.frame_count or 0)
+        pipeline = Pipeline(endless.camera, configuration)
+        return Soak(pipeline, endless, truth).run(report)
 
 
 def soak_table(name: str, parts: list[SoakPart]) -> Table:
     """Return a row for each part of a soak."""
     columns = ('tracked', 'keyframes', 'in map', 'points', 'CPU ms', 'p95', 'error m', 'MB')
-    table = Table('minutes', *columns, padding=0, title=name)
-    for column in table.columns:
-        column.justify, column.no_wrap = 'right', True
+    table = figure_table('minutes', *columns)
+    table.title = name
     for part in parts:
         middle, high = part.frame_ms
         table.add_row(
@@ -113,25 +109,10 @@ def soak_table(name: str, parts: list[SoakPart]) -> Table:
     return table
 
 
-def _recordings(drive: str, seeds: int, folder: Path, announce: Announce) -> list[tuple[str, Path]]:
-    """Return the drive's recordings by name: itself, or the scene rendered once for each seed."""
-    if (Path(drive) / 'poses.txt').is_file():
-        return [(Path(drive).name, Path(drive))]
-    scene, found = open_scene(drive), []
-    for seed in range(1, seeds + 1):
-        name = f'{Path(drive).stem}-{seed}'
-        recording, stamp = folder / name / 'recording', folder / name / 'rendered_from.txt'
-        render_once(name, dataclasses.replace(scene, seed=seed), recording, stamp, announce)
-        found.append((name, recording))
-    return found
-
-
 def drives_table(results: list[DriveResult]) -> Table:
     """Return a row for each drive, then the median and the worst error of the path."""
     names = ('tracked', 'path m', 'error m', 'tracking ms', 'p95', 'mapping ms')
-    table = Table('drive', *names, padding=0)
-    for column in table.columns[1:]:
-        column.justify, column.no_wrap = 'right', True
+    table = figure_table('drive', *names)
     for result in results:
         score, tracking = result.score, result.stages['tracking']
         table.add_row(
@@ -149,3 +130,7 @@ def drives_table(results: list[DriveResult]) -> Table:
         f'{np.median(errors_m):.4f} m, worst {max(errors_m):.4f} m; times: means'
     )
     return table
+
+
+if __name__ == '__main__':
+    run_command(benchmark_slam)

@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 
 from segfloor_ros import __version__
+from segfloor_ros.benchmark.chain import MeasuredStages
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor
+from segfloor_ros.benchmark.corridor_images import CorridorImages
+from segfloor_ros.benchmark.figures import Workload
+from segfloor_ros.benchmark.processes import Progress, run_apart
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.evaluation.benchmark_apart import Progress, run_apart
-from segfloor_ros.evaluation.benchmark_chain import ImageChain, MapChain
-from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT, Corridor
-from segfloor_ros.evaluation.benchmark_figures import Workload
-from segfloor_ros.evaluation.benchmark_images import CorridorImages
-from segfloor_ros.evaluation.benchmark_reference import ReferenceWorkload
 
 IMAGES = 'images'
 JSON_VERSION = 1
@@ -70,14 +69,11 @@ def measure_images(
 ) -> Workload:
     """Measure all stages on generated stereo images."""
     cv2.setNumThreads(plan.threads)
-    reference = ReferenceWorkload()
-    reference.time()
-    chain = ImageChain(CAMERA, configuration, MOUNT)
+    stages = MeasuredStages(CAMERA, configuration, MOUNT)
     for frame in CorridorImages(plan.frames, plan.seed).drive():
-        chain.process(frame)
-        on_progress(chain.frames)
-    reference.time()
-    return chain.workload(IMAGES, chain.frames, chain.tracked, reference.median_ms)
+        stages.process(frame)
+        on_progress(stages.frames)
+    return stages.workload(IMAGES)
 
 
 def measure_map(
@@ -85,15 +81,11 @@ def measure_map(
 ) -> Workload:
     """Measure labelling and grid on a number of generated keyframes."""
     cv2.setNumThreads(plan.threads)
-    reference = ReferenceWorkload()
-    reference.time()
-    corridor = Corridor(keyframes, plan.seed)
-    chain = MapChain(configuration)
-    for done, keyframe in enumerate(corridor.drive(), start=1):
-        chain.update(keyframe)
+    stages = MeasuredStages(CAMERA, configuration, MOUNT)
+    for done, keyframe in enumerate(Corridor(keyframes, plan.seed).drive(), start=1):
+        stages.update_map(keyframe)
         on_progress(done)
-    reference.time()
-    return chain.workload(f'{keyframes} keyframes', keyframes, keyframes, reference.median_ms)
+    return stages.workload(f'{keyframes} keyframes')
 
 
 def as_document(plan: BenchmarkPlan, workloads: list[Workload]) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.benchmark.corridor import CAMERA, CEILING_M, HALF_WIDTH_M, MOUNT
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.evaluation.benchmark_corridor import CAMERA, CEILING_M, HALF_WIDTH_M, MOUNT
 from segfloor_ros.geometry import Array, make_transform
 
 STEP_M = 0.05

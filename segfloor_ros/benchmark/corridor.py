@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.evaluation.benchmark_chain import MapInput
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
 from segfloor_ros.geometry import Array, invert, make_transform, transform_points
+from segfloor_ros.pipeline import MapInput
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 HALF_WIDTH_M = 1.5

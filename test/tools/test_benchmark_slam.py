@@ -1,4 +1,4 @@
-"""`segfloor benchmark-slam`: recordings with a known path, and scenes rendered once per seed."""
+"""`tools.benchmark_slam`: recordings with a known path, and scenes rendered once per seed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from rich.console import Console
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
@@ -14,19 +15,21 @@ from typer.testing import CliRunner
 
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.benchmark_slam import drives_table, soak_table
-from segfloor_ros.cli.main import app
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.benchmark_slam import measure_drive
-from segfloor_ros.evaluation.endless_drive import write_endless_drive
-from segfloor_ros.evaluation.soak import Soak
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import invert
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.simulation.renderer import RenderingError
+from tools.benchmark_slam import benchmark_slam, drives_table, soak_table
+from tools.endless_drive import write_endless_drive
+from tools.slam_drives import measure_drive
+from tools.soak import Soak
 
 FRAMES = 12
+
+app = typer.Typer()
+app.command()(benchmark_slam)
 
 
 @pytest.fixture(scope='module')
@@ -59,7 +62,7 @@ def test_a_drive_is_scored_against_its_true_path(drive) -> None:
 def test_a_recording_without_its_true_path_is_refused(drive, tmp_path) -> None:
     with pytest.raises(InputError, match=r'poses\.txt'):
         measure_drive('room', tmp_path, Configuration(), lambda done: None)
-    result = CliRunner().invoke(app, ['benchmark-slam', 'corridr1'])
+    result = CliRunner().invoke(app, ['corridr1'])
     assert isinstance(result.exception, InputError)
     assert 'corridor1' in str(result.exception)
 
@@ -70,13 +73,13 @@ def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
         'like: corridor2\ncamera: {width: 320, height: 240}\n'
         'path: {waypoints: [[0.1, 0.0], [0.5, 0.0]]}\n'
     )
-    arguments = ['benchmark-slam', str(scene), '--seeds', '2', '--workdir', str(tmp_path / 'work')]
+    arguments = [str(scene), '--seeds', '2', '--workdir', str(tmp_path / 'work')]
     result = CliRunner().invoke(app, arguments)
     if isinstance(result.exception, RenderingError):
         pytest.skip(str(result.exception))
     assert result.exit_code == 0, result.output
     assert re.findall(r'short-\d', result.output) == ['short-1', 'short-2']
-    recordings = [tmp_path / 'work' / f'short-{seed}' / 'recording' for seed in (1, 2)]
+    recordings = [tmp_path / 'work' / f'short-{seed}' for seed in (1, 2)]
     images = [(folder / 'image_0' / '000000.png').read_bytes() for folder in recordings]
     assert images[0] != images[1]
     rendered = (recordings[0] / 'poses.txt').stat().st_mtime_ns

@@ -1,4 +1,4 @@
-"""`segfloor benchmark-nodes`: its drive to and fro, its sums by hand, the command for real."""
+"""`tools.benchmark_nodes`: its drive to and fro, the command for real."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.endless_drive import write_endless_drive
+from tools.endless_drive import write_endless_drive
 
 pytest.importorskip('rclpy')
 
-from segfloor_ros.cli import replay_idle
-from segfloor_ros.cli.benchmark_nodes import figure_rows, idle_table
-from segfloor_ros.cli.replay_figures import NodeFigures
 from segfloor_ros.messages.topics import NODES
+from tools import idle_nodes
+from tools.benchmark_nodes import idle_table
 
 
 def open_recording(folder):
@@ -47,35 +46,9 @@ def test_a_single_frame_is_no_drive(tmp_path) -> None:
         write_endless_drive(source, tmp_path / 'endless', 1.0)
 
 
-def test_the_figures_are_of_the_quarters_after_the_first() -> None:
-    figures = NodeFigures(
-        frames_sent=20,
-        frames_processed=18,
-        frames_skipped=2,
-        keyframes=8,
-        mapped=7,
-        wall_s=2.0,
-        latency_s=np.array([9.0, 9.0, 0.1, 0.3, 0.2, 0.2, 0.4, 0.6]),
-        steps_s={'a': np.array([0.3, 0.1, 0.2])},
-        cpu_share={'a': 0.5},
-        memory_mb=np.array([[0, 90.0], [5, 100.0], [10, 101.0], [20, 102.0]]),
-        shutdown_s=0.5,
-    )
-    rows = dict(figure_rows(figures))
-    assert rows['frames sent, processed'] == '20, 18'
-    assert rows['keyframes, in the map'] == '8, 7'
-    assert rows['frames per second'] == '9.0'
-    assert rows['image to map, median and p95'] == '350 ms, 9000 ms'
-    assert rows['image to map, 2nd and last quarter'] == '200 ms, 500 ms'
-    assert rows['until a had done, median and p95'] == '200, 290 ms'
-    assert rows['frames skipped to stay up to date'] == '2'
-    assert rows['a: CPU'] == '50 % of a core'
-    assert rows['a: memory, 2nd and last quarter'] == '100.0 MB, 102.0 MB'
-
-
 def test_a_soak_loses_nothing(tmp_path) -> None:
     drive = write_kitti(tmp_path / 'drive', room_drive(5, step_m=0.04)[0])
-    command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'benchmark-nodes', str(drive),
+    command = [sys.executable, '-m', 'tools.benchmark_nodes', str(drive),
                '--rate', '10', '--soak-minutes', '0.03']  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -85,22 +58,22 @@ def test_a_soak_loses_nothing(tmp_path) -> None:
 
 
 def test_what_nodes_cost_that_do_nothing_is_told(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(replay_idle, 'SETTLE_S', 0.5)
-    monkeypatch.setattr(replay_idle, 'ALL_IDLE_S', 0.1)
+    monkeypatch.setattr(idle_nodes, 'SETTLE_S', 0.5)
+    monkeypatch.setattr(idle_nodes, 'ALL_IDLE_S', 0.1)
     frames, _ = room_drive(2)
     source = open_recording(write_kitti(tmp_path / 'drive', frames))
     stands = write_endless_drive(source, tmp_path / 'stands', 20.0, stands=True)
     configuration = resolve(None, ('stereo_slam.num_features=700',),
                             stereo_camera={'input': str(stands)})  # fmt: skip
     monkeypatch.setenv('ROS_DOMAIN_ID', '')
-    shares = replay_idle.measure_idle(configuration, 2.0)
-    assert tuple(shares) == replay_idle.PHASES
+    shares = idle_nodes.measure_idle(configuration, 2.0)
+    assert tuple(shares) == idle_nodes.PHASES
     assert all(set(by_node) == set(NODES) for by_node in shares.values())
     waiting, standing = shares['no images'], shares['camera stands']
     assert 0 < waiting['stereo_slam'] < standing['stereo_slam'] < 4
     table = idle_table(shares)
     assert table.row_count == len(NODES)
-    assert [column.header for column in table.columns] == ['node', *replay_idle.PHASES]
+    assert [column.header for column in table.columns] == ['node', *idle_nodes.PHASES]
 
 
 def test_a_camera_that_stands_sends_its_first_frame(tmp_path) -> None:

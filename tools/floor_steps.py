@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,17 +11,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT
+from segfloor_ros.benchmark.corridor_images import STEP_M, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.benchmark import Announce
-from segfloor_ros.evaluation.benchmark_corridor import CAMERA, MOUNT
-from segfloor_ros.evaluation.benchmark_images import STEP_M, CorridorImages
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
 from segfloor_ros.geometry import Array
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
+from tools.driving import drive, open_recording
 
 WHOLE, WITHOUT_DISPARITY = 'all', 'all but disparity'
 WARM_UP = 2
@@ -64,21 +64,17 @@ def keyframes_of(
     recording: str, configuration: Configuration, announce: Announce
 ) -> tuple[StereoCamera, Iterator[FloorInput]]:
     """Return the camera of a recording, and its keyframes as SLAM makes them."""
-    settings = dataclasses.replace(configuration.stereo_camera, input=recording)
-    source = open_source(settings)
+    source = open_recording(recording, configuration)
 
-    def drive() -> Iterator[FloorInput]:
+    def keyframes() -> Iterator[FloorInput]:
         report = announce(f'segmenting {recording}', source.frame_count or 0)
-        slam = make_slam(source.camera, configuration.stereo_slam)
-        for done, frame in enumerate(source.frames(), start=1):
-            for result in slam.process(frame):
-                if result.keyframe is not None and slam.mount is not None:
-                    key = result.keyframe
+        with contextlib.closing(make_slam(source.camera, configuration.stereo_slam)) as slam:
+            for step in drive(slam, source.frames(), report):
+                for key in (r.keyframe for r in step.results if r.keyframe is not None):
+                    assert slam.mount is not None
                     yield FloorInput(key.left, key.right, slam.mount, key.T_map_base)
-            report(done)
-        slam.close()
 
-    return source.camera, drive()
+    return source.camera, keyframes()
 
 
 def generated_keyframes(frames: int, seed: int) -> tuple[StereoCamera, Iterator[FloorInput]]:

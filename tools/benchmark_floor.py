@@ -1,10 +1,11 @@
-"""`segfloor benchmark-floor`: the share of each step of floor segmentation, and what the choices of
-the disparity bring.
+"""The share of each step of floor segmentation, what the choices of the disparity bring, and masks
+of simulated drives against the truth: `python -m tools.benchmark_floor`.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -12,25 +13,25 @@ import cv2
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli.benchmark import announcing
+from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.options import ParamsOption, SetOption
-from segfloor_ros.cli.output import console
+from segfloor_ros.cli.output import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.benchmark_disparity import (
+from segfloor_ros.simulation.any_scene import open_scene
+from tools.disparity_choices import (
     DisparityScore,
     choices,
     read_pairs,
     score,
 )
-from segfloor_ros.evaluation.benchmark_floor import (
+from tools.floor_masks import SCENES, SceneScore, mount_of, render_floor, score_recording
+from tools.floor_steps import (
     WITHOUT_DISPARITY,
     FloorTimes,
     generated_keyframes,
     keyframes_of,
     time_steps,
 )
-from segfloor_ros.evaluation.benchmark_floor_scenes import SCENES, SceneScore, score_scene
-from segfloor_ros.simulation.any_scene import open_scene
 
 
 def benchmark_floor(
@@ -51,6 +52,10 @@ def benchmark_floor(
         Optional[str],  # noqa: UP045
         typer.Option(help='Scenes to simulate and score, with commas; all: those made for floor.'),
     ] = None,
+    workdir: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help='Keep renderings here; what is there is used again.'),
+    ] = None,
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
@@ -61,11 +66,11 @@ def benchmark_floor(
     if simulated is not None:
         names = SCENES if simulated == 'all' else simulated.split(',')
         scenes = {name: open_scene(name) for name in names}
-        with announcing() as announce:
-            found = [
-                score_scene(name, scene, configuration, announce(f'driving {name}', 0))
-                for name, scene in scenes.items()
-            ]
+        with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary, announcing() as announce:
+            found = []
+            for name, scene in scenes.items():
+                recording = render_floor(name, scene, workdir or Path(temporary), announce)
+                found.append(score_recording(name, recording, mount_of(scene), configuration))
         console.print(scenes_table(found))
         return
     pairs = read_pairs(middlebury) if middlebury is not None else []
@@ -91,10 +96,7 @@ def benchmark_floor(
 def scenes_table(scores: list[SceneScore]) -> Table:
     """Return a row for each scene."""
     names = ('precision %', 'recall %', 'low as floor %', 'sill as floor %')
-    table = Table('scene', 'masks', *names, padding=0)
-    table.columns[0].no_wrap = True
-    for column in table.columns[1:]:
-        column.justify = 'right'
+    table = figure_table('scene', 'masks', *names)
     for one in scores:
         shares = (one.precision, one.recall, one.low_called_floor, one.sill_called_floor)
         cells = ('-' if math.isnan(share) else f'{100 * share:.1f}' for share in shares)
@@ -108,9 +110,8 @@ def scenes_table(scores: list[SceneScore]) -> Table:
 
 def steps_table(times: FloorTimes) -> Table:
     """Return a row for each step: its time per keyframe and its share."""
-    table = Table('step', 'median ms', 'p95 ms', 'share %', title=times.name)
-    for column in table.columns[1:]:
-        column.justify = 'right'
+    table = figure_table('step', 'median ms', 'p95 ms', 'share %')
+    table.title = times.name
     for name, step in times.steps.items():
         if name == WITHOUT_DISPARITY:
             table.add_section()
@@ -123,9 +124,7 @@ def steps_table(times: FloorTimes) -> Table:
 def disparity_table(scores: list[DisparityScore]) -> Table:
     """Return a row for each choice and pair."""
     names = ('bad-0.5', 'bad-1.0', 'bad-2.0', 'wrong', 'matched', 'median ms')
-    table = Table('disparity', 'pair', *names)
-    for column in table.columns[2:]:
-        column.justify = 'right'
+    table = figure_table('disparity', 'pair', *names)
     for one in scores:
         shares = (one.bad_half, one.bad_1, one.bad_2, one.wrong_2, one.matched)
         table.add_row(
@@ -136,3 +135,7 @@ def disparity_table(scores: list[DisparityScore]) -> Table:
         'wrong: off by more than 2 px, in % of those matched'
     )
     return table
+
+
+if __name__ == '__main__':
+    run_command(benchmark_floor)

@@ -20,6 +20,7 @@ from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
+from rich.table import Table
 from std_srvs.srv import SetBool
 
 from segfloor_ros.cli.replay_graph import isolated_environment
@@ -27,10 +28,10 @@ from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.cli.replay_session import ProgressListener, ReplayGraph
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.memory import rss_mb
 from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, TOPICS
+from segfloor_ros.resident_memory import rss_mb
 
 MEMORY_PERIOD_S = 2.0
 TICKS_PER_S = os.sysconf('SC_CLK_TCK')
@@ -196,3 +197,45 @@ def cpu_s(processes: NodeProcesses) -> dict[str, float]:
         fields = Path(f'/proc/{process_id}/stat').read_text().rpartition(')')[2].split()
         used[node] = (int(fields[11]) + int(fields[12])) / TICKS_PER_S
     return used
+
+
+def figures_table(figures: NodeFigures) -> Table:
+    """Return the figures as a table; of a course, its second and its last quarter."""
+    table = Table('figure', 'value')
+    for name, value in figure_rows(figures):
+        table.add_row(name, value)
+    return table
+
+
+def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
+    """Return names and values of the figures, with units."""
+    latency_ms = 1e3 * figures.latency_s
+    rows = [
+        ('frames sent, processed', f'{figures.frames_sent}, {figures.frames_processed}'),
+        ('frames skipped to stay up to date', f'{figures.frames_skipped}'),
+        ('keyframes, in the map', f'{figures.keyframes}, {figures.mapped}'),
+        ('frames per second', f'{figures.frames_processed / figures.wall_s:.1f}'),
+        ('interrupt to all ended', f'{figures.shutdown_s:.2f} s'),
+    ]
+    if len(latency_ms):
+        middle, high = np.percentile(latency_ms, (50, 95))
+        rows.append(('image to map, median and p95', f'{middle:.0f} ms, {high:.0f} ms'))
+        early, late = (np.median(part) for part in _second_and_last_quarter(latency_ms))
+        rows.append(('image to map, 2nd and last quarter', f'{early:.0f} ms, {late:.0f} ms'))
+    for node, duration_s in figures.steps_s.items():
+        if len(duration_s):
+            middle, high = 1e3 * np.percentile(duration_s, (50, 95))
+            rows.append((f'until {node} had done, median and p95', f'{middle:.0f}, {high:.0f} ms'))
+    for column, (node, share) in enumerate(figures.cpu_share.items(), 1):
+        rows.append((f'{node}: CPU', f'{100 * share:.0f} % of a core'))
+        if len(figures.memory_mb):
+            parts = _second_and_last_quarter(figures.memory_mb[:, column])
+            early, late = (np.median(part) for part in parts)
+            rows.append((f'{node}: memory, 2nd and last quarter', f'{early:.1f} MB, {late:.1f} MB'))
+    return rows
+
+
+def _second_and_last_quarter(course: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two parts of a course (N,) to compare; in the first quarter caches fill."""
+    quarter = max(len(course) // 4, 1)
+    return course[quarter : 2 * quarter] if len(course) > 1 else course, course[-quarter:]

@@ -6,7 +6,7 @@ import time
 
 from std_srvs.srv import SetBool
 
-from segfloor_ros.cli.replay_figures import FigureGraph, connected_nodes, cpu_s
+from segfloor_ros.cli.replay_measured import FigureGraph, connected_nodes, cpu_s
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.messages.diagnostics import NEED_LASTS_S
 from segfloor_ros.messages.topics import CAMERA, GRID

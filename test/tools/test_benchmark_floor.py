@@ -1,34 +1,37 @@
-"""`segfloor benchmark-floor`: shares of the steps; disparities scored by hand."""
+"""`tools.benchmark_floor`: shares of the steps; disparities scored by hand."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
+import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from segfloor_ros.cli.benchmark_floor import disparity_table, steps_table
-from segfloor_ros.cli.main import app
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.evaluation.benchmark_disparity import (
+from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from tools.benchmark_floor import benchmark_floor, disparity_table, steps_table
+from tools.disparity_choices import (
     TruePair,
     choices,
     read_pairs,
     score,
     visible,
 )
-from segfloor_ros.evaluation.benchmark_floor import (
+from tools.floor_steps import (
     WHOLE,
     WITHOUT_DISPARITY,
     generated_keyframes,
     time_steps,
 )
-from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 SHIFT_PX = 16
+
+app = typer.Typer()
+app.command()(benchmark_floor)
 
 
 def shifted_pair(name: str = 'shifted') -> TruePair:
@@ -116,7 +119,7 @@ def test_pairs_are_read_from_files(tmp_path):
     assert np.array_equal(read.disparity_px, pair.disparity_px)
     assert np.array_equal(read.counted, pair.counted)
     (folder / 'im6.png').unlink()
-    result = CliRunner().invoke(app, ['benchmark-floor', '--middlebury', str(tmp_path)])
+    result = CliRunner().invoke(app, ['--middlebury', str(tmp_path)])
     assert isinstance(result.exception, InputError)
     assert 'im6.png' in str(result.exception)
 

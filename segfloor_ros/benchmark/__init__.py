@@ -1,0 +1,1 @@
+"""What the stages cost here: `segfloor benchmark`, on generated data."""

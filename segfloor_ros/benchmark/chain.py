@@ -1,0 +1,95 @@
+"""The stages one after the other on one thread, with a map at every keyframe: so the published
+figures were measured, and so no stage waits for another one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from segfloor_ros.benchmark.figures import UpdateTimes, Workload
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
+from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.pipeline import KeyframeStages, MapInput
+from segfloor_ros.resident_memory import MemoryLog
+from segfloor_ros.slam.results import FrameResult, Keyframe
+from segfloor_ros.stages import make_slam
+
+MAP = 'map'
+"""The stage of drawing the whole map, which the pipeline does once, at the end."""
+
+
+class MeasuredStages:
+    """All stages, timed. mount: where the camera sits, None where the settings say or it is to be
+    measured.
+    """
+
+    def __init__(
+        self, camera: StereoCamera, configuration: Configuration, mount: Mount | None = None
+    ) -> None:
+        self.times = UpdateTimes()
+        self.grid: OccupancyGrid | None = None
+        self.frames = 0
+        self.tracked = 0
+        self.points = 0
+        self._slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
+        self._stages = KeyframeStages(camera, configuration, self.times)
+        self._reference = ReferenceWorkload()
+        self._reference.time()
+        self._memory = MemoryLog()
+
+    def process(self, frame: StereoFrame) -> list[FrameResult]:
+        """Take in the next frame; returns the tracking results that are ready, oldest first."""
+        self.frames += 1
+        results = self._slam.process(frame)
+        for result in results:
+            self.tracked += result.tracked
+            if result.keyframe is not None:
+                self._take_keyframe(result.keyframe)
+        return results
+
+    def close(self) -> None:
+        """End what runs beside."""
+        self._slam.close()
+
+    def update_map(self, keyframe: MapInput) -> None:
+        """Take in one keyframe whose floor is segmented, and draw the map."""
+        self._stages.update_map(keyframe)
+        self._end_update(len(keyframe.cloud.point_id))
+
+    def workload(self, name: str) -> Workload:
+        """Return the figures under a name."""
+        self._reference.time()
+        reference_ms = self._reference.median_ms
+        stages: dict[str, dict[str, Any]] = self.times.summary()
+        for figures in stages.values():
+            figures['p50_ratio'] = round(figures['p50_ms'] / reference_ms, 4)
+        updates = self._stages.map_updates
+        items = self.frames or updates
+        return Workload(
+            name=name,
+            items=items,
+            tracked=self.tracked if self.frames else updates,
+            map_updates=updates,
+            points=self.points,
+            cells=0 if self.grid is None else self.grid.cells.size,
+            stages=stages,
+            update_s=self.times.per_update(),
+            items_per_s=round(items / self.times.total_s, 2) if self.times.total_s else 0.0,
+            memory_mb=self._memory.summary(),
+            reference_ms=round(reference_ms, 3),
+        )
+
+    def _take_keyframe(self, keyframe: Keyframe) -> None:
+        assert self._slam.mount is not None
+        self._stages.process(keyframe, self._slam.mount)
+        self._end_update(len(keyframe.cloud.point_id))
+
+    def _end_update(self, points: int) -> None:
+        # The grid folds new evidence in when the map is asked for.
+        with self.times.measure(MAP):
+            self.grid = self._stages.grid()
+        self.points = points
+        self.times.end_update()
+        self._memory.sample()

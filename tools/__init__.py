@@ -1,0 +1,1 @@
+"""What developers measure with; the package does not need it."""
