@@ -103,6 +103,9 @@ def _record_into(
                 sink.add(frame)
             if options.floor_every and frame.index % options.floor_every == 0:
                 _write_frame_truth(folder, simulation, frame.index, options)
+            if simulation.scene.movers:
+                moving = simulation.moving_mask(frame.index)
+                _write_png(folder / 'moving' / f'{frame.index:06d}.png', moving)
             poses.append(frame.T_world_left)
             on_frame(frame.index + 1)
     _write_poses(folder / 'poses.txt', np.array(poses))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.geometry import Array, quaternion_xyzw
-from segfloor_ros.simulation.people import part_poses
+from segfloor_ros.simulation.movers import is_moving, part_poses
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.world import RIG, World, people_bodies
+from segfloor_ros.simulation.world import RIG, World, mover_bodies
 
 GREY_OF_RGB = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -22,15 +23,16 @@ class RenderingError(SegfloorError):
 
 
 class WorldRenderer:
-    """A world in MuJoCo in which the stereo rig and people can be moved."""
+    """A world in MuJoCo in which the stereo rig and what moves can be placed."""
 
     def __init__(self, scene: Scene, world: World):
         self._mujoco = _import_mujoco()
         self._scene = scene
         self._model = self._mujoco.MjModel.from_xml_string(world.xml, world.files)
         self._data = self._mujoco.MjData(self._model)
+        self._movers = mover_bodies(scene)
         self._mocap = {
-            name: int(self._model.body(name).mocapid[0]) for name in [RIG, *people_bodies(scene)]
+            name: int(self._model.body(name).mocapid[0]) for name in [RIG, *chain(*self._movers)]
         }
         self._floor_ids = [self._model.geom(name).id for name in world.floor_geoms]
 
@@ -39,15 +41,23 @@ class WorldRenderer:
         return View(self._mujoco, self._model, self._data, self._floor_ids, width, height, focal_px)
 
     def move(self, T_world_left: Array, time_s: float) -> None:
-        """Put the rig at a pose of the left optical frame, and people where they are at a time."""
+        """Put the rig at a pose of the left optical frame, and what moves where it is at a time."""
         self._place(RIG, T_world_left[:3, 3], quaternion_xyzw(T_world_left[:3, :3]))
-        poses = [part_poses(person, time_s) for person in self._scene.people]
-        for name, (x, y, yaw) in zip(
-            people_bodies(self._scene), np.concatenate([np.zeros((0, 3)), *poses]), strict=True
-        ):
-            turn = np.array([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
-            self._place(name, np.array([x, y, 0.0]), turn)
+        for mover, names in zip(self._scene.movers, self._movers, strict=True):
+            for name, T_world_part in zip(names, part_poses(mover, time_s), strict=True):
+                self._place(name, T_world_part[:3, 3], quaternion_xyzw(T_world_part[:3, :3]))
         self._mujoco.mj_forward(self._model, self._data)
+
+    def moving_geoms(self, time_s: float) -> list[int]:
+        """Return the geoms of all that moves at a time."""
+        moving = [
+            name
+            for mover, names in zip(self._scene.movers, self._movers, strict=True)
+            for name in names
+            if is_moving(mover, time_s)
+        ]
+        bodies = [self._model.body(name).id for name in moving]
+        return [int(g) for g in np.flatnonzero(np.isin(self._model.geom_bodyid, bodies))]
 
     def _place(self, name: str, position: Array, quat_xyzw: Array) -> None:
         index = self._mocap[name]
@@ -92,11 +102,15 @@ class View:
 
     def floor_mask(self, camera: str) -> NDArray[np.uint8]:
         """Return the mask (H, W) uint8: 255 where the camera sees floor, 0 elsewhere."""
+        return self.mask(camera, self._floor_ids)
+
+    def mask(self, camera: str, geoms: list[int]) -> NDArray[np.uint8]:
+        """Return the mask (H, W) uint8: 255 where the camera sees one of the geoms, 0 elsewhere."""
         self._renderer.enable_segmentation_rendering()
         ids = self._render(camera)
         self._renderer.disable_segmentation_rendering()
-        is_floor = (ids[..., 1] == self._geom_type) & np.isin(ids[..., 0], self._floor_ids)
-        return np.where(is_floor, 255, 0).astype(np.uint8)
+        seen = (ids[..., 1] == self._geom_type) & np.isin(ids[..., 0], geoms)
+        return np.where(seen, 255, 0).astype(np.uint8)
 
     def _render(self, camera: str) -> NDArray[Any]:
         self._model.cam_fovy[:] = self._fov_y_deg

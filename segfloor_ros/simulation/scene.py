@@ -82,12 +82,28 @@ class FloorPatch:
 
 @dataclass(frozen=True)
 class Person:
-    """Someone who walks to and fro along `points`, from `start_s` on."""
+    """Someone who stands at the first of `points` and from `start_s` on walks along them, to and
+    fro or, without `returns`, to the last one and stays.
+    """
 
     points: tuple[Point, ...]
     speed_m_s: float = 0.8
     start_s: float = 0.0
+    returns: bool = True
     height_m: float = 1.75
+    texture: str = 'cloth'
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car of `size` (length, width, height) that drives as a `Person` walks."""
+
+    points: tuple[Point, ...]
+    speed_m_s: float = 8.0
+    start_s: float = 0.0
+    returns: bool = False
+    size: Point3 = (4.2, 1.8, 1.5)
+    texture: str = 'goods'
 
 
 @dataclass(frozen=True)
@@ -244,6 +260,7 @@ class Scene:
     slopes: tuple[Slope, ...] = ()
     floor_patches: tuple[FloorPatch, ...] = ()
     people: tuple[Person, ...] = ()
+    cars: tuple[Car, ...] = ()
     lighting: Lighting = field(default_factory=Lighting)
     camera: CameraRig = field(default_factory=CameraRig)
     sensors: Sensors = field(default_factory=Sensors)
@@ -251,3 +268,8 @@ class Scene:
     raster_phase: float = 0.5
     robot_height_m: float = 1.0
     step_height_m: float = 0.03
+
+    @property
+    def movers(self) -> tuple[Person | Car, ...]:
+        """Everything that moves; it is not part of the true map."""
+        return (*self.people, *self.cars)

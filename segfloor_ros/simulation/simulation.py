@@ -139,6 +139,12 @@ class Simulation:
         time_s = float(self.drive.times_s[index])
         return depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
 
+    def moving_mask(self, index: int) -> NDArray[np.uint8]:
+        """Render what moves in one frame's rectified left image: (H, W) uint8, 255 moving."""
+        time_s = float(self.drive.times_s[index])
+        self._renderer.move(self.motion.T_world_left(time_s), time_s)
+        return self._truth.mask(CAMERAS[0], self._renderer.moving_geoms(time_s))
+
     def _exposed(self, time_s: float) -> list[Picture]:
         """Return the ideal left and right pictures, averaged over the exposure around a time."""
         exposure_s = self.scene.camera.exposure_s

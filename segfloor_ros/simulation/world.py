@@ -1,4 +1,4 @@
-"""A scene as a MuJoCo model: textured meshes, floor, lights, a movable stereo rig and people."""
+"""A scene as a MuJoCo model: textured meshes, floor, lights, the stereo rig, movers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.mesh import Mesh, caps, merge, sides
-from segfloor_ros.simulation.people import PARTS, part_solids
+from segfloor_ros.simulation.movers import part_solids
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.solids import Prism, floors, obstacles
 from segfloor_ros.simulation.textures import Texture, make_texture
@@ -95,13 +95,16 @@ def build_world(scene: Scene, width: int, height: int) -> World:
     builder.bodies += builder.solids(obstacles(scene), 'solid')
     if scene.slopes or scene.floor_patches:
         builder.bodies += builder.solids(floors(scene), 'slope')
-    _add_people(builder)
+    _add_movers(builder)
     return World(_document(builder, width, height), builder.files, tuple(builder.floor_geoms))
 
 
-def people_bodies(scene: Scene) -> list[str]:
-    """Return the names of the movable bodies of all people, `PARTS` of each in turn."""
-    return [f'person_{i}_{part}' for i in range(len(scene.people)) for part in PARTS]
+def mover_bodies(scene: Scene) -> list[list[str]]:
+    """Return the names of the movable bodies of each mover, one per part."""
+    return [
+        [f'mover_{i}_{part}' for part in range(len(part_solids(mover)))]
+        for i, mover in enumerate(scene.movers)
+    ]
 
 
 def _add_ground(builder: WorldBuilder) -> None:
@@ -129,12 +132,10 @@ def _add_plane(
     )
 
 
-def _add_people(builder: WorldBuilder) -> None:
-    names = iter(people_bodies(builder.scene))
-    for person in builder.scene.people:
-        for part in PARTS:
-            name = next(names)
-            geoms = ''.join(builder.solids(part_solids(person, part), name))
+def _add_movers(builder: WorldBuilder) -> None:
+    for mover, names in zip(builder.scene.movers, mover_bodies(builder.scene), strict=True):
+        for name, prisms in zip(names, part_solids(mover), strict=True):
+            geoms = ''.join(builder.solids(prisms, name))
             builder.bodies.append(f'<body name="{name}" mocap="true">{geoms}</body>')
 
 

@@ -141,6 +141,22 @@ def test_person_moves_through_the_picture():
             assert columns.mean() == pytest.approx(79.5 - 80 * np.tan(bearing), abs=8)
             # Its feet stand on the floor, and are not floor.
             assert (walk.truth(index).floor[nearer] == 0).all()
+            moving = walk.moving_mask(index) == 255
+            assert moving[nearer].all() and moving.sum() < 1.2 * nearer.sum()
+
+
+def test_a_mover_is_not_in_the_true_map_and_its_mask_is_written_for_every_frame(tmp_path):
+    people = [{'points': [[2.0, -0.8], [2.0, 0.8]], 'start_s': 1.0}]
+    cars = [{'points': [[1.5, 0.0], [3.0, 0.0]], 'size': [0.4, 0.3, 0.3], 'speed_m_s': 0.2}]
+    with simulate(people=people, cars=cars) as moving, simulate() as empty:
+        np.testing.assert_array_equal(moving.true_map.cells, empty.true_map.cells)
+        record(moving, tmp_path / 'drive', RecordingOptions(floor_every=0))
+        frames = moving.frame_count
+    files = sorted((tmp_path / 'drive' / 'moving').iterdir())
+    assert [file.name for file in files] == [f'{i:06d}.png' for i in range(frames)]
+    share = [(cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == 255).mean() for file in files]
+    # The car from the start, the person beside it once it walks.
+    assert 0 < share[0] < share[-1] < 0.5
 
 
 def test_recording_has_the_layout_of_a_kitti_folder_with_truth(room, tmp_path):

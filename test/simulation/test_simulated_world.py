@@ -11,7 +11,7 @@ from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.floor_plan import merged_rectangles
 from segfloor_ros.simulation.mesh import caps, merge, sides
-from segfloor_ros.simulation.people import part_poses
+from segfloor_ros.simulation.movers import is_moving, part_poses
 from segfloor_ros.simulation.scene import Person, Scene
 from segfloor_ros.simulation.scene_file import load_scene, scene_from_mapping, shipped_scenes
 from segfloor_ros.simulation.solids import block, cylinder, floors, obstacles
@@ -249,9 +249,26 @@ def test_tour_keeps_clear_of_walls_and_comes_back():
 
 def test_people_walk_to_and_fro():
     person = Person(points=((0.0, 0.0), (2.0, 0.0), (2.0, 1.0)), speed_m_s=0.5, start_s=1.0)
-    at = {t: part_poses(person, t)[0] for t in (0.0, 3.0, 6.0, 8.0, 12.0)}
-    np.testing.assert_allclose(at[0.0], [0, 0, 0])
-    np.testing.assert_allclose(at[3.0], [1, 0, 0])
-    np.testing.assert_allclose(at[6.0], [2, 0.5, np.pi / 2])
-    np.testing.assert_allclose(at[8.0], [2, 0.5, -np.pi / 2])
-    np.testing.assert_allclose(np.abs(at[12.0]), [0.5, 0, np.pi], atol=1e-9)
+    expected = {0: (0, 0, 0), 3: (1, 0, 0), 6: (2, 0.5, 90), 8: (2, 0.5, -90), 12: (0.5, 0, 180)}
+    for time_s, (x, y, yaw_deg) in expected.items():
+        T_world_torso = part_poses(person, time_s)[0]
+        np.testing.assert_allclose(T_world_torso[:2, 3], (x, y), atol=1e-9)
+        forward = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+        np.testing.assert_allclose(T_world_torso[:2, 0], forward, atol=1e-9)
+
+
+def test_people_without_return_stay_at_the_end_and_move_only_on_their_way():
+    person = Person(points=((0.0, 0.0), (1.0, 0.0)), speed_m_s=0.5, start_s=4.0, returns=False)
+    np.testing.assert_allclose(part_poses(person, 60.0)[0, :2, 3], (1, 0))
+    assert [is_moving(person, t) for t in (1.0, 4.1, 5.0, 7.0)] == [False, True, True, False]
+
+
+def test_a_foot_of_someone_who_walks_stays_on_the_floor_and_does_not_slide():
+    person = Person(points=((0.0, 0.0), (20.0, 0.0)), speed_m_s=1.0)
+    times = np.arange(3.0, 6.0, 0.02)
+    poses = np.array([part_poses(person, t)[[2, 6]] for t in times])
+    ankles = (poses @ [0, 0, -0.42, 1])[..., :3]
+    np.testing.assert_allclose(ankles[..., 2].min(axis=1), 0.02, atol=0.03)
+    slide = np.diff(ankles[..., 0], axis=0).min(axis=1)
+    # At any time one of them is at rest while the body moves by 2 cm.
+    assert np.median(slide) < 0.005 and slide.max() < 0.02
