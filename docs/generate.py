@@ -14,6 +14,7 @@ from segfloor_ros.messages.topics import (
     FLOOR,
     GRID,
     NODES,
+    PACED_BY,
     SLAM,
     Topic,
     published_by,
@@ -54,7 +55,7 @@ follows every later correction of the keyframes.""",
 
 PAUSE, RESET = ('`~/pause`', '`std_srvs/srv/SetBool`'), ('`~/reset`', '`std_srvs/srv/Trigger`')
 PAUSING = 'Pause (true): receive and process nothing, keep the map. Go on (false).'
-NEW_MAP = 'Drop what is kept of the map and begin anew with the next keyframe.'
+NEW_MAP = 'Drop the map and begin with an empty one at the next keyframe.'
 
 SERVICES = {
     CAMERA: [
@@ -65,8 +66,8 @@ SERVICES = {
         (*PAUSE, PAUSING),
         (
             *RESET,
-            'Begin a new map. The nodes behind it see it by the path of the keyframes and drop '
-            'theirs. The same happens when the stamps of the images go back by more than half a '
+            'Drop the map and begin with an empty one. The nodes behind it learn it from '
+            '`keyframe/map_start` and drop theirs. The same happens when the stamps of the images go back by more than half a '
             'second, as when a recording begins again.',
         ),
     ],
@@ -116,7 +117,7 @@ def page(node: str) -> str:
         PURPOSE[node],
         '## Subscribes to',
         _topics(subscribed_by(node, alternatives=True))
-        or 'Nothing (at rate 0 or lossless: `/diagnostics`).',
+        or f'Nothing (at rate 0 or lossless: {", ".join(f"`{name}`" for name in PACED_BY)}).',
         '## Publishes',
         _topics([*published_by(node, alternatives=True), DIAGNOSTICS]),
         STATUS[node] + ' Once a second `connections` tells the subscribers of each topic, and '

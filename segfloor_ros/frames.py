@@ -45,7 +45,7 @@ class FrameTree:
         old = bisect_left(stamps, stamps[-1] - HISTORY_NS)
         del stamps[:old], transforms[:old]
 
-    def forget_moving(self) -> None:
+    def clear_moving(self) -> None:
         """Keep the fixed transforms alone."""
         self._moving.clear()
 

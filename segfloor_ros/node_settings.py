@@ -20,8 +20,8 @@ class NodeSettings(StageSettings):
     )
     resume_within_s: float = setting(
         30.0,
-        'A node that was killed goes on with what it knew if it is started again within this time; '
-        '0: it begins anew.',
+        'A node that was killed resumes with what it knew if it is started again within this time; '
+        '0: it starts with an empty map.',
         unit='s',
         minimum=0.0,
         maximum=3600.0,

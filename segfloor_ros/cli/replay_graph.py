@@ -7,7 +7,7 @@ import socket
 from collections.abc import Mapping
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, TOPICS, published_by
+from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS, published_by
 
 # DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
 # into the ports that Linux hands out to clients.
@@ -17,9 +17,6 @@ PARTICIPANTS_TRIED = 8
 
 _reservation: socket.socket | None = None
 """Holds the last port of the domain that this process was told."""
-
-STATUS_LISTENERS = 2
-"""The camera, to pace its frames, and the replay itself."""
 
 RECORDED = (
     'odometry',
@@ -61,12 +58,11 @@ def free_domain() -> int:
     raise SegfloorError('every ROS domain id is in use on this machine; set ROS_DOMAIN_ID')
 
 
-def unconnected(
-    counts: Mapping[str, Mapping[str, int]], status_listeners: int = STATUS_LISTENERS
-) -> list[str]:
+def unconnected(counts: Mapping[str, Mapping[str, int]], is_paced: bool = True) -> list[str]:
     """Return what is missing before the first frame can be sent without loss, in words.
 
-    counts: subscribers by node and topic, as each publisher sees them.
+    counts: subscribers by node and topic, as each publisher sees them. is_paced: the camera listens
+    to how far the frames are.
     """
     missing = []
     for node in NODES:
@@ -78,8 +74,8 @@ def unconnected(
             for topic in published_by(node, alternatives=True)
             if not topic.instead_of or topic.name in counts[node]
         }
-        needed = {topic: _listeners_of(topic) for topic in names.values()}
-        needed[DIAGNOSTICS.name] = status_listeners
+        needed = {topic: _listeners_of(topic, is_paced) for topic in names.values()}
+        needed[DIAGNOSTICS.name] = 1  # the replay itself
         missing += [
             f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'
             for topic, number in needed.items()
@@ -88,8 +84,9 @@ def unconnected(
     return missing
 
 
-def _listeners_of(topic: str) -> int:
-    return len(TOPICS[topic].subscribers) + (topic in RECORDED)
+def _listeners_of(topic: str, is_paced: bool) -> int:
+    listeners = len(TOPICS[topic].subscribers) + (topic in RECORDED)
+    return listeners + (is_paced and topic in PACED_BY)
 
 
 def _is_free(port: int) -> bool:

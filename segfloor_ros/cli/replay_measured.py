@@ -134,7 +134,7 @@ def connected_nodes(
             with NodeProcesses(NODES, arguments, environment, Path(folder)) as processes:
                 graph = FigureGraph(FigureRecorder(context, processes), processes)
                 # A camera that keeps to the clock does not listen to the nodes.
-                graph.connect(status_listeners=1 + lossless)
+                graph.connect(is_paced=lossless)
                 yield graph
     finally:
         rclpy.try_shutdown(context=context)

@@ -19,7 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.cli.interrupts import first_interrupt_noted
-from segfloor_ros.cli.replay_graph import STATUS_LISTENERS, isolated_environment, unconnected
+from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
 from segfloor_ros.configuration import Configuration
@@ -196,10 +196,10 @@ class ReplayGraph:
         self._executor = SingleThreadedExecutor(context=recorder.context)
         self._executor.add_node(recorder)
 
-    def connect(self, status_listeners: int = STATUS_LISTENERS) -> float:
+    def connect(self, is_paced: bool = True) -> float:
         """Wait until every topic has its subscribers; returns the seconds it took."""
         start_s = time.monotonic()
-        while missing := unconnected(self.recorder.connections, status_listeners):
+        while missing := unconnected(self.recorder.connections, is_paced):
             if time.monotonic() - start_s > DISCOVERY_S:
                 raise ReplayError(
                     f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '

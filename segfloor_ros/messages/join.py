@@ -47,6 +47,11 @@ class StampJoiner:
         self._done: OrderedDict[int, None] = OrderedDict()
         self._dropped: list[Dropped] = []
 
+    @property
+    def all_parts(self) -> tuple[str, ...]:
+        """All parts, the optional ones last."""
+        return (*self.parts, *(part for part in self._optional if part not in self.parts))
+
     def add(self, part: str, stamp_ns: int, value: Any) -> dict[str, Any] | None:
         """Take in one part; returns the values by part when its set is complete with it."""
         self._note_time(part, stamp_ns)

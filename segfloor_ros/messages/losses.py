@@ -7,7 +7,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 class LossCounter:
     """Counts the gaps in the numbers of one topic. A number that does not grow is that of another
-    publisher, or of one that was started again: counting begins anew.
+    publisher, or of one that was started again: counting starts over.
     """
 
     def __init__(self) -> None:

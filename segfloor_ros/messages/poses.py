@@ -96,14 +96,34 @@ def at_least(covariance: Array, variance: float) -> Array:
 
 def path_message(stamp_ns: int, frame_id: str, path: KeyframePath) -> Path:
     """Return the path of all keyframes; its header carries the stamp of the latest keyframe."""
-    message = Path(header=make_header(stamp_ns, frame_id))
-    message.poses = [
-        PoseStamped(header=make_header(pose_stamp_ns, frame_id), pose=pose)
-        for pose_stamp_ns, pose in zip(
-            path.stamp_ns.tolist(), _pose_messages(path.T_map_base), strict=True
-        )
-    ]
-    return message
+    return PathMessages(frame_id).next(stamp_ns, path)
+
+
+class PathMessages:
+    """Makes the messages of a path that grows. A path of an hour holds thousands of poses, each of
+    six objects; those that have not moved since the last message are used again.
+    """
+
+    def __init__(self, frame_id: str) -> None:
+        self._frame_id = frame_id
+        self._stamp_ns: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._T_map_base: Array = np.zeros((0, 4, 4))
+        self._poses: list[PoseStamped] = []
+
+    def next(self, stamp_ns: int, path: KeyframePath) -> Path:
+        """Return the message of the path as it is now."""
+        count = min(len(self._stamp_ns), len(path.stamp_ns))
+        has_moved = np.ones(len(path.stamp_ns), bool)
+        has_moved[:count] = (self._stamp_ns[:count] != path.stamp_ns[:count]) | (
+            self._T_map_base[:count] != path.T_map_base[:count]
+        ).any(axis=(1, 2))
+        moved = np.flatnonzero(has_moved)
+        self._poses = [*self._poses[:count], *[PoseStamped()] * (len(has_moved) - count)]
+        for i, pose in zip(moved.tolist(), _pose_messages(path.T_map_base[moved]), strict=True):
+            header = make_header(int(path.stamp_ns[i]), self._frame_id)
+            self._poses[i] = PoseStamped(header=header, pose=pose)
+        self._stamp_ns, self._T_map_base = path.stamp_ns.copy(), path.T_map_base.copy()
+        return Path(header=make_header(stamp_ns, self._frame_id), poses=list(self._poses))
 
 
 def path_arrays(message: Path) -> KeyframePath:

@@ -13,7 +13,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan, PointCloud2
+from sensor_msgs.msg import (
+    CameraInfo,
+    CompressedImage,
+    Image,
+    LaserScan,
+    PointCloud2,
+    TimeReference,
+)
+from std_msgs.msg import Header
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.messages import qos
@@ -26,11 +34,17 @@ NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
 OTHERS = ''
 """In place of a publisher: nodes outside of this package."""
 
+MAP_START = 'keyframe/map_start'
+FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
+PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
+"""Topics that a lossless camera listens to: how far frames and keyframes are."""
+
 
 @dataclass(frozen=True)
 class Topic:
     """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
-    it replaces by parameter, where it does.
+    it replaces by parameter, where it does. is_optional: its subscribers do without it where nobody
+    publishes it. also_by: further publishers.
     """
 
     name: str
@@ -40,6 +54,8 @@ class Topic:
     subscribers: tuple[str, ...]
     about: str
     instead_of: str = ''
+    is_optional: bool = False
+    also_by: tuple[str, ...] = ()
 
     @property
     def type_name(self) -> str:
@@ -101,6 +117,14 @@ _ALL = [
         'lost.',
     ),
     Topic(
+        FRAME_DONE,
+        Header,
+        qos.ODOMETRY,
+        SLAM,
+        (),
+        'The header of every frame that SLAM has done with: tracked, skipped or refused.',
+    ),
+    Topic(
         'camera_mount',
         TransformStamped,
         qos.LATCHED,
@@ -116,6 +140,15 @@ _ALL = [
         (FLOOR, CLOUD, GRID),
         'base_link in map at the keyframe.',
     ),
+    Topic(
+        MAP_START,
+        TimeReference,
+        qos.KEYFRAMES,
+        SLAM,
+        (FLOOR, CLOUD, GRID),
+        'The keyframe, and as time_ref when its map began: another time_ref is another map.',
+        is_optional=True,
+    ),
     *_keyframe_images(),
     Topic(
         'keyframe/features',
@@ -130,9 +163,8 @@ _ALL = [
         Path,
         qos.KEYFRAMES,
         SLAM,
-        (FLOOR, CLOUD, GRID),
-        'base_link in map of all keyframes as now optimised; each pose with its own stamp. Where '
-        'earlier keyframes are missing, a new map has begun.',
+        (GRID,),
+        'base_link in map of all keyframes as now optimised; each pose with its own stamp.',
     ),
     Topic(
         'map_points',
@@ -211,6 +243,16 @@ _ALL = [
         'The obstacle points alone: x y z id. Published while someone listens.',
     ),
     Topic(
+        KEYFRAME_DONE,
+        Header,
+        qos.KEYFRAMES,
+        GRID,
+        (),
+        'The header of every keyframe that goes no further: it is in the map, or a node could not '
+        'process it.',
+        also_by=(FLOOR, CLOUD),
+    ),
+    Topic(
         'map',
         OccupancyGrid,
         qos.LATCHED,
@@ -237,7 +279,7 @@ def published_by(node: str, alternatives: bool = False) -> list[Topic]:
     """Return the topics of a node's publishers, without diagnostics; alternatives: also those that
     replace others by parameter.
     """
-    mine = [topic for topic in TOPICS.values() if topic.publisher == node]
+    mine = [topic for topic in TOPICS.values() if node in (topic.publisher, *topic.also_by)]
     return [topic for topic in mine if alternatives or not topic.instead_of]
 
 

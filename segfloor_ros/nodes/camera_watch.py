@@ -48,10 +48,28 @@ class CameraWatch:
         age_ns = self._node.get_clock().now().nanoseconds - stamp_ns
         self._is_live = abs(age_ns) < LIVE_NS
 
+    def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
+        """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
+        has begun.
+        """
+        reporter = self._node.reporter
+        reporter.health.skipped()
+        if not is_ready:
+            words = 'skipped: calibration or mount of the camera are not known yet'
+            reporter.report(stamp_ns, Level.WARN, words)
+            return
+        reporter.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
+        reporter.diagnose(
+            'skipped',
+            f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
+            'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
+            'play a recording with lossless set on stereo_camera',
+        )
+
     def find_problems(self, missing_infos: list[str]) -> None:
         """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
         for topic in missing_infos:
-            self._node.diagnose(
+            self._node.reporter.diagnose(
                 topic,
                 f'no message on {topic}: images wait for their calibration; let the driver '
                 'publish it, or remap the topic; `segfloor calibrate` makes one',
@@ -77,7 +95,7 @@ class CameraWatch:
             if self._own.rectified_input
             else f'the calibration on camera_info is not that of {topics}; calibrate again'
         )
-        self._node.diagnose(
+        self._node.reporter.diagnose(
             'rows',
             f'{what}: the same points stand {found[0]:.1f} rows apart (median of {found[1]})',
             Level.ERROR,
@@ -88,7 +106,7 @@ class CameraWatch:
         """Say so where the mount that was measured from the floor is hard to believe."""
         pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
         if abs(roll) > PLAUSIBLE_ROLL_DEG or abs(pitch) > PLAUSIBLE_PITCH_DEG:
-            self._node.diagnose(
+            self._node.reporter.diagnose(
                 'tilt',
                 f'{next(iter(self._stamps))}: the floor seems tilted by {pitch:.1f} deg along and '
                 f'{roll:.1f} deg across the view, which is hardly so; does the camera see the '
@@ -101,7 +119,7 @@ class CameraWatch:
         for topic, last_s in self._last_image_s.items():
             # A recording may end or wait for the nodes; a camera may not.
             if self._is_live and now_s - last_s > SILENT_S:
-                self._node.diagnose(
+                self._node.reporter.diagnose(
                     f'silence of {topic}',
                     f'no image on {topic} for a while; is the camera connected and its driver '
                     'running?',
@@ -116,7 +134,7 @@ class CameraWatch:
             return
         gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
         if gap_ns > 1e9 * self._own.sync_tolerance_s:
-            self._node.diagnose(
+            self._node.reporter.diagnose(
                 'stamps',
                 f'the stamps of {" and ".join(self._stamps)} are {1e-6 * gap_ns:.1f} ms apart, '
                 f'more than sync_tolerance_s = {self._own.sync_tolerance_s:g} s: no pairs; trigger '

@@ -17,8 +17,9 @@ from segfloor_ros.messages.clouds import (
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
-from segfloor_ros.nodes.hand_over import HandOver
-from segfloor_ros.nodes.stage_node import StageNode, run_node
+from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.running import run_node
+from segfloor_ros.nodes.stage_node import StageNode
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
 POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
@@ -29,8 +30,8 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
 
     works_on_demand = True
 
-    def __init__(self, hand_over: HandOver | None = None) -> None:
-        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings, hand_over)
+    def __init__(self) -> None:
+        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
 
     def set_up(self) -> None:
         """Make the topics."""
@@ -39,24 +40,21 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
             FLOOR: self.output('floor_points'),
             OBSTACLE: self.output('obstacle_points'),
         }
-        self.join((MAP_POINTS, FEATURES, POSE, MASK), self._take)
+        self._keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
 
-    def start_anew(self) -> None:
+    def reset_stage(self) -> None:
         """Begin without points."""
         self._stage = CloudLabelling(self.parameters.stage)
 
-    def resume(self, state: CloudLabelling) -> None:
-        """Go on with the labels of a killed node."""
-        self._stage = state
+    def restore(self, state: tuple[int | None, CloudLabelling]) -> None:
+        """Resume with the labels of a killed node."""
+        self._keyframes.map_start_ns, self._stage = state
         self._stage.settings = self.parameters.stage
-        self.get_logger().warning('going on with the labels of a node that was killed')
+        self.get_logger().warning('resumed with the labels of a node that was killed')
 
     def on_settings_changed(self) -> None:
         """Label the next keyframe with the new settings."""
         self._stage.settings = self.parameters.stage
-
-    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
-        self.work(stamp_ns, lambda: self._label(stamp_ns, parts))
 
     def _label(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         cloud = sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
@@ -69,7 +67,7 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         for label, output in self._by_label.items():
             if output.get_subscription_count():
                 output.publish(points_of_label(stamp_ns, frame_id, labelled, label))
-        self.keep(self._stage)
+        self.kept_state.save((self._keyframes.map_start_ns, self._stage))
         return {'points': len(labelled.point_id)}
 
 

@@ -19,13 +19,13 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
-from segfloor_ros.nodes.hand_over import HandOver
-from segfloor_ros.nodes.stage_node import StageNode, run_node
+from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.running import run_node
+from segfloor_ros.nodes.stage_node import StageNode
 
 LEFT, RIGHT = 'keyframe/left/image_rect', 'keyframe/right/image_rect'
 LEFT_INFO, RIGHT_INFO = 'keyframe/left/camera_info', 'keyframe/right/camera_info'
 POSE = 'keyframe/odometry'
-MAX_WAITING_FOR_MOUNT = 100
 
 
 class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentationNodeSettings]):
@@ -33,8 +33,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
 
     works_on_demand = True
 
-    def __init__(self, hand_over: HandOver | None = None) -> None:
-        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings, hand_over)
+    def __init__(self) -> None:
+        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings)
 
     def set_up(self) -> None:
         """Make the topics."""
@@ -46,20 +46,15 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._v_disparity = self.output('keyframe/v_disparity')
         self._mask = self.output('keyframe/floor_mask')
         self._scan = self.output('keyframe/floor_scan')
-        self.listen('camera_mount', self._take_mount)
-        self.join((LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE), self._take)
+        self.inputs.subscribe('camera_mount', self._take_mount)
+        parts = (LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE)
+        self._keyframes = KeyframeJoin(self, parts, self._segment, may_process=self._has_mount)
 
-    def start_anew(self) -> None:
+    def reset_stage(self) -> None:
         """Begin without memory of the floor."""
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
         self._mount_check: MountCheck | None = None
-        self._waiting: list[tuple[int, dict[str, Any]]] = []
-
-    def on_new_map(self, first_stamp_ns: int) -> None:
-        """Wait for the mount that belongs to the map, unless it is here already."""
-        if self._mount_stamp_ns != first_stamp_ns:
-            self._mount = None
 
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings, and with what is remembered."""
@@ -70,16 +65,14 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._mount = Mount.from_transform(transform_array(message))
         self._mount_stamp_ns = to_ns(message.header.stamp)
         self._base_frame = message.header.frame_id
-        waiting, self._waiting = self._waiting, []
-        for stamp_ns, parts in waiting:
-            self._take(stamp_ns, parts)
+        self._keyframes.process_waiting()
 
-    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
-        if self._mount is None:
-            # The mount travels on a topic of its own and may come a moment later.
-            self._waiting = [*self._waiting, (stamp_ns, parts)][-MAX_WAITING_FOR_MOUNT:]
-            return
-        self.work(stamp_ns, lambda: self._segment(stamp_ns, parts))
+    def _has_mount(self) -> bool:
+        """Whether the mount is known, of the map that the keyframes belong to: it travels on a
+        topic of its own and may come a moment later.
+        """
+        map_start_ns = self._keyframes.map_start_ns
+        return self._mount is not None and map_start_ns in (None, self._mount_stamp_ns)
 
     def _segment(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         assert self._mount is not None
@@ -104,7 +97,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
 
     def _compare_mounts(self, words: str | None) -> None:
         if words is not None:
-            self.diagnose(
+            self.reporter.diagnose(
                 'mount',
                 f'{words}; correct the tf from {self._base_frame} to the camera, or the parameters '
                 'camera_height_m, camera_pitch_rad and camera_roll_rad of stereo_slam',
@@ -113,8 +106,9 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
 
     def find_problems(self) -> None:
         """Say what the keyframes wait for."""
-        if self._waiting:
-            self.diagnose('camera_mount', 'no message on camera_mount; is stereo_slam running?')
+        if self._keyframes.waiting_count:
+            text = 'no message on camera_mount; is stereo_slam running?'
+            self.reporter.diagnose('camera_mount', text)
 
     def _stage_for(self, parts: Mapping[str, Any]) -> tuple[FloorSegmentation, StereoCamera]:
         eyes = (eye_calibration(parts[topic], topic) for topic in (LEFT_INFO, RIGHT_INFO))

@@ -17,52 +17,46 @@ from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.messages.clouds import features_arrays, labelled_arrays
 from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_message
-from segfloor_ros.messages.path_bytes import path_of_bytes
+from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
-from segfloor_ros.nodes.hand_over import HandOver
-from segfloor_ros.nodes.stage_node import PATH, StageNode, run_node
+from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.running import run_node
+from segfloor_ros.nodes.stage_node import StageNode
 
 POINTS, FEATURES = 'labelled_points', 'keyframe/features'
-POSE, SCAN = 'keyframe/odometry', 'keyframe/floor_scan'
+PATH, POSE, SCAN = 'keyframe/path', 'keyframe/odometry', 'keyframe/floor_scan'
 
 
 class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettings]):
     """Builds the map at every keyframe and publishes it."""
 
-    def __init__(self, hand_over: HandOver | None = None) -> None:
-        super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings, hand_over)
+    def __init__(self) -> None:
+        super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings)
 
     def set_up(self) -> None:
         """Make the topics and the service."""
         self._later: Timer | None = None
         self._map = self.output('map')
-        self.join((POINTS, FEATURES, PATH, POSE, SCAN), self._take)
+        parts = (POINTS, FEATURES, PATH, POSE, SCAN)
+        self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
         self.offer(Trigger, 'save_map', self._save)
 
-    def start_anew(self) -> None:
+    def reset_stage(self) -> None:
         """Begin with an empty map."""
         self._stage = OccupancyGridMapper(self.parameters.stage)
         self._stamp_ns = 0
         self._frame_id = ''
         self._published_s = -float('inf')
 
-    def resume(self, state: tuple[OccupancyGridMapper, int, str]) -> None:
-        """Go on with the map of a killed node, and publish it at once."""
-        self._stage, self._stamp_ns, self._frame_id = state
+    def restore(self, state: tuple[int | None, OccupancyGridMapper, int, str]) -> None:
+        """Resume with the map of a killed node, and publish it at once."""
+        self._keyframes.map_start_ns, self._stage, self._stamp_ns, self._frame_id = state
         self._stage.change_settings(self.parameters.stage)
-        self.get_logger().warning('going on with the map of a node that was killed')
+        self.get_logger().warning('resumed with the map of a node that was killed')
         self._publish()
-
-    def forget(self) -> None:
-        """Drop the map."""
-        super().forget()
-        if self._later is not None:
-            self.destroy_timer(self._later)
-        self._later = None
 
     def on_inputs_closed(self) -> None:
         """Publish the map if it was still to come."""
-        super().on_inputs_closed()
         if self._later is not None and self.context.ok():
             self._publish()
 
@@ -70,17 +64,15 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         """Map the next keyframe with the new settings."""
         self._stage.change_settings(self.parameters.stage)
 
-    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
-        self.work(stamp_ns, lambda: self._update(stamp_ns, parts))
-
     def _update(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         points = labelled_arrays(parts[POINTS], POINTS)
         features = features_arrays(parts[FEATURES], FEATURES)
-        path = path_of_bytes(parts[PATH])
+        path = path_arrays(parts[PATH])
         scan = scan_arrays(parts[SCAN], SCAN)
         self._stage.update(stamp_ns, points, features, path, scan)
         self._stamp_ns, self._frame_id = stamp_ns, parts[POSE].header.frame_id
-        self.keep((self._stage, self._stamp_ns, self._frame_id))
+        map_start_ns = self._keyframes.map_start_ns
+        self.kept_state.save((map_start_ns, self._stage, self._stamp_ns, self._frame_id))
         self._publish_soon()
         return {}
 
@@ -92,7 +84,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         if wait_s <= 0:
             self._publish()
         else:
-            self._later = self.steady_timer(wait_s, self._publish)
+            self._later = self.inputs.steady_timer(wait_s, self._publish)
 
     def _publish(self) -> None:
         if self._later is not None:

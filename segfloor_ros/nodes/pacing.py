@@ -39,7 +39,7 @@ class ClockPace:
             self._start = self._clock_s(), stamp_ns
 
     def restart(self) -> None:
-        """Start the clock anew with the next frame, e.g. after a pause."""
+        """Start the clock again with the next frame, e.g. after a pause."""
         self._start = None
 
 
@@ -54,55 +54,51 @@ class ChainPace:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._last_sign_s = clock_s()
-        self._unanswered: set[int] = set()
+        self._frames: set[int] = set()
         self._keyframes: set[int] = set()
-        self._ended_early: set[int] = set()
+        self._done_early: set[int] = set()
 
     def ready(self) -> bool:
-        """Whether the chain has room for the next frame."""
+        """Whether the next frame may be sent."""
         return (
-            len(self._unanswered) < MAX_FRAMES_UNDER_WAY
+            len(self._frames) < MAX_FRAMES_UNDER_WAY
             and len(self._keyframes) < MAX_KEYFRAMES_UNDER_WAY
         )
 
     def sent(self, stamp_ns: int) -> None:
-        """Wait for the answer to this frame from now on."""
+        """Wait for SLAM to be done with this frame from now on."""
         self._last_sign_s = self._clock_s()
-        self._unanswered.add(stamp_ns)
+        self._frames.add(stamp_ns)
 
-    def answered(self, stamp_ns: int) -> None:
-        """SLAM has processed a frame; it takes them in order, so earlier ones are done or lost."""
+    def frame_done(self, stamp_ns: int) -> None:
+        """SLAM is done with a frame; it takes them in order, so earlier ones are done or lost."""
         self._last_sign_s = self._clock_s()
-        self._unanswered = {t for t in self._unanswered if t > stamp_ns}
+        self._frames = {t for t in self._frames if t > stamp_ns}
 
     def keyframe_began(self, stamp_ns: int) -> None:
         """SLAM has published a keyframe."""
-        # The statuses of two nodes may overtake each other.
-        if stamp_ns in self._ended_early:
-            self._ended_early.discard(stamp_ns)
+        # The messages of two nodes may overtake each other.
+        if stamp_ns in self._done_early:
+            self._done_early.discard(stamp_ns)
         else:
             self._keyframes.add(stamp_ns)
 
-    def keyframe_mapped(self, stamp_ns: int) -> None:
-        """A keyframe has reached the end of the chain; earlier ones are done or lost."""
-        self._keyframes = {t for t in self._keyframes if t >= stamp_ns}
-        self.keyframe_ended(stamp_ns)
-
-    def keyframe_ended(self, stamp_ns: int) -> None:
-        """A keyframe has reached the end of the chain, or failed on the way."""
+    def keyframe_done(self, stamp_ns: int) -> None:
+        """A keyframe goes no further; the nodes take them in order, so earlier ones are nearly done
+        or lost.
+        """
         self._last_sign_s = self._clock_s()
-        if stamp_ns in self._keyframes:
-            self._keyframes.discard(stamp_ns)
-        else:
-            self._ended_early.add(stamp_ns)
+        if stamp_ns not in self._keyframes:
+            self._done_early.add(stamp_ns)
+        self._keyframes = {t for t in self._keyframes if t > stamp_ns}
 
     def restart(self) -> None:
-        """Be patient anew, e.g. after a pause."""
+        """Start the patience again, e.g. after a pause."""
         self._last_sign_s = self._clock_s()
 
-    def forget_frames(self) -> None:
+    def drop_frames(self) -> None:
         """Wait for no frame any more: whoever had them listens no longer."""
-        self._unanswered.clear()
+        self._frames.clear()
 
     def give_up(self) -> str:
         """Where nothing has happened for too long, wait for nothing that is under way any more and
@@ -110,13 +106,13 @@ class ChainPace:
         """
         if self.ready() or self._clock_s() - self._last_sign_s < PATIENCE_S:
             return ''
-        words = f'{len(self._unanswered)} frames and {len(self._keyframes)} keyframes'
-        self._unanswered.clear()
+        words = f'{len(self._frames)} frames and {len(self._keyframes)} keyframes'
+        self._frames.clear()
         self._keyframes.clear()
         return words
 
     def waits_for(self) -> str:
         """Return what is being waited for, in words."""
-        if self._unanswered:
-            return f'stereo_slam to answer the frame with stamp {min(self._unanswered)}'
+        if self._frames:
+            return f'stereo_slam to answer the frame with stamp {min(self._frames)}'
         return f'the keyframe with stamp {min(self._keyframes, default=0)} to reach the map'

@@ -1,33 +1,27 @@
-"""The five nodes in one process: same names, topics, services and parameters, fewer copies.
+"""The five nodes in one process: same names, topics, services and parameters.
 
-Messages between them are handed over instead of sent; see `hand_over`. The camera is among them
-where `input` names a recording or a device.
+The camera is among them where `input` names a recording or a device.
 """
 
 from __future__ import annotations
 
-from rclpy.executors import Executor
 from rclpy.node import Node
 
 from segfloor_ros.messages.topics import CAMERA
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.hand_over import HandOver
-from segfloor_ros.nodes.managed_node import ManagedNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stage_node import run_nodes
+from segfloor_ros.nodes.running import run_nodes
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 STAGES = (StereoSlamNode, FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
-"""In the order of the flow: a node finds the publishers of what it subscribes to."""
 
 
-def make_nodes(executor: Executor) -> list[ManagedNode]:
+def make_nodes() -> list[Node]:
     """Make the nodes of the pipeline."""
-    hand_over = HandOver(executor)
-    nodes: list[ManagedNode] = [StereoCameraNode(hand_over)] if _has_input() else []
-    return [*nodes, *(make(hand_over) for make in STAGES)]
+    nodes: list[Node] = [StereoCameraNode()] if _has_input() else []
+    return [*nodes, *(make() for make in STAGES)]
 
 
 def _has_input() -> bool:

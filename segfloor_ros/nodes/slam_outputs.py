@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.clouds import features_message, sparse_cloud_message
 from segfloor_ros.messages.images import image_message
-from segfloor_ros.messages.path_bytes import path_bytes
 from segfloor_ros.messages.poses import (
+    PathMessages,
     at_least,
     body_twist,
     odometry_message,
     transform_message,
     twist_covariance,
 )
+from segfloor_ros.messages.progress import map_start_message
+from segfloor_ros.messages.topics import MAP_START
 from segfloor_ros.node_settings import StereoSlamNodeSettings
-from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult, Keyframe
 
 LEAST_VARIANCE = 1e-6
@@ -37,7 +38,7 @@ class CameraFrames:
 class SlamOutputs:
     """The publishers of stereo SLAM."""
 
-    def __init__(self, node: StageNode[Any, Any], own: StereoSlamNodeSettings) -> None:
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
         self._own = own
         self._odometry = node.output('odometry')
         self._mount = node.output('camera_mount')
@@ -47,16 +48,21 @@ class SlamOutputs:
         self._features = node.output('keyframe/features')
         self._path = node.output('keyframe/path')
         self._map_points = node.output('map_points')
+        self._map_start = node.output(MAP_START)
+        self.map_start_ns = 0
+        """When the map was begun, by which the nodes behind know one map from another."""
+
+    def reset(self, map_start_ns: int) -> None:
+        """Publish about a new map from now on; velocities are not known across a reset."""
+        # The time of a recording that is played again may be the same twice.
+        self.map_start_ns = map_start_ns + (map_start_ns == self.map_start_ns)
         self._last: FrameResult | None = None
+        self._path_messages = PathMessages(self._own.map_frame)
 
-    def start_anew(self) -> None:
-        """Forget the frame before; velocities are not known across a reset."""
-        self._last = None
-
-    def publish_mount(self, stamp_ns: int, frames: CameraFrames, mount: Mount) -> None:
-        """Publish where the left camera sits on the base."""
-        base = self._own.base_frame
-        self._mount.publish(transform_message(stamp_ns, base, frames.left, mount.T_base_left))
+    def publish_mount(self, frames: CameraFrames, mount: Mount) -> None:
+        """Publish where the left camera sits on the base; the stamp tells for which map."""
+        base, T_base_left = self._own.base_frame, mount.T_base_left
+        self._mount.publish(transform_message(self.map_start_ns, base, frames.left, T_base_left))
 
     def publish(
         self, result: FrameResult, calibration: StereoCalibration, frames: CameraFrames
@@ -118,5 +124,6 @@ class SlamOutputs:
         )
         features = features_message(stamp_ns, own.map_frame, keyframe.features)
         self._features.publish(features)
-        self._path.publish(path_bytes(stamp_ns, own.map_frame, keyframe.path))
+        self._path.publish(self._path_messages.next(stamp_ns, keyframe.path))
+        self._map_start.publish(map_start_message(stamp_ns, own.map_frame, self.map_start_ns))
         self._map_points.publish(sparse_cloud_message(stamp_ns, own.map_frame, keyframe.cloud))

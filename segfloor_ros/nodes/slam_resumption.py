@@ -16,9 +16,7 @@ PATIENCE_S = 5.0
 class SlamResumption:
     """Keeps what a later SLAM needs and lets a new SLAM go on with what was found."""
 
-    def __init__(
-        self, keep: Callable[[LastState, bool], None], last: LastState | None = None
-    ) -> None:
+    def __init__(self, keep: Callable[[LastState], None], last: LastState | None = None) -> None:
         self._keep = keep
         self._last = last
         self._continuation: Continuation | None = None
@@ -58,5 +56,4 @@ class SlamResumption:
     def keep(self, camera: StereoCamera, mount: Mount, result: FrameResult) -> None:
         """Keep a keyframe for a later SLAM."""
         if result.keyframe is not None:
-            state = LastState(camera, mount, result.keyframe, result.T_map_odom)
-            self._keep(state, True)
+            self._keep(LastState(camera, mount, result.keyframe, result.T_map_odom))

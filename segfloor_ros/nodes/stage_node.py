@@ -1,174 +1,268 @@
-"""What the five nodes have in common: parameters, topics by name, status, and a clean end."""
+"""What the five nodes have in common: states, parameters, and the parts they are made of."""
 
 from __future__ import annotations
 
-import logging
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
-import rclpy
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.publisher import Publisher
+from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.join import StampJoiner
-from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
+from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.node_settings import NodeSettings
-from segfloor_ros.nodes.hand_over import HandOver
+from segfloor_ros.nodes.connections import Connections
+from segfloor_ros.nodes.inputs import Inputs
 from segfloor_ros.nodes.kept_state import KeptState
-from segfloor_ros.nodes.managed_node import ManagedNode
-from segfloor_ros.nodes.middleware import prepare_middleware
+from segfloor_ros.nodes.life_cycle import refuse_impossible_transitions
 from segfloor_ros.nodes.parameters import NodeParameters
-from segfloor_ros.nodes.reporting_node import PATH, ReportingNode
+from segfloor_ros.nodes.reporter import Reporter
 from segfloor_ros.settings import StageSettings
 
 Stage = TypeVar('Stage', bound=StageSettings)
 Own = TypeVar('Own', bound=NodeSettings)
 
-INTERRUPT_HEARD_S = 0.2
+CONNECTION_CHECK_S = 0.1
+DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class StageNode(ReportingNode, Generic[Stage, Own]):
-    """A node around one stage. Subclasses create the topics in `set_up`, the stage in `start_anew`,
-    and hand messages to the stage.
+class StageNode(LifecycleNode, Generic[Stage, Own]):
+    """A managed node (REP-2002 in rclpy's form) around one stage, with the services `~/pause` and
+    `~/reset`.
 
-    Callbacks run one after the other; the depth of the subscriptions is the queue. A fault of a
-    message or of the stage is one line in the log and one status; the node lives on.
+    Configured, it has its topics and services (`set_up`) and an empty map (`reset_stage`). While it
+    is active, needed and not paused, its `inputs` are open. Deactivated, idle or paused it receives
+    nothing and keeps its map; cleaned up it has neither map nor topics. Callbacks run one after the
+    other; the depth of the subscriptions is the queue.
     """
 
-    def __init__(
-        self, stage: type[Stage], own: type[Own], hand_over: HandOver | None = None
-    ) -> None:
-        super().__init__(stage.stage_name(), hand_over)
+    works_on_demand = False
+    """Whether messages that nobody needs the results of may be missed."""
+
+    def __init__(self, stage: type[Stage], own: type[Own]) -> None:
+        super().__init__(stage.stage_name(), automatically_declare_parameters_from_overrides=True)
         self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
         self.add_on_set_parameters_callback(self._change_parameters)
-        self._joiners: list[StampJoiner] = []
-        self._life = MapLife()
-        resume_within_s = self.parameters.own.resume_within_s
-        self._kept_state = KeptState(self.get_fully_qualified_name(), resume_within_s)
+        self.reporter = Reporter(self)
+        self.inputs = Inputs(self, self.reporter)
+        self.connections = Connections(self, self.reporter, self.inputs)
+        self.kept_state = KeptState(
+            self.get_fully_qualified_name(), self.parameters.own.resume_within_s
+        )
+        self._at_clean_up: list[Callable[[], Any]] = []
+        self._state = 'unconfigured'
+        self._is_paused, self._is_needed = False, True
+        self._fault: Exception | None = None
+        self._last_health_s = 0.0
+        refuse_impossible_transitions(self)
+        self.inputs.steady_timer(CONNECTION_CHECK_S, self._check)
         if self.parameters.own.autostart:
-            self.start()
+            self._configure_and_activate()
+
+    # What the nodes fill in.
+
+    def set_up(self) -> None:
+        """Make the topics and services. Raises SegfloorError when that cannot be."""
+        raise NotImplementedError
+
+    def reset_stage(self) -> None:
+        """Begin with an empty map, first of all after `set_up`. The topics stay."""
+        raise NotImplementedError
+
+    def restore(self, state: Any) -> None:
+        """Resume with the state that a killed node has left in `kept_state`."""
+
+    def on_inputs_opened(self) -> None:
+        """Prepare for messages, at first and after a pause."""
+
+    def on_inputs_closed(self) -> None:
+        """Give up what waits for more messages."""
 
     def on_settings_changed(self) -> None:
         """Take over changed live parameters; the next message is processed with them."""
 
-    def on_inputs_closed(self) -> None:
-        """Give up the sets that are not complete."""
-        super().on_inputs_closed()
-        for joiner in self._joiners:
-            joiner.clear()
+    def find_problems(self) -> None:
+        """Report what shows over time; called once a second while the inputs are open."""
 
-    def reset(self) -> None:
-        """Drop the map, and all that waits."""
-        for joiner in self._joiners:
-            joiner.clear()
-        self._life = MapLife()
-        super().reset()
+    def is_needed_otherwise(self) -> bool:
+        """Whether somebody needs the node beside the listeners to its topics and its status."""
+        return False
 
-    def begin_anew(self, reason: str) -> None:
-        """Drop the map, and what was kept of it."""
-        self._kept_state.remove()
-        super().begin_anew(reason)
+    # What they use.
 
-    def take_up(self) -> None:
-        """Go on with what a killed node of this name has left, where the node keeps something."""
-        kept = self._kept_state.take()
-        if kept is not None:
-            self._life, state = kept
-            self.resume(state)
+    @property
+    def state_in_words(self) -> str:
+        """The state of the node: unconfigured, inactive, active, paused, idle or finalized."""
+        if self._state == 'active' and self._is_paused:
+            return 'paused'
+        return 'idle' if self._state == 'active' and not self._is_needed else self._state
 
-    def keep(self, state: Any, always: bool = False) -> None:
-        """Keep a state for `resume` of a later node, should this one be killed."""
-        self._kept_state.save((self._life, state), always)
-
-    def resume(self, state: Any) -> None:
-        """Go on with a state that a killed node has given to `keep`."""
-
-    def forget(self) -> None:
-        """Give up what waits."""
-        super().forget()
-        self._kept_state.remove()
-        self._joiners.clear()
-        self._life = MapLife()
-
-    def listen(
-        self,
-        name: str,
-        callback: Callable[[Any], None],
-        choose_profile: Callable[[], QoSProfile] | None = None,
-        raw: bool = False,
-    ) -> None:
-        """Subscribe to a topic of `TOPICS` while the node is active; faults in the callback are
-        logged with the topic's name. raw: hand on the serialized message. choose_profile: asked
-        whenever the inputs open.
-        """
+    def output(self, name: str) -> Publisher:
+        """Create the publisher of a topic of `TOPICS`. It lives until the node is cleaned up."""
         topic = TOPICS[name]
+        # What does not connect is reported by `qos_check`, in words and on /diagnostics.
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        made = self.create_publisher(topic.type, name, topic.profile, event_callbacks=quiet)
+        self.connections.outputs[name] = made
+        self.at_clean_up(lambda: self.destroy_publisher(made))
+        return made
 
-        def guarded(message: Any, info: Mapping[str, Any]) -> None:
-            self.note_received(topic, None if raw else to_ns(message.header.stamp), info)
-            try:
-                callback(message)
-            except Exception as error:
-                self.say_fault(name, error)
+    def offer(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
+        """Offer a service until the node is cleaned up."""
+        made = self.create_service(kind, name, answer)
+        self.at_clean_up(lambda: self.destroy_service(made))
 
-        choose = choose_profile or (lambda: topic.profile)
-        self.subscribe_while_open(topic.type, name, guarded, choose, raw)
+    def at_clean_up(self, step: Callable[[], Any]) -> None:
+        """Do something when the node is cleaned up; the last one first."""
+        self._at_clean_up.append(step)
 
-    def joiner(self, parts: Sequence[str], **limits: Any) -> StampJoiner:
-        """Return a joiner that is emptied when the inputs close."""
-        self._joiners.append(StampJoiner(parts, **limits))
-        return self._joiners[-1]
-
-    def join(self, parts: Sequence[str], process: Callable[[int, dict[str, Any]], None]) -> None:
-        """Subscribe to topics whose messages belong to one keyframe; `process` gets the stamp and
-        the messages by topic once all with one stamp have arrived. Those that remain alone are
-        reported. Where SLAM publishes `keyframe/path`, it tells when a new map begins: the node
-        then begins anew. The path is handed on serialized.
+    def work(self, stamp_ns: int, step: Callable[[], Mapping[str, Any]]) -> bool:
+        """Run the stage's step for one stamp and report how it went, with the values it returns;
+        returns whether it went well.
         """
-        joiner = self.joiner(parts, optional={PATH: lambda: self.is_published(PATH)})
-
-        def take(part: str, stamp_ns: int, message: Any) -> None:
-            complete = joiner.add(part, stamp_ns, message)
-            self.say_dropped(joiner)
-            if complete is None:
-                return
-            if PATH in complete:
-                self._follow_life(path_head(complete[PATH], PATH))
-            process(stamp_ns, complete)
-
-        def listen(part: str) -> None:
-            self.listen(part, lambda message: take(part, to_ns(message.header.stamp), message))
-
-        for part in parts:
-            if part != PATH:
-                listen(part)
-        self.listen(PATH, lambda data: take(PATH, path_head(data, PATH).stamp_ns, data), raw=True)
-
-    def on_new_map(self, first_stamp_ns: int) -> None:
-        """Note that SLAM's map now begins at this stamp."""
-
-    def _follow_life(self, head: PathHead) -> None:
-        if self._life.is_new(head):
-            self.begin_anew('stereo_slam has begun a new map')
-            self.on_new_map(head.first_stamp_ns)
-
-    def work(self, stamp_ns: int, step: Callable[[], Mapping[str, Any]]) -> None:
-        """Run the stage's step for one stamp and report how it went, with the values it returns."""
         start = time.perf_counter()
         try:
             values = step()
         except Exception as error:
-            self.report_fault(stamp_ns, error)
-            return
+            self.reporter.report_fault(stamp_ns, error)
+            return False
         milliseconds = 1e3 * (time.perf_counter() - start)
-        self.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
+        self.reporter.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
+        return True
+
+    def pause(self, paused: bool) -> None:
+        """Close the inputs until further notice, or open them again."""
+        self._is_paused = paused
+        self._open_or_close()
+
+    def reset(self, reason: str) -> None:
+        """Drop the map and begin with an empty one, with one line in the log."""
+        self.get_logger().info(f'reset: {reason}')
+        self.kept_state.remove()
+        self.reset_stage()
+
+    # The transitions, as rclpy calls them.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make topics, services and an empty map."""
+        return self._transit(self._configure, 'inactive')
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the inputs."""
+        return self._transit(lambda: self._open_or_close('active'), 'active')
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the inputs and keep the map."""
+        return self._transit(lambda: self._open_or_close('inactive'), 'inactive')
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop the map, topics and services."""
+        return self._transit(self._clean_up, 'unconfigured')
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop everything, from any state."""
+        return self._transit(self._clean_up, 'finalized')
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop everything; the node can be configured again."""
+        return self._transit(self._clean_up, 'unconfigured')
+
+    def destroy_node(self) -> None:
+        """End the node and what works for it."""
+        self._clean_up()
+        super().destroy_node()
+
+    def _configure_and_activate(self) -> None:
+        """Configure and activate. Raises what stands in the way."""
+        for step in (self.trigger_configure, self.trigger_activate):
+            if step() != DONE:
+                assert self._fault is not None
+                raise self._fault
+
+    def _transit(self, step: Callable[[], None], label: str) -> TransitionCallbackReturn:
+        """Take the step of a transition; a fault is logged and the transition refused."""
+        try:
+            step()
+        except Exception as error:
+            self._fault = error
+            self.get_logger().error(' '.join(str(error).split()) or repr(error))
+            if not isinstance(error, SegfloorError):
+                self.get_logger().debug(''.join(traceback.format_exception(error)))
+            return REFUSED
+        self._state = label
+        return DONE
+
+    def _configure(self) -> None:
+        try:
+            self.offer(SetBool, '~/pause', self._answer_pause)
+            self.offer(Trigger, '~/reset', self._answer_reset)
+            self.at_clean_up(self.kept_state.remove)
+            self.set_up()
+            self.reset_stage()
+            kept = self.kept_state.take()
+            if kept is not None:
+                self.restore(kept)
+        except Exception:
+            self._clean_up()
+            raise
+
+    def _clean_up(self) -> None:
+        self._is_paused = False
+        self._open_or_close('inactive')
+        self.inputs.remove_all()
+        while self._at_clean_up:
+            self._at_clean_up.pop()()
+        self.connections.outputs.clear()
+
+    def _open_or_close(self, label: str = '') -> None:
+        """Open or close the inputs as the state asks for; label: the state that is entered."""
+        is_active = (label or self._state) == 'active'
+        wanted = is_active and self._is_needed and not self._is_paused
+        if wanted and not self.inputs.is_open:
+            self.inputs.open()
+            self.on_inputs_opened()
+        elif not wanted and self.inputs.is_open:
+            self.inputs.close()
+            self.reporter.restart_loss_counts()
+            self.on_inputs_closed()
+
+    def _check(self) -> None:
+        """Report connections and health, and look whether the node is needed."""
+        counts = self.connections.count_listeners()
+        always = not self.works_on_demand or self._state != 'active'
+        self._is_needed = self.connections.are_needed(counts, always or self.is_needed_otherwise())
+        self._open_or_close()
+        now_s = time.monotonic()
+        is_due = now_s - self._last_health_s >= HEALTH_PERIOD_S
+        self.connections.report(counts, always=is_due)
+        if is_due:
+            self._last_health_s = now_s
+            if self.inputs.is_open:
+                self.find_problems()
+                self.connections.find_problems()
+            self.reporter.publish_health(self.state_in_words)
+
+    def _answer_pause(
+        self, request: SetBool.Request, response: SetBool.Response
+    ) -> SetBool.Response:
+        self.pause(bool(request.data))
+        response.success, response.message = True, 'paused' if self._is_paused else 'running'
+        return response
+
+    def _answer_reset(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        self.inputs.give_up_waiting()
+        response.success = self._transit(lambda: self.reset('by ~/reset'), self._state) == DONE
+        response.message = 'reset' if response.success else str(self._fault)
+        return response
 
     def _change_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         result = self.parameters.change(parameters)
@@ -178,43 +272,3 @@ class StageNode(ReportingNode, Generic[Stage, Own]):
 
 
 AnyStageNode = StageNode[Any, Any]
-
-
-def run_node(make_node: Callable[[], ManagedNode]) -> None:
-    """Run a node until it is interrupted (status 0); bad parameters or input end it with one
-    line and status 2.
-    """
-    run_nodes(lambda executor: [make_node()])
-
-
-def run_nodes(make_nodes: Callable[[Executor], Sequence[ManagedNode]]) -> None:
-    """Run nodes in one executor, like `run_node`; the executor comes first, for those who hand
-    work to it.
-    """
-    logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
-    status = 0
-    nodes: Sequence[ManagedNode] = ()
-    try:
-        prepare_middleware()
-        rclpy.init()
-        executor = SingleThreadedExecutor()
-        nodes = make_nodes(executor)
-        for node in nodes:
-            executor.add_node(node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except SegfloorError as error:
-        print(f'segfloor: {error}', file=sys.stderr)
-        status = 2
-    except Exception:
-        # An interrupt takes the middleware away under whatever is being done at that moment, and
-        # may be heard of a little later than what it broke.
-        time.sleep(INTERRUPT_HEARD_S)
-        if rclpy.ok():
-            raise
-    finally:
-        for node in nodes:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    sys.exit(status)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from std_msgs.msg import Header
 
 from segfloor_ros.camera.images import Grey
 from segfloor_ros.camera.settings import StereoCameraSettings
@@ -13,25 +14,26 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.messages.camera_info import camera_info_message
-from segfloor_ros.messages.diagnostics import RECORDING, Level, Status, statuses
+from segfloor_ros.messages.diagnostics import RECORDING, Level
+from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import compressed_message, image_message
-from segfloor_ros.messages.topics import CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM
+from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
-from segfloor_ros.nodes.hand_over import HandOver
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
-from segfloor_ros.nodes.stage_node import StageNode, run_node
+from segfloor_ros.nodes.running import run_node
+from segfloor_ros.nodes.stage_node import StageNode
 
 LOOK_AGAIN_S = 0.05
 """How often is looked for subscribers, and whether the chain has room: its answers say so too."""
 AFTER_THE_END_S = 1.0
-SAY_WAITING_S = 5.0
+LOG_WAITING_S = 5.0
 
 
 class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]):
     """Publishes every pair with its own stamp, once somebody listens."""
 
-    def __init__(self, hand_over: HandOver | None = None) -> None:
-        super().__init__(StereoCameraSettings, StereoCameraNodeSettings, hand_over)
+    def __init__(self) -> None:
+        super().__init__(StereoCameraSettings, StereoCameraNodeSettings)
 
     def set_up(self) -> None:
         """Open the recording and make the topics."""
@@ -45,35 +47,50 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
         if own.lossless or not own.rate:
-            # Also while paused: frames are under way then, too.
-            self.keep_subscription(
-                DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_status, DIAGNOSTICS.profile
-            )
-        self.repeat(self._advance)
+            self._follow_chain()
+        self.inputs.repeat(self._advance)
         self.pause(own.start_paused)
+        self.at_clean_up(self._stop_reading)
 
-    def start_anew(self) -> None:
+    def reset_stage(self) -> None:
         """Begin with the first frame."""
         own = self.parameters.own
         self._pairs = self._source.raw_pairs()
         self._next: RawPair | None = None
         self._frames_sent = 0
         self._connected = self._finished = False
-        self._said_waiting_s = time.monotonic()
+        self._logged_waiting_s = time.monotonic()
         self._clock_pace = ClockPace(own.rate) if own.rate else None
         self._chain_pace = ChainPace() if own.lossless or not own.rate else None
 
-    def forget(self) -> None:
-        """Stop reading."""
-        super().forget()
-        self._pairs = iter(())
-
     def on_inputs_opened(self) -> None:
         """Keep the recording's pace from here on."""
-        self._said_waiting_s = time.monotonic()
+        self._logged_waiting_s = time.monotonic()
         for pace in (self._clock_pace, self._chain_pace):
             if pace is not None:
                 pace.restart()
+
+    def _stop_reading(self) -> None:
+        self._pairs = iter(())
+
+    def _follow_chain(self) -> None:
+        """Listen to how far the frames are, also while paused: they are under way then, too."""
+
+        def follow(name: str, note: Callable[[ChainPace, int], None]) -> None:
+            def take(message: Any) -> None:
+                if self._chain_pace is not None:
+                    header = message if isinstance(message, Header) else message.header
+                    note(self._chain_pace, to_ns(header.stamp))
+                if self.inputs.is_open:
+                    self._advance()
+
+            topic = TOPICS[name]
+            made = self.create_subscription(topic.type, name, take, topic.profile)
+            self.at_clean_up(lambda: self.destroy_subscription(made))
+
+        notes = (ChainPace.frame_done, ChainPace.keyframe_began, ChainPace.keyframe_done)
+        for name, note in zip(PACED_BY, notes, strict=True):
+            follow(name, note)
 
     def _advance(self) -> float:
         """Send the next pairs as far as they may go now; returns when to look again, in s."""
@@ -85,7 +102,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
                 self._send(self._next)
                 self._next = None
         except SegfloorError as error:
-            self.say_fault(self._source.name, error)
+            self.reporter.log_fault(self._source.name, error)
             self._finish(Level.ERROR, str(error))
         return AFTER_THE_END_S if self._finished else LOOK_AGAIN_S
 
@@ -99,9 +116,9 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             outputs = (*self._images.values(), *self._infos.values())
             silent = [out.topic_name for out in outputs if not out.get_subscription_count()]
             if silent:
-                self._say_waiting_for('subscribers of ' + ', '.join(silent))
+                self._log_waiting_for('subscribers of ' + ', '.join(silent))
             if silent and self._connected and self._chain_pace is not None:
-                self._chain_pace.forget_frames()
+                self._chain_pace.drop_frames()
                 self._chain_pace.restart()
             self._connected = not silent
         return self._connected
@@ -112,13 +129,13 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             return wait_s
         given_up = self._chain_pace.give_up()
         if given_up:
-            self.diagnose(
+            self.reporter.diagnose(
                 'lost',
                 f'{given_up} under way have not come to their end and are given up: a node was '
                 'paused, deactivated or killed; look at its status',
             )
             return 0.0
-        self._say_waiting_for(self._chain_pace.waits_for())
+        self._log_waiting_for(self._chain_pace.waits_for())
         return LOOK_AGAIN_S
 
     def _fetch(self) -> bool:
@@ -135,13 +152,13 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         for pace in (self._clock_pace, self._chain_pace):
             if pace is not None:
                 pace.sent(pair.stamp_ns)
-        self._said_waiting_s = time.monotonic()
+        self._logged_waiting_s = time.monotonic()
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))
             self._images[side].publish(self._image_message(pair.stamp_ns, frame_id, image))
         self._frames_sent += 1
-        self.report(pair.stamp_ns, Level.OK, 'sent', frame_index=pair.index)
+        self.reporter.report(pair.stamp_ns, Level.OK, 'sent', frame_index=pair.index)
 
     def _image_message(self, stamp_ns: int, frame_id: str, image: Grey) -> Any:
         if not self._compressed:
@@ -155,35 +172,13 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self.get_logger().info(f'{self._source.name}: {self._frames_sent} pairs sent')
         stamp_ns = self.get_clock().now().nanoseconds
         values = {'frames': self._frames_sent, 'skipped': self._source.skipped_frames}
-        self.publish_status(RECORDING, stamp_ns, level, message, values)
+        self.reporter.publish(RECORDING, stamp_ns, level, message, values)
 
-    def _take_status(self, message: DiagnosticArray) -> None:
-        if self._chain_pace is None:
-            return
-        namespace = self.get_namespace().rstrip('/')
-        for status in statuses(message):
-            if status.name == f'{namespace}/{status.node}':
-                note_status(self._chain_pace, status)
-        if self.is_open:
-            self._advance()
-
-    def _say_waiting_for(self, what: str) -> None:
+    def _log_waiting_for(self, what: str) -> None:
         now_s = time.monotonic()
-        if what and now_s - self._said_waiting_s > SAY_WAITING_S:
-            self._said_waiting_s = now_s
+        if what and now_s - self._logged_waiting_s > LOG_WAITING_S:
+            self._logged_waiting_s = now_s
             self.get_logger().warning(f'waiting for {what}')
-
-
-def note_status(pace: ChainPace, status: Status) -> None:
-    """Tell the pace what the status of a node means for the frames under way."""
-    if status.node == SLAM:
-        if status.values.get('keyframe') == '1':
-            pace.keyframe_began(status.stamp_ns)
-        pace.answered(status.stamp_ns)
-    elif status.node == GRID:
-        pace.keyframe_mapped(status.stamp_ns)
-    elif status.node in (FLOOR, CLOUD) and status.level is Level.ERROR:
-        pace.keyframe_ended(status.stamp_ns)
 
 
 def main() -> None:

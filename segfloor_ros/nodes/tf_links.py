@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 import yaml
 from geometry_msgs.msg import TransformStamped
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
 
 from segfloor_ros.frames import FrameTree
@@ -19,7 +21,7 @@ from segfloor_ros.messages import qos
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import to_ns, to_time
 from segfloor_ros.messages.poses import transform_array
-from segfloor_ros.nodes.managed_node import ManagedNode
+from segfloor_ros.nodes.stage_node import AnyStageNode
 
 
 class TfLink(Protocol):
@@ -31,8 +33,8 @@ class TfLink(Protocol):
     def latest_ns(self, parent: str, child: str) -> int | None:
         """Return up to when it is known where a moving frame is on its parent; None if never."""
 
-    def forget_moving(self) -> None:
-        """Forget where frames moved: time begins anew."""
+    def clear_moving(self) -> None:
+        """Drop where frames have moved: time starts over."""
 
     def root_of(self, frame: str) -> str:
         """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
@@ -50,7 +52,7 @@ class TfLink(Protocol):
         """Read no more."""
 
 
-def tf_link(node: ManagedNode) -> TfLink | None:
+def tf_link(node: AnyStageNode) -> TfLink | None:
     """Return the node's access to tf, or None where there is no tf."""
     if importlib.util.find_spec('tf2_ros') is not None:
         return Tf2Ros(node)
@@ -62,7 +64,7 @@ def tf_link(node: ManagedNode) -> TfLink | None:
 class Tf2Ros:
     """tf by tf2_ros."""
 
-    def __init__(self, node: ManagedNode) -> None:
+    def __init__(self, node: AnyStageNode) -> None:
         import tf2_ros
 
         self._node = node
@@ -71,7 +73,7 @@ class Tf2Ros:
         self._listener: Any = tf2_ros.TransformListener(self._buffer, node)
         self._moving: Any = tf2_ros.TransformBroadcaster(node)
         self._fixed: Any = tf2_ros.StaticTransformBroadcaster(node)
-        node.at_cleanup(self._end)
+        node.at_clean_up(self._end)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
         """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
@@ -88,8 +90,8 @@ class Tf2Ros:
         except self._error:
             return None
 
-    def forget_moving(self) -> None:
-        """Forget where frames moved: time begins anew. tf2 keeps the fixed ones."""
+    def clear_moving(self) -> None:
+        """Drop where frames have moved: time starts over. tf2 keeps the fixed ones."""
         self._buffer.clear()
 
     def root_of(self, frame: str) -> str:
@@ -128,20 +130,19 @@ class Tf2Ros:
 class TfMessages:
     """tf by its messages alone."""
 
-    def __init__(self, node: ManagedNode) -> None:
+    def __init__(self, node: AnyStageNode) -> None:
         from tf2_msgs.msg import TFMessage
 
         self._type: Any = TFMessage
         self._node = node
         self._frames = FrameTree()
-        self._moving = node.keep_publisher(TFMessage, '/tf', qos.TF)
-        self._fixed = node.keep_publisher(TFMessage, '/tf_static', qos.TF_STATIC)
+        self._moving = self._publisher('/tf', qos.TF)
+        self._fixed = self._publisher('/tf_static', qos.TF_STATIC)
         self._stop = [
-            node.keep_subscription(TFMessage, '/tf', self._take_moving, qos.TF),
-            node.keep_subscription(
-                TFMessage, '/tf_static', self._take_fixed, qos.TF_STATIC_LISTENER
-            ),
+            self._subscribe('/tf', self._take_moving, qos.TF),
+            self._subscribe('/tf_static', self._take_fixed, qos.TF_STATIC_LISTENER),
         ]
+        node.at_clean_up(self.stop_listening)
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
         """Return T_target_source (4, 4) at a time, or the latest one; None where unknown."""
@@ -151,9 +152,9 @@ class TfMessages:
         """Return up to when it is known where a moving frame is on its parent; None if never."""
         return self._frames.latest_ns(child)
 
-    def forget_moving(self) -> None:
-        """Forget where frames moved: time begins anew."""
-        self._frames.forget_moving()
+    def clear_moving(self) -> None:
+        """Drop where frames have moved: time starts over."""
+        self._frames.clear_moving()
 
     def root_of(self, frame: str) -> str:
         """Return the topmost frame that a frame hangs on; itself where it hangs on none."""
@@ -175,6 +176,18 @@ class TfMessages:
         """Read no more."""
         while self._stop:
             self._stop.pop()()
+
+    def _publisher(self, topic: str, profile: QoSProfile) -> Publisher:
+        made = self._node.create_publisher(self._type, topic, profile)
+        self._node.at_clean_up(lambda: self._node.destroy_publisher(made))
+        return made
+
+    def _subscribe(
+        self, topic: str, take: Callable[[Any], None], profile: QoSProfile
+    ) -> Callable[[], Any]:
+        """Subscribe whether the node is active or not; returns what ends it."""
+        made = self._node.create_subscription(self._type, topic, take, profile)
+        return lambda: self._node.destroy_subscription(made)
 
     def _take_moving(self, message: Any) -> None:
         self._take(

@@ -44,7 +44,7 @@ class Transforms:
                 'measured'
             )
         else:
-            node.every(TICK_S, self._advance)
+            node.inputs.every(TICK_S, self._advance)
 
     def listener_count(self) -> int:
         """Return how many other nodes listen to tf."""
@@ -54,13 +54,13 @@ class Transforms:
         """From now on tf has some time to tell the mount."""
         self._deadline_s = time.monotonic() + self._own.tf_wait_s
 
-    def start_anew(self) -> None:
-        """Forget the map's place in odom."""
+    def reset(self) -> None:
+        """Drop what is known of the map's place in odom."""
         self._uncorrected.clear()
         self._T_map_odom = None
         self._corrected_ns = 0
         if self._link is not None:
-            self._link.forget_moving()
+            self._link.clear_moving()
 
     def mount_is_settled(self, camera_frame: str) -> bool:
         """Whether tf tells the mount of the left optical frame, or had time enough to."""
@@ -68,9 +68,9 @@ class Transforms:
             return True
         base = self._own.base_frame
         if time.monotonic() < self._deadline_s:
-            self._node.say(f'waiting for tf from {base} to {camera_frame}')
+            self._node.reporter.warn(f'waiting for tf from {base} to {camera_frame}')
             return False
-        self._node.say(
+        self._node.reporter.warn(
             f'no tf from {base} to {camera_frame} within {self._own.tf_wait_s:g} s; the mount of '
             'the camera is measured from the floor'
         )
@@ -154,7 +154,7 @@ class Transforms:
                     self._uncorrected.popleft()
                 return
         if len(self._uncorrected) == MAX_UNCORRECTED:
-            self._node.say(
+            self._node.reporter.warn(
                 f'no tf from {odom} to {base} at the times of the images, so none from '
                 f'{self._own.map_frame} to {odom} is broadcast; publish_odom_tf is off, which '
                 'leaves it to another node'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rclpy.node import Node
+from segfloor_ros.nodes.stage_node import AnyStageNode
 
 MOST_PASSES = 100
 """Messages that come faster than they are taken do not put the work off for good."""
@@ -17,22 +17,23 @@ class WhenIdle:
     message would leave the newer ones in the queue, unknown, while it lasts.
     """
 
-    def __init__(self, node: Node, callback: Callable[[], None]) -> None:
+    def __init__(self, node: AnyStageNode, callback: Callable[[], None]) -> None:
         self._callback = callback
         self._is_new = False
         self._passes = 0
-        self.guard = node.create_guard_condition(self._pass)
+        self._guard = node.create_guard_condition(self._pass)
+        node.at_clean_up(lambda: node.destroy_guard_condition(self._guard))
 
     def request(self) -> None:
         """Have it called; what came just now may be followed by more."""
         self._is_new = True
-        self.guard.trigger()
+        self._guard.trigger()
 
     def _pass(self) -> None:
         if self._is_new and self._passes < MOST_PASSES:
             self._is_new = False
             self._passes += 1
-            self.guard.trigger()
+            self._guard.trigger()
             return
         self._is_new, self._passes = False, 0
         self._callback()

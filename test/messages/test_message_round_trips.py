@@ -27,7 +27,7 @@ from segfloor_ros.messages.diagnostics import (
 )
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import to_ns, to_time
-from segfloor_ros.messages.path_bytes import path_bytes, path_of_bytes
+from segfloor_ros.messages.progress import map_start_message, map_start_ns
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 STAMP_NS = 1_403_715_273_262_142_976
@@ -195,32 +195,34 @@ def test_impossible_poses_are_refused() -> None:
         poses.path_arrays(message)
 
 
-@pytest.mark.parametrize('frame_id', ['', 'm', 'map', 'robot', 'robot7/map', 'robot77/map'])
-@pytest.mark.parametrize('count', [0, 1, 2, 5])
-def test_the_bytes_of_a_path_are_those_of_its_message(frame_id, count) -> None:
-    stamps = STAMP_NS + np.arange(count) * 123_456_789
-    path = KeyframePath(stamps, se3_exp(RNG.normal(size=(count, 6))))
-    message = poses.path_message(STAMP_NS, frame_id, path)
-    data = path_bytes(STAMP_NS, frame_id, path)
-    # What serialize_message leaves in the gaps between fields is by chance.
-    assert len(data) == len(serialize_message(message))
-    assert deserialize_message(data, type(message)) == message
-    back = path_of_bytes(bytes(serialize_message(message)))
-    np.testing.assert_array_equal(back.stamp_ns, stamps)
-    np.testing.assert_allclose(back.T_map_base, path.T_map_base, atol=1e-12)
+def test_poses_that_have_not_moved_are_sent_again_and_others_anew() -> None:
+    first = KeyframePath(np.array([5, 7, 9]), se3_exp(RNG.normal(size=(3, 6))))
+    moved = KeyframePath(np.array([5, 7, 9, 11]), se3_exp(RNG.normal(size=(4, 6))))
+    moved.T_map_base[0] = first.T_map_base[0]
+    shorter = KeyframePath(np.array([7]), moved.T_map_base[:1])
+    path_messages, used = poses.PathMessages('map'), []
+    for stamp_ns, path in ((9, first), (11, moved), (12, shorter)):
+        message = path_messages.next(stamp_ns, path)
+        used.append(message.poses)
+        assert message == poses.path_message(stamp_ns, 'map', path)
+        back = poses.path_arrays(over_the_wire(message))
+        np.testing.assert_array_equal(back.stamp_ns, path.stamp_ns)
+        np.testing.assert_allclose(back.T_map_base, path.T_map_base, atol=1e-12)
+    assert used[1][0] is used[0][0]
+    assert used[1][1] is not used[0][1]
 
 
-def test_a_path_of_other_frames_is_read_all_the_same() -> None:
+def test_a_path_of_impossible_poses_is_refused() -> None:
     path = KeyframePath(np.array([5, 7, 9]), se3_exp(RNG.normal(size=(3, 6))))
     message = poses.path_message(STAMP_NS, 'map', path)
-    message.poses[1].header.frame_id = 'elsewhere'
-    back = path_of_bytes(bytes(serialize_message(message)))
-    np.testing.assert_array_equal(back.stamp_ns, path.stamp_ns)
-    np.testing.assert_allclose(back.T_map_base, path.T_map_base, atol=1e-12)
     message.poses[2].pose.position.x = float('inf')
-    message.poses[1].header.frame_id = 'map'
     with pytest.raises(MessageError):
-        path_of_bytes(bytes(serialize_message(message)))
+        poses.path_arrays(over_the_wire(message))
+
+
+def test_the_beginning_of_a_map_survives() -> None:
+    message = over_the_wire(map_start_message(STAMP_NS + 5, 'map', STAMP_NS))
+    assert (to_ns(message.header.stamp), map_start_ns(message)) == (STAMP_NS + 5, STAMP_NS)
 
 
 def test_an_empty_path_is_a_path() -> None:

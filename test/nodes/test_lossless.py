@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.messages.diagnostics import HEALTH, Level, Status, status_message
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import DIAGNOSTICS, SLAM, TOPICS
+from segfloor_ros.messages.diagnostics import HEALTH
+from segfloor_ros.messages.headers import make_header, to_ns
+from segfloor_ros.messages.topics import FRAME_DONE, TOPICS
 from segfloor_ros.nodes import pacing
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 
@@ -23,9 +23,7 @@ class Listener:
     def __init__(self, graph) -> None:
         self._graph = graph
         self.stamps: list[int] = []
-        self._status = graph.tester.create_publisher(
-            DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
-        )
+        self._frame_done = graph.publisher(FRAME_DONE)
         self._subscriptions: list = []
         self.listen()
 
@@ -42,7 +40,7 @@ class Listener:
             self._graph.tester.destroy_subscription(self._subscriptions.pop())
 
     def answer(self, stamp_ns: int) -> None:
-        self._status.publish(status_message(Status(stamp_ns, f'/{SLAM}', Level.OK, '', {})))
+        self._frame_done.publish(make_header(stamp_ns, ''))
 
     def _take(self, message) -> None:
         self.stamps.append(to_ns(message.header.stamp))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from node_messages import STAMP_NS, grid_messages, publish
 
-from segfloor_ros.nodes import reporting_node
+from segfloor_ros.nodes import connections
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
@@ -23,7 +23,7 @@ from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 def test_without_listeners_nothing_is_received(
     make_graph, monkeypatch, make, received, made
 ) -> None:
-    monkeypatch.setattr(reporting_node, 'NEED_LASTS_S', 1.0)
+    monkeypatch.setattr(connections, 'NEED_LASTS_S', 1.0)
     graph = make_graph()
     graph.be_deaf()
     node = graph.add(make())

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 
-from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.nodes.pacing import (
     MAX_FRAMES_UNDER_WAY,
     MAX_KEYFRAMES_UNDER_WAY,
@@ -10,7 +9,6 @@ from segfloor_ros.nodes.pacing import (
     ChainPace,
     ClockPace,
 )
-from segfloor_ros.nodes.stereo_camera import note_status
 
 S = 1_000_000_000
 
@@ -36,9 +34,9 @@ def test_few_frames_are_under_way_at_a_time() -> None:
         pace.sent(stamp)
     assert not pace.ready()
     assert 'stamp 0' in pace.waits_for()
-    pace.answered(-1)
+    pace.frame_done(-1)
     assert not pace.ready()
-    pace.answered(0)
+    pace.frame_done(0)
     assert pace.ready()
 
 
@@ -47,13 +45,13 @@ def test_the_answer_to_a_frame_is_the_end_of_those_before_it() -> None:
     pace = ChainPace()
     for stamp in range(MAX_FRAMES_UNDER_WAY):
         pace.sent(stamp)
-    pace.answered(MAX_FRAMES_UNDER_WAY - 1)
+    pace.frame_done(MAX_FRAMES_UNDER_WAY - 1)
     for stamp in range(MAX_FRAMES_UNDER_WAY - 1):
         pace.sent(100 + stamp)
         assert pace.ready()
     for stamp in range(MAX_KEYFRAMES_UNDER_WAY):
-        note_status(pace, _status('stereo_slam', 200 + stamp, keyframe='1'))
-    note_status(pace, _status('occupancy_grid', 200 + MAX_KEYFRAMES_UNDER_WAY - 1))
+        pace.keyframe_began(200 + stamp)
+    pace.keyframe_done(200 + MAX_KEYFRAMES_UNDER_WAY - 1)
     assert pace.ready()
 
 
@@ -64,7 +62,7 @@ def test_what_is_lost_under_way_is_given_up_after_a_while_without_any_sign() -> 
         pace.sent(stamp)
     now[0] += PATIENCE_S - 1
     pace.keyframe_began(7)
-    pace.keyframe_mapped(7)
+    pace.keyframe_done(7)
     now[0] += PATIENCE_S - 1
     assert pace.give_up() == ''
     assert not pace.ready()
@@ -74,34 +72,29 @@ def test_what_is_lost_under_way_is_given_up_after_a_while_without_any_sign() -> 
     assert pace.give_up() == ''
     for stamp in range(MAX_FRAMES_UNDER_WAY):
         pace.sent(stamp)
-    pace.forget_frames()
+    pace.drop_frames()
     assert pace.ready()
 
 
-def test_keyframes_count_until_they_reach_the_map_or_fail() -> None:
+def test_keyframes_count_until_they_go_no_further() -> None:
     pace = ChainPace()
     for stamp in range(MAX_KEYFRAMES_UNDER_WAY):
         pace.sent(stamp)
-        note_status(pace, _status('stereo_slam', stamp, keyframe='1'))
+        pace.frame_done(stamp)
+        pace.keyframe_began(stamp)
     assert not pace.ready()
     assert 'the keyframe with stamp 0' in pace.waits_for()
-    note_status(pace, _status('floor_segmentation', 0))
-    assert not pace.ready()
-    note_status(pace, _status('occupancy_grid', 0))
+    pace.keyframe_done(0)
     assert pace.ready()
-    note_status(pace, _status('stereo_slam', 9, keyframe='1'))
+    pace.keyframe_began(9)
     assert not pace.ready()
-    note_status(pace, _status('cloud_labelling', 1, Level.ERROR))
+    pace.keyframe_done(1)
     assert pace.ready()
 
 
 def test_the_end_of_a_keyframe_may_be_heard_of_before_its_beginning() -> None:
     pace = ChainPace()
     for stamp in range(10):
-        note_status(pace, _status('occupancy_grid', stamp))
-        note_status(pace, _status('stereo_slam', stamp, keyframe='1'))
+        pace.keyframe_done(stamp)
+        pace.keyframe_began(stamp)
         assert pace.ready()
-
-
-def _status(node: str, stamp: int, level: Level = Level.OK, **values: str) -> Status:
-    return Status(stamp, f'/{node}', level, '', values)

@@ -1,4 +1,4 @@
-"""A map begun anew: by service, by a recording that begins again, by SLAM started again."""
+"""A map reset: by service, by a recording that is played again, by SLAM started again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from node_messages import cloud_messages, publish
-from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
@@ -17,15 +16,13 @@ from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import image_message
-from segfloor_ros.messages.map_life import MapLife, PathHead, path_head
-from segfloor_ros.messages.poses import path_message
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.messages.progress import map_start_message
+from segfloor_ros.messages.topics import MAP_START, TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import KeyframePath
 
 S = 1_000_000_000
 FRAMES, MIDDLE = 12, 6
@@ -163,17 +160,15 @@ def test_a_reset_node_forgets_and_goes_on(make_graph) -> None:
     np.testing.assert_array_equal(first, second)
 
 
-def test_the_head_of_a_path_is_read_from_its_bytes() -> None:
-    for frame_id in ('', 'm', 'ma', 'map', 'maps'):
-        for stamps in ([], [5 * S + 7], [5 * S + 7, 6 * S]):
-            path = KeyframePath(np.array(stamps, np.int64), np.tile(np.eye(4), (len(stamps), 1, 1)))
-            data = serialize_message(path_message(9 * S + 1, frame_id, path))
-            head = PathHead(9 * S + 1, len(stamps), stamps[0] if stamps else 0)
-            assert path_head(data, 'path') == head
-
-
-def test_a_path_that_grows_is_of_the_same_map() -> None:
-    life = MapLife()
-    heads = [(1, 1, 1), (2, 2, 1), (4, 4, 1), (5, 1, 5), (6, 2, 5), (1, 1, 1), (1, 1, 1)]
-    found = [life.is_new(PathHead(*head)) for head in heads]
-    assert found == [False, False, False, True, False, True, True]
+def test_a_node_is_reset_when_the_keyframes_are_of_another_map(make_graph) -> None:
+    graph = make_graph()
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    publishers: dict[str, Any] = {}
+    for count, start_ns in enumerate((7, 7, 8), start=1):
+        start = {MAP_START: map_start_message(count * S, 'map', start_ns)}
+        publish(graph, {**cloud_messages(count * S), **start}, publishers)
+        graph.until(lambda count=count: len(labelled) == count, f'keyframe {count}')
+    first, second, third = (labelled_arrays(message, '').confidence for message in labelled)
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(first, third)

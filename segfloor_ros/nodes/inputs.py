@@ -1,0 +1,170 @@
+"""What a node receives: subscriptions, joins by stamp and timers that are open while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.reporter import Reporter
+
+LEAST_PERIOD_S = 0.001
+Open = tuple[Any, Callable[[Any], Any]]
+"""Something that is open, and what closes it."""
+
+
+class Inputs:
+    """The inputs of one node. They are declared once, and opened and closed with its states.
+
+    A fault in a callback is one line in the log that names the topic; the node lives on.
+    """
+
+    def __init__(self, node: Node, reporter: Reporter) -> None:
+        self._node = node
+        self._reporter = reporter
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._openers: list[Callable[[], Open]] = []
+        self._open: list[Open] = []
+        self._joiners: list[StampJoiner] = []
+        self.subscriptions: dict[str, Subscription] = {}
+        """The open subscriptions by the topic's name as in the code, before remapping."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages are received."""
+        return bool(self._open)
+
+    def subscribe(
+        self,
+        name: str,
+        callback: Callable[[Any], None],
+        choose_profile: Callable[[], QoSProfile] | None = None,
+    ) -> None:
+        """Receive a topic of `TOPICS`. choose_profile: asked whenever the inputs open."""
+        topic = TOPICS[name]
+
+        def take(message: Any, info: Mapping[str, Any]) -> None:
+            stamp_ns, subscription = to_ns(message.header.stamp), self.subscriptions[name]
+            self._reporter.note_received(topic, stamp_ns, info, subscription)
+            try:
+                callback(message)
+            except Exception as error:
+                self._reporter.log_fault(name, error)
+
+        def subscribe() -> Open:
+            profile = choose_profile() if choose_profile else topic.profile
+            # What does not connect is reported by `qos_check`, in words and on /diagnostics.
+            quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+            # rclpy's annotation knows callbacks of one argument only.
+            two_arguments: Any = take
+            made = self._node.create_subscription(
+                topic.type, name, two_arguments, profile, event_callbacks=quiet
+            )
+            self.subscriptions[name] = made
+            return made, self._node.destroy_subscription
+
+        self._openers.append(subscribe)
+
+    def join(
+        self,
+        parts: Sequence[str],
+        process: Callable[[int, dict[str, Any]], None],
+        on_message: Callable[[str, int], None] | None = None,
+        choose_profile: Callable[[], QoSProfile] | None = None,
+        **limits: Any,
+    ) -> None:
+        """Receive topics whose messages belong together by their stamps; `process` gets the stamp
+        and the messages by topic once all have arrived. Those that remain alone are reported.
+        on_message: gets topic and stamp of every message. limits: of the `StampJoiner`.
+        """
+        joiner = StampJoiner(parts, **limits)
+        self._joiners.append(joiner)
+
+        def take(part: str, message: Any) -> None:
+            stamp_ns = to_ns(message.header.stamp)
+            if on_message is not None:
+                on_message(part, stamp_ns)
+            complete = joiner.add(part, stamp_ns, message)
+            self._reporter.report_dropped(joiner, self.publishing_nodes)
+            if complete is not None:
+                process(stamp_ns, complete)
+
+        for part in joiner.all_parts:
+            self.subscribe(part, partial(take, part), choose_profile)
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call something regularly while the inputs are open."""
+        self._openers.append(
+            lambda: (self.steady_timer(period_s, callback), self._node.destroy_timer)
+        )
+
+    def repeat(self, step: Callable[[], float]) -> None:
+        """Call something while the inputs are open, each time after as many seconds as it has
+        returned the time before.
+        """
+
+        def start() -> Open:
+            def run() -> None:
+                timer.timer_period_ns = round(1e9 * max(step(), LEAST_PERIOD_S))
+                timer.reset()
+
+            timer = self.steady_timer(LEAST_PERIOD_S, run)
+            return timer, self._node.destroy_timer
+
+        self._openers.append(start)
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
+        """Make a timer that also runs while the time of a recording stands still."""
+        return self._node.create_timer(period_s, callback, clock=self._steady_clock)
+
+    def open(self) -> None:
+        """Receive from now on."""
+        self._open = [opener() for opener in self._openers]
+
+    def close(self) -> None:
+        """Receive nothing any more, and give up what waits for a partner."""
+        while self._open:
+            entity, destroy = self._open.pop()
+            destroy(entity)
+        self.subscriptions.clear()
+        self.give_up_waiting()
+
+    def reopen(self) -> None:
+        """Subscribe again, with other profiles or topics."""
+        if self.is_open:
+            self.close()
+            self.open()
+
+    def give_up_waiting(self) -> None:
+        """Drop the messages that wait for a partner."""
+        for joiner in self._joiners:
+            joiner.clear()
+
+    def remove_all(self) -> None:
+        """Close the inputs and declare none any more."""
+        self.close()
+        self._openers.clear()
+        self._joiners.clear()
+
+    def publisher_count(self, name: str) -> int:
+        """Return how many publishers of a topic that is received now are seen."""
+        found = self.subscriptions.get(name)
+        return found.get_publisher_count() if found is not None else 0
+
+    def publishing_nodes(self, name: str) -> int:
+        """Return how many nodes publish a topic that is received now. One that was killed and
+        started again is one, though for a while both its lives are seen.
+        """
+        known = name in self.subscriptions
+        infos = self._node.get_publishers_info_by_topic(name) if known else []
+        return len({(info.node_namespace, info.node_name) for info in infos})

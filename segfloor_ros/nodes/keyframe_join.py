@@ -1,0 +1,72 @@
+"""The parts of a keyframe, for the nodes behind SLAM."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from segfloor_ros.messages.headers import make_header
+from segfloor_ros.messages.progress import map_start_ns
+from segfloor_ros.messages.topics import KEYFRAME_DONE, MAP_START
+from segfloor_ros.nodes.stage_node import AnyStageNode
+
+Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
+"""Gets the stamp and the messages by topic; returns values for the status."""
+
+
+MAX_WAITING = 100
+
+
+class KeyframeJoin:
+    """Joins the parts of a keyframe and has the node process them. Where SLAM tells which map a
+    keyframe belongs to, the node is reset before the first one of another map.
+
+    may_process: keyframes are kept while it says no, until `process_waiting`. is_last: the
+    keyframe goes no further when the node has processed it.
+    """
+
+    def __init__(
+        self,
+        node: AnyStageNode,
+        parts: Sequence[str],
+        process: Process,
+        may_process: Callable[[], bool] = lambda: True,
+        is_last: bool = False,
+    ) -> None:
+        self._node = node
+        self._process = process
+        self._may_process = may_process
+        self._is_last = is_last
+        self._done = node.output(KEYFRAME_DONE)
+        self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=MAX_WAITING)
+        self.map_start_ns: int | None = None
+        """When the map was begun; None where nobody has told."""
+
+        def is_told() -> bool:
+            return node.inputs.publisher_count(MAP_START) > 0
+
+        node.inputs.join(parts, self._take, optional={MAP_START: is_told})
+
+    @property
+    def waiting_count(self) -> int:
+        """How many keyframes are kept."""
+        return len(self._waiting)
+
+    def process_waiting(self) -> None:
+        """Process what is kept, as far as it may be."""
+        while self._waiting and self._may_process():
+            stamp_ns, parts = self._waiting.popleft()
+            is_well = self._node.work(stamp_ns, partial(self._process, stamp_ns, parts))
+            if self._is_last or not is_well:
+                self._done.publish(make_header(stamp_ns, ''))
+
+    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        if MAP_START in parts:
+            last_ns, self.map_start_ns = self.map_start_ns, map_start_ns(parts[MAP_START])
+            if last_ns not in (None, self.map_start_ns):
+                self._waiting.clear()
+                self._node.reset('stereo_slam has begun a new map')
+        self._waiting.append((stamp_ns, parts))
+        self.process_waiting()

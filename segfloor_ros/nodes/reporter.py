@@ -1,0 +1,150 @@
+"""What a node tells about itself: a status per stamp, its health once a second, and the log."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+from rclpy.subscription import Subscription
+
+from segfloor_ros.errors import SegfloorError
+from segfloor_ros.messages.diagnostics import HEALTH, Level, Status, status_message
+from segfloor_ros.messages.health import Health
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.losses import LossCounter, loss_in_words
+from segfloor_ros.messages.topics import DIAGNOSTICS, Topic
+from segfloor_ros.resident_memory import rss_mb
+
+LOSS_LASTS_S = 10.0
+PROBLEM_LASTS_S = 3.0
+REPEAT_S = 5.0
+
+
+class Reporter:
+    """Publishes on /diagnostics how a node fares, in every state, and logs it now and then."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.publisher = node.create_publisher(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
+        )
+        self.health = Health()
+        self._losses: dict[str, LossCounter] = {}
+        self._logged_s: dict[str, float] = {}
+
+    def note_received(
+        self, topic: Topic, stamp_ns: int, info: Mapping[str, Any], subscription: Subscription
+    ) -> None:
+        """Count a message of a topic, its age, and the messages that are missing before it. info:
+        what the middleware tells of it.
+        """
+        delay_s = 1e-9 * (self._node.get_clock().now().nanoseconds - stamp_ns)
+        waited_s = 1e-9 * (time.time_ns() - int(info.get('received_timestamp') or time.time_ns()))
+        self.health.received(topic.name, delay_s, waited_s)
+        # Of a latched topic only the last message counts.
+        if topic.profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            return
+        losses = self._losses.setdefault(topic.name, LossCounter())
+        lost = losses.note(info.get('publication_sequence_number'))
+        # The numbers of several publishers run side by side.
+        if lost and subscription.get_publisher_count() == 1:
+            self.health.lost(topic.name, lost)
+            name, profile = self._node.get_name(), subscription.qos_profile
+            text = loss_in_words(topic.name, lost, name, profile)
+            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, LOSS_LASTS_S)
+
+    def restart_loss_counts(self) -> None:
+        """What comes from now on is not missed."""
+        for losses in self._losses.values():
+            losses.skip()
+
+    def report(self, stamp_ns: int, level: Level, message: str, **values: Any) -> None:
+        """Publish a status about one stamp."""
+        self.publish('', stamp_ns, level, message, {**values, 'rss_mb': f'{rss_mb():.2f}'})
+
+    def report_processed(
+        self, stamp_ns: int, level: Level, message: str, milliseconds: float, **values: Any
+    ) -> None:
+        """Publish a status about what was processed."""
+        self.health.processed(milliseconds, message)
+        self.report(stamp_ns, level, message, **values, processing_ms=f'{milliseconds:.3f}')
+
+    def report_waiting(self, stamp_ns: int, message: str) -> None:
+        """Publish a status about what cannot be processed yet, and is kept."""
+        self.health.waits(message)
+        self.report(stamp_ns, Level.WARN, message)
+
+    def report_fault(self, stamp_ns: int, error: Exception) -> None:
+        """Log a fault and publish a status about it."""
+        self.health.failed()
+        self.log_fault(f'stamp {stamp_ns}', error)
+        self.report(stamp_ns, Level.ERROR, one_line(error))
+
+    def report_dropped(self, joiner: StampJoiner, publishing_nodes: Callable[[str], int]) -> None:
+        """Warn about sets that were given up, naming the topics of the missing parts."""
+        for dropped in joiner.take_dropped():
+            names = ', '.join(dropped.missing)
+            counts = {name: publishing_nodes(name) for name in joiner.parts}
+            crowded = ''.join(
+                f'; {name} is published by {count} nodes, stop or remap one'
+                for name, count in counts.items()
+                if count > 1
+            )
+            text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
+            self.health.dropped()
+            self.warn(text, about=names + crowded)
+            self.report(dropped.stamp_ns, Level.ERROR, text)
+
+    def diagnose(
+        self, about: str, text: str, level: Level = Level.WARN, lasts_s: float = PROBLEM_LASTS_S
+    ) -> None:
+        """Tell what is wrong and what to do about it: in the log now and then, on /diagnostics as
+        long as it is found again within `lasts_s`.
+        """
+        self.health.found(about, level, text, lasts_s)
+        self.warn(text, about)
+
+    def warn(self, text: str, about: str = '') -> None:
+        """Log a warning, at most every few seconds about the same."""
+        if self._is_due(about or text):
+            self._node.get_logger().warning(text)
+
+    def log_fault(self, where: str, error: Exception) -> None:
+        """Log a fault in one line, at most every few seconds; the traceback of an unexpected one
+        goes to the debug log.
+        """
+        text, log = one_line(error), self._node.get_logger()
+        if not self._is_due(text):
+            return
+        log.error(text if text.startswith(where) else f'{where}: {text}')
+        if not isinstance(error, SegfloorError):
+            log.debug(''.join(traceback.format_exception(error)))
+
+    def publish_health(self, state: str) -> None:
+        """Publish how the node fares. state: of the node, in a word."""
+        level, words, values = self.health.summary(state)
+        values['rss_mb'] = f'{rss_mb():.1f}'
+        self.publish(HEALTH, self._node.get_clock().now().nanoseconds, level, words, values)
+
+    def publish(
+        self, kind: str, stamp_ns: int, level: Level, message: str, values: Mapping[str, Any]
+    ) -> None:
+        """Publish a status of a kind of its own."""
+        name = self._node.get_fully_qualified_name() + (f': {kind}' if kind else '')
+        texts = {key: str(value) for key, value in values.items()}
+        self.publisher.publish(status_message(Status(stamp_ns, name, level, message, texts)))
+
+    def _is_due(self, about: str) -> bool:
+        now_s = time.monotonic()
+        self._logged_s = {key: s for key, s in self._logged_s.items() if now_s - s < REPEAT_S}
+        return self._logged_s.setdefault(about, now_s) == now_s
+
+
+def one_line(error: Exception) -> str:
+    """Return an error in one line; unexpected ones with their type."""
+    text = ' '.join(str(error).split())
+    return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'

@@ -1,0 +1,130 @@
+"""Stereo pairs and their calibration as messages, from whatever a camera's driver publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo
+
+from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.images import EightBitScale
+from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.camera_info import eye_calibration, same_calibration
+from segfloor_ros.messages.images import grey_image
+from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.camera_watch import CameraWatch
+from segfloor_ros.nodes.qos_check import offered_best_effort
+from segfloor_ros.nodes.stage_node import AnyStageNode
+
+INFOS = ('left/camera_info', 'right/camera_info')
+MAX_UNPAIRED = 30
+Pair = dict[str, Any]
+"""A left and a right message of the same time, by topic."""
+
+
+class StereoInput:
+    """Receives images and calibrations, pairs them by stamp and rectifies them.
+
+    on_pair: gets every pair. on_calibration: called when a calibration has come.
+    """
+
+    def __init__(
+        self,
+        node: AnyStageNode,
+        own: StereoSlamNodeSettings,
+        on_pair: Callable[[int, Pair], None],
+        on_calibration: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._own = own
+        self._on_calibration = on_calibration
+        self._infos: dict[str, CameraInfo] = {}
+        self._eyes: dict[str, EyeCalibration] = {}
+        self._takes_best_effort = own.image_reliability == 'best_effort'
+        kind = 'image_rect' if own.rectified_input else 'image_raw'
+        kind += '/compressed' if own.image_transport == 'compressed' else ''
+        self.left, self.right = f'left/{kind}', f'right/{kind}'
+        self.watch = CameraWatch(node, own, self.left, self.right)
+        self.reset()
+        for info in INFOS:
+            node.inputs.subscribe(info, partial(self._take_info, info), self._choose_profile)
+        node.inputs.join(
+            (self.left, self.right),
+            on_pair,
+            on_message=self.watch.saw_image,
+            choose_profile=self._choose_profile,
+            capacity=MAX_UNPAIRED,
+            tolerance_ns=round(own.sync_tolerance_s * 1e9),
+        )
+
+    def reset(self) -> None:
+        """Take over the latest calibration with the next pair."""
+        self._rectifier: StereoRectifier | None = None
+        self._eight_bit = EightBitScale(self._own.bit_depth)
+
+    @property
+    def missing_calibrations(self) -> list[str]:
+        """The topics on which no calibration has come."""
+        return [topic for topic in INFOS if topic not in self._eyes]
+
+    @property
+    def calibration(self) -> StereoCalibration:
+        """The calibration of the rectified images, of which both eyes are known."""
+        return self._raw_calibration().rectified()
+
+    @property
+    def rectifier(self) -> StereoRectifier:
+        """What rectifies, made for the calibration at the first pair."""
+        if self._rectifier is None:
+            taken = self.calibration if self._own.rectified_input else self._raw_calibration()
+            self._rectifier = StereoRectifier(taken)
+        return self._rectifier
+
+    def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the rectified grey images (H, W) of a pair. Raises MessageError."""
+        images = (grey_image(pair[topic], topic) for topic in (self.left, self.right))
+        left, right = self.rectifier.rectify(*self._eight_bit(*images))
+        self.watch.check_rows(left, right)
+        return left, right
+
+    def frame_ids(self, pair: Pair) -> tuple[str, str]:
+        """Return the names of both optical frames."""
+        return pair[self.left].header.frame_id, pair[self.right].header.frame_id
+
+    def adapt(self) -> None:
+        """Take the images best effort where a driver offers no more, if the choice is left to the
+        node.
+        """
+        if self._takes_best_effort or self._own.image_reliability != 'auto':
+            return
+        lossy = offered_best_effort(self._node, (*INFOS, self.left, self.right))
+        if lossy:
+            self._takes_best_effort = True
+            names = ', '.join(lossy)
+            self._node.get_logger().info(
+                f'taken best effort, as offered: {names}; images may get lost'
+            )
+            self._node.inputs.reopen()
+
+    def _choose_profile(self) -> QoSProfile:
+        return qos.IMAGES_BEST_EFFORT if self._takes_best_effort else qos.IMAGES
+
+    def _raw_calibration(self) -> StereoCalibration:
+        return StereoCalibration(*(self._eyes[topic] for topic in INFOS))
+
+    def _take_info(self, topic: str, message: CameraInfo) -> None:
+        if topic in self._infos and same_calibration(message, self._infos[topic]):
+            return
+        self._eyes[topic] = eye_calibration(message, topic)
+        self._infos[topic] = message
+        if self._rectifier is not None:
+            self._node.reporter.warn(
+                f'{topic}: the calibration is not the one in use; ~/reset takes it over'
+            )
+        self._on_calibration()
