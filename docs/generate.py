@@ -67,8 +67,8 @@ SERVICES = {
         (
             *RESET,
             'Drop the map and begin with an empty one. The nodes behind it learn it from '
-            '`keyframe/map_start` and drop theirs. The same happens when the stamps of the images go back by more than half a '
-            'second, as when a recording begins again.',
+            '`keyframe/map_start` and drop theirs. The same happens when the stamps of the images '
+            'go back by more than half a second, as when a recording is played again.',
         ),
     ],
     FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
