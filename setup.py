@@ -58,7 +58,15 @@ setup(
     ],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-        'cli': ['typer>=0.12', 'rich>=13', 'rosbags>=0.10', 'evo>=1.28', 'matplotlib>=3.6'],
+        'cli': [
+            'typer>=0.12',
+            'rich>=13',
+            'rosbags>=0.10',
+            'evo>=1.28',
+            'matplotlib>=3.6',
+            'junitparser>=3',
+        ],
+        'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
         'sim': ['mujoco>=3.3'],
         # colcon takes the tests to be pytest's by this name.
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],

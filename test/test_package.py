@@ -20,7 +20,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
 IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
                  'python3-yaml': 'yaml'}  # fmt: skip
-OF_EXTRAS = {'typer', 'rich', 'rosbags', 'evo', 'matplotlib', 'mujoco'}
+OF_EXTRAS = {'typer', 'rich', 'rosbags', 'evo', 'matplotlib', 'mujoco', 'junitparser', 'fsspec',
+             'distributed'}  # fmt: skip
 START_S = 60.0
 
 
@@ -175,6 +176,7 @@ def installed(workspace: Path, command: str, **environment: str) -> subprocess.P
     )
 
 
+@pytest.mark.slow
 def test_the_install_has_what_ros_looks_for(workspace) -> None:
     prefix = workspace / 'install' / 'segfloor_ros'
     for node in (*NODES, 'segfloor_pipeline', 'segfloor'):
@@ -191,6 +193,7 @@ def test_the_install_has_what_ros_looks_for(workspace) -> None:
     assert profiles.stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_colcon_runs_the_tests(workspace) -> None:
     some = ['--pytest-args', 'test/test_geometry.py']
     colcon = ['colcon', '--log-base', 'log', 'test', '--return-code-on-test-failure', *some]
@@ -204,6 +207,7 @@ def test_colcon_runs_the_tests(workspace) -> None:
     assert (suite.attrib['failures'], suite.attrib['errors']) == ('0', '0')
 
 
+@pytest.mark.slow
 def test_the_installed_command_runs_from_the_install(workspace) -> None:
     out, errors = installed(workspace, 'segfloor --help').communicate(timeout=START_S)
     assert 'replay' in out, errors
@@ -212,6 +216,7 @@ def test_the_installed_command_runs_from_the_install(workspace) -> None:
     assert str(workspace / 'install') in out, errors
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
 @pytest.mark.parametrize('node', NODES[1:])
 def test_an_installed_node_starts_and_stops_on_interrupt(workspace, make_graph, node) -> None:
@@ -227,6 +232,7 @@ def test_an_installed_node_starts_and_stops_on_interrupt(workspace, make_graph, 
     assert process.returncode == 0, errors
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
 def test_an_installed_camera_without_input_says_so(workspace) -> None:
     path = workspace / 'install' / 'segfloor_ros' / 'lib' / 'segfloor_ros' / 'stereo_camera'

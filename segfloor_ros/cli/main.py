@@ -10,6 +10,7 @@ import typer
 
 from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.cli.calibrate import calibrate
+from segfloor_ros.cli.check import check_suite
 from segfloor_ros.cli.convert import convert
 from segfloor_ros.cli.demo import demo
 from segfloor_ros.cli.evaluate import app as evaluate
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
     app.command()(command)
+app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')
 
 

@@ -1,0 +1,171 @@
+"""`segfloor check`: many recordings against bounds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+from rich.table import Table
+
+from segfloor_ros.cli.output import console, figure_table, print_error
+from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.suite.bounds import number
+from segfloor_ros.suite.description import Entry, Suite, read_suite
+from segfloor_ros.suite.job import Job, Outcome, package_digest
+from segfloor_ros.suite.result_files import MEASURED, unpack
+from segfloor_ros.suite.verdicts import (
+    Baseline,
+    Checked,
+    SuiteResult,
+    check,
+    read_baseline,
+    write_baseline,
+)
+from segfloor_ros.suite.workers import outcomes
+
+COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
+HEADINGS = ('tracked %', 'path error m', 'precision %', 'recall %', 'time ratio')
+
+
+def check_suite(
+    suite: Annotated[Path, typer.Argument(metavar='SUITE.yaml', help='Recordings and bounds.')],
+    out: Annotated[Path, typer.Option('--out', help='Folder for the results.')],
+    jobs: Annotated[
+        int, typer.Option(min=1, help='Recordings at a time, each in a process of this machine.')
+    ] = 1,
+    scheduler: Annotated[
+        str, typer.Option(help='Address of a Dask scheduler whose workers map the recordings.')
+    ] = '',
+    resume: Annotated[
+        bool, typer.Option('--resume', help='Keep what an interrupted check has left in --out.')
+    ] = False,
+    baseline: Annotated[
+        Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        typer.Option(help='Nothing may be worse than in this file by more than no_worse_by.'),
+    ] = None,
+    baseline_to_write: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option('--write-baseline', help='Write the measures for a later --baseline.'),
+    ] = None,
+    cache: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help='Folder for results, renderings and copies to use again. '
+            '[default: ~/.cache/segfloor]'
+        ),
+    ] = None,
+    no_cache: Annotated[
+        bool, typer.Option('--no-cache', help='Map every recording, whatever the cache has.')
+    ] = False,
+) -> None:
+    """Map recordings and hold the results against bounds. Status 1: a bound failed."""
+    described = read_suite(suite)
+    known = read_baseline(baseline) if baseline is not None else None
+    _check_folder(out)
+    folder = (cache or _default_cache()).absolute()
+    todo = [_job(entry, folder, not no_cache) for entry in described.entries]
+    found: dict[str, Checked] = {}
+    for job, outcome in _all_outcomes(todo, out, resume, jobs, scheduler):
+        checked = check(job.entry, outcome, known)
+        found[checked.name] = checked
+        _print_progress(checked, len(found), len(todo))
+    result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
+    _finish(result, out, described, known)
+    if baseline_to_write is not None:
+        write_baseline(result, baseline_to_write)
+        console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)
+    if not result.holds:
+        raise typer.Exit(1)
+
+
+def _job(entry: Entry, cache: Path, reuse: bool) -> Job:
+    params = Path(entry.params).read_text() if entry.params else ''
+    return Job(entry, params, str(cache), reuse)
+
+
+def _all_outcomes(
+    todo: list[Job], out: Path, resume: bool, processes: int, scheduler: str
+) -> Iterator[tuple[Job, Outcome]]:
+    """Yield jobs with what came of them; what is in `out` already comes first."""
+    by_name = {job.entry.name: job for job in todo}
+    for job in todo if resume else ():
+        kept = _read_outcome(job, out)
+        if kept is not None:
+            del by_name[job.entry.name]
+            yield job, kept
+    for outcome in outcomes(list(by_name.values()), processes, scheduler):
+        if outcome.package not in ('', package_digest()):
+            raise SettingsError(
+                f'worker {outcome.worker} has another version of segfloor_ros than this machine; '
+                'install the same on all'
+            )
+        job = by_name[outcome.name]
+        unpack(outcome.archive, out / outcome.name)
+        if not outcome.problem:
+            record = {'job': job.digest(), 'seconds': outcome.seconds, **outcome.measured}
+            (out / outcome.name / MEASURED).write_text(json.dumps(record, indent=2) + '\n')
+        yield job, outcome
+
+
+def _read_outcome(job: Job, out: Path) -> Outcome | None:
+    """Return what an earlier check found, None where it did not or with other parameters."""
+    try:
+        record = json.loads((out / job.entry.name / MEASURED).read_text())
+        if record.pop('job') != job.digest():
+            return None
+        seconds = record.pop('seconds')
+    except (OSError, ValueError, KeyError):
+        return None
+    return Outcome(job.entry.name, record, seconds=seconds, reused=True)
+
+
+def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:
+    """Print the table and what fails, and write the files of the suite."""
+    # Imported here: Matplotlib takes a second that other commands should not wait for.
+    from segfloor_ros.suite.junit import write_junit
+    from segfloor_ros.suite.page import write_page
+
+    console.print(_table(result))
+    for checked in result.recordings:
+        for complaint in checked.complaints:
+            print_error(complaint)
+    if baseline is not None:
+        for name in [e.name for e in described.entries if e.name not in baseline]:
+            print_error(f"{name}: is not in the baseline, so only the suite's own bounds hold")
+    write_junit(result, out / 'junit.xml')
+    console.print(f'junit: {out / "junit.xml"}', highlight=False, soft_wrap=True)
+    console.print(f'page: {write_page(result, out)}', highlight=False, soft_wrap=True)
+
+
+def _print_progress(checked: Checked, done: int, total: int) -> None:
+    state = 'ok' if checked.holds else 'no map' if checked.problem else 'fails'
+    origin = 'kept' if checked.reused else f'{checked.seconds:.0f} s'
+    console.print(f'{done}/{total} {checked.name}: {state} ({origin})', highlight=False)
+
+
+def _table(result: SuiteResult) -> Table:
+    table = figure_table('recording', 'result', *HEADINGS)
+    for checked in result.recordings:
+        state = '[green]ok' if checked.holds else '[red]no map' if checked.problem else '[red]fails'
+        values = (checked.measured.get(name) for name in COLUMNS)
+        cells = ('' if value is None else number(value) for value in values)
+        table.add_row(checked.name, state, *cells)
+    return table
+
+
+def _check_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f'{out}: cannot be a folder for the results ({error.strerror}); choose another --out'
+        ) from None
+
+
+def _default_cache() -> Path:
+    home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+    return Path(home) / 'segfloor'

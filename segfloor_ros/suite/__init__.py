@@ -1,0 +1,1 @@
+"""Suites: many recordings mapped, measured and held against bounds, on one machine or on many."""

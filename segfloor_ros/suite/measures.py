@@ -1,0 +1,140 @@
+"""What a suite can bound: the measures of a mapped recording."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.floor import score_floor_folders
+from segfloor_ros.evaluation.map_score import score_map
+from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.evaluation.truth import load_truth, read_map
+from segfloor_ros.grid.occupancy import OccupancyGrid
+
+HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
+
+
+@dataclass(frozen=True)
+class Measure:
+    """better: which way is better. slack: by how much it may be worse than the baseline unless the
+    suite says otherwise; relative: as a share of the baseline; None: it is not compared.
+    """
+
+    unit: str
+    better: str
+    description: str
+    slack: float | None = None
+    relative: bool = False
+
+
+MEASURES = {
+    'tracked_percent': Measure('%', HIGHER, 'frames with a pose', 1.0),
+    'lost_intervals': Measure('', LOWER, 'stretches of frames without a pose', 0.0),
+    'path_error_m': Measure('m', LOWER, 'RMSE of the path after rigid alignment', 0.01),
+    'end_error_m': Measure('m', LOWER, 'error of the last pose, seen from the first', 0.02),
+    'return_m': Measure('m', LOWER, 'from the last pose to the first'),
+    'precision_percent': Measure('%', HIGHER, 'of road maps, map after opening', 0.5),
+    'recall_percent': Measure('%', HIGHER, 'of road maps, map after opening', 1.0),
+    'free_precision_percent': Measure('%', HIGHER, 'of the cells called free', 0.5),
+    'free_recall_percent': Measure('%', HIGHER, 'of the cells that are free', 1.0),
+    'floor_precision_percent': Measure('%', HIGHER, 'of the floor masks', 0.5),
+    'floor_recall_percent': Measure('%', HIGHER, 'of the floor masks', 1.0),
+    'agreement_percent': Measure('%', HIGHER, 'cells known here and in reference_map, alike', 1.0),
+    'known_area_m2': Measure('m²', HIGHER, 'free and occupied cells', 0.02, relative=True),
+    'keyframes': Measure('', NEITHER, 'keyframes'),
+    'loops': Measure('', NEITHER, 'closed loops'),
+    'camera_height_m': Measure('m', NEITHER, 'height of the camera above the floor'),
+    'time_ratio': Measure('', LOWER, 'median of all stages per keyframe, in reference workloads'),
+    'memory_peak_mb': Measure('MB', LOWER, 'resident memory at most', 0.2, relative=True),
+    'memory_per_update_mb': Measure('MB', LOWER, 'more resident memory per map update'),
+    'wall_s': Measure('s', LOWER, 'time of mapping'),
+}
+
+
+def measure_run(
+    run: Path, truth: Path | None, reference_map: Path | None, reference_ms: float
+) -> dict[str, float]:
+    """Return the measures of a results folder by name, those that the truth allows.
+
+    truth: a folder with map.yaml (and scene.yaml, base_poses.txt), poses.txt or floor/, or a map
+    YAML. reference_map: a map of an earlier run from the same start. reference_ms: median time of
+    the reference workload. Raises InputError naming what cannot be read.
+    """
+    summary = json.loads((run / 'summary.json').read_text())
+    grid = read_map(run / 'map.yaml')
+    measured = {
+        **_of_summary(summary, reference_ms),
+        'return_m': _return_m(run / 'trajectory.txt'),
+        'known_area_m2': float((states(grid) != UNKNOWN).sum()) * grid.resolution_m**2,
+    }
+    if truth is not None:
+        measured.update(_against_truth(run, grid, truth))
+    if reference_map is not None:
+        measured['agreement_percent'] = 100 * agreement(grid, read_map(reference_map))
+    return {name: round(value, 6) for name, value in measured.items() if np.isfinite(value)}
+
+
+def agreement(grid: OccupancyGrid, reference: OccupancyGrid) -> float:
+    """Return the share of the cells known in both maps, of one frame, that say the same. NaN where
+    there is none.
+    """
+    here, there = resample(grid, reference, (0.0, 0.0, 0.0)), states(reference)
+    both = (here != UNKNOWN) & (there != UNKNOWN)
+    return float((here == there)[both].mean()) if both.any() else float('nan')
+
+
+def _of_summary(summary: dict[str, Any], reference_ms: float) -> dict[str, float]:
+    stage_ms = sum(stage['p50_ms'] for stage in summary['stages'].values())
+    memory = summary['rss_mb']
+    return {
+        'tracked_percent': 100 * summary['tracked_frames'] / max(1, summary['frames']),
+        'lost_intervals': float(len(summary['lost_intervals'])),
+        'keyframes': float(summary['keyframes']),
+        'loops': float(summary['loops']),
+        'camera_height_m': float(summary['camera_height_m']),
+        'time_ratio': stage_ms / reference_ms,
+        'memory_peak_mb': float(memory['peak']),
+        'memory_per_update_mb': float(memory['slope_per_update']),
+        'wall_s': float(summary['wall_s']),
+    }
+
+
+def _return_m(trajectory: Path) -> float:
+    poses = read_trajectory(trajectory)[1]
+    return float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]))
+
+
+def _against_truth(run: Path, grid: OccupancyGrid, truth: Path) -> dict[str, float]:
+    measured: dict[str, float] = {}
+    if not truth.exists():
+        raise InputError(f'{truth}: there is no such truth')
+    if not truth.is_dir() or (truth / 'map.yaml').is_file():
+        known = load_truth(truth)
+        score = score_map(grid, known, known.start_pose or (0.0, 0.0, 0.0))
+        measured['precision_percent'] = 100 * score.opened.precision.mean
+        measured['recall_percent'] = 100 * score.opened.recall.mean
+        measured['free_precision_percent'] = 100 * score.cells.free_precision
+        measured['free_recall_percent'] = 100 * score.cells.free_recall
+    if (truth / 'poses.txt').is_file():
+        # Imported here: evo takes a second that no other command should wait for.
+        from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+
+        path = score_trajectory(match_files(run, truth))
+        measured['path_error_m'] = path.ate_rmse_m
+        measured['end_error_m'] = path.end_error_m
+    if _share_masks(run / 'floor_masks', truth / 'floor'):
+        floor = score_floor_folders(run, truth)
+        measured['floor_precision_percent'] = 100 * floor.precision
+        measured['floor_recall_percent'] = 100 * floor.recall
+    return measured
+
+
+def _share_masks(ours: Path, true: Path) -> bool:
+    names = [{file.name for file in folder.glob('*.png')} for folder in (ours, true)]
+    return bool(names[0] & names[1])

@@ -1,0 +1,91 @@
+"""A suite's results on one page, with links to the report of each recording."""
+
+from __future__ import annotations
+
+import base64
+import html
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from segfloor_ros.evaluation.report import REPORT_NAME, STYLE
+from segfloor_ros.suite.bounds import number
+from segfloor_ros.suite.measures import MEASURES
+from segfloor_ros.suite.verdicts import Checked, SuiteResult
+
+PAGE = 'suite.html'
+COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent',
+           'known_area_m2', 'time_ratio', 'memory_peak_mb')  # fmt: skip
+THUMBNAIL_PX = 110
+MARKS = """
+td { vertical-align: middle; } td:first-child a { font-weight: 600; }
+.ok { color: #1b7f3b; } .bad { color: #b3261e; } ul { margin: 0; padding-left: 18px; }
+img { image-rendering: pixelated; border: 1px solid #e1e6ec; }
+"""
+
+
+def write_page(result: SuiteResult, folder: Path) -> Path:
+    """Write suite.html into the suite's folder, which holds a folder for each recording."""
+    kept = sum(checked.holds for checked in result.recordings)
+    title = html.escape(result.name)
+    names = ('recording', 'map', '', *COLUMNS)
+    head = ''.join(f'<th>{_heading(name)}</th>' for name in names)
+    rows = ''.join(_row(checked, folder) for checked in result.recordings)
+    failed = ''.join(
+        f'<li class="bad">{html.escape(complaint)}</li>'
+        for checked in result.recordings
+        for complaint in checked.complaints
+    )
+    complaints = f'<h2>What fails</h2><ul>{failed}</ul>' if failed else ''
+    path = folder / PAGE
+    path.write_text(
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<title>{title}</title><style>{STYLE}{MARKS}</style></head><body>'
+        f'<h1>{title}</h1><p class="sub">{kept} of {len(result.recordings)} recordings are as '
+        f'they should be</p>{complaints}<h2>Recordings</h2>'
+        f'<table><tr>{head}</tr>{rows}</table></body></html>\n',
+        encoding='utf-8',
+    )
+    return path
+
+
+def _row(checked: Checked, folder: Path) -> str:
+    name = html.escape(checked.name)
+    link = f'{checked.name}/{REPORT_NAME}'
+    if (folder / link).is_file():
+        name = f'<a href="{html.escape(link)}">{name}</a>'
+    failing = {v.bound.measure for v in checked.verdicts if not v.holds}
+    cells = [name, _thumbnail(folder / checked.name / 'map.pgm'), _state(checked)]
+    for measure in COLUMNS:
+        value = checked.measured.get(measure)
+        text = '' if value is None else number(value)
+        cells.append(f'<span class="bad">{text}</span>' if measure in failing else text)
+    return '<tr>' + ''.join(f'<td>{cell}</td>' for cell in cells) + '</tr>'
+
+
+def _state(checked: Checked) -> str:
+    if checked.holds:
+        return '<span class="ok">ok</span>'
+    return f'<span class="bad">{"no map" if checked.problem else "fails"}</span>'
+
+
+def _heading(name: str) -> str:
+    if name not in MEASURES:
+        return name
+    unit = MEASURES[name].unit
+    words = name.removesuffix('_percent').removesuffix('_m2').removesuffix('_mb').removesuffix('_m')
+    return html.escape(words.replace('_', ' ') + (f' {unit}' if unit else ''))
+
+
+def _thumbnail(path: Path) -> str:
+    """Return a small picture of a map, '' where there is none."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if image is None:
+        return ''
+    scale = THUMBNAIL_PX / max(image.shape)
+    size = np.maximum(1, np.rint(scale * np.array(image.shape[::-1]))).astype(int)
+    small = cv2.resize(image, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
+    data = base64.b64encode(bytes(cv2.imencode('.png', small)[1])).decode()
+    return f'<img alt="map" src="data:image/png;base64,{data}">'

@@ -1,0 +1,94 @@
+"""What a suite found: each recording with its measures and verdicts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.suite.bounds import Verdict, bounds_of_baseline, judge
+from segfloor_ros.suite.description import Entry
+from segfloor_ros.suite.job import Outcome
+
+FORMAT = 1
+Baseline = Mapping[str, Mapping[str, float]]
+"""Measures by recording."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A recording, its measures, and what they say to its bounds. problem: why there is no map."""
+
+    name: str
+    measured: Mapping[str, float]
+    verdicts: list[Verdict]
+    problem: str
+    seconds: float
+    reused: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether there is a map and every bound is kept."""
+        return not self.problem and all(verdict.holds for verdict in self.verdicts)
+
+    @property
+    def complaints(self) -> list[str]:
+        """A line for each thing that is wrong."""
+        if self.problem:
+            return [f'{self.name}: {self.problem}']
+        return [f'{self.name}: {verdict}' for verdict in self.verdicts if not verdict.holds]
+
+
+@dataclass(frozen=True)
+class SuiteResult:
+    """All recordings of a suite, in its order."""
+
+    name: str
+    recordings: list[Checked]
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything is as it should be."""
+        return all(checked.holds for checked in self.recordings)
+
+
+def check(entry: Entry, outcome: Outcome, baseline: Baseline | None) -> Checked:
+    """Hold an outcome against the bounds of the suite and, where given, of a baseline."""
+    bounds = list(entry.bounds)
+    if baseline is not None:
+        bounds += bounds_of_baseline(baseline.get(entry.name, {}), entry.slacks)
+    return Checked(
+        entry.name,
+        outcome.measured,
+        judge(bounds, outcome.measured),
+        outcome.problem,
+        outcome.seconds,
+        outcome.reused,
+    )
+
+
+def write_baseline(result: SuiteResult, path: Path) -> None:
+    """Write the measures of all recordings that have a map."""
+    measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
+    document = {'version': FORMAT, 'recordings': measures}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(document, indent=2) + '\n')
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read what `write_baseline` wrote. Raises InputError."""
+    try:
+        recordings = json.loads(path.read_text())['recordings']
+        return {
+            name: {key: float(value) for key, value in measures.items()}
+            for name, measures in recordings.items()
+        }
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f'{path}: not a baseline; write one with --write-baseline') from None

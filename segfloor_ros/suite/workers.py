@@ -1,0 +1,71 @@
+"""Who does the jobs of a suite: this process, processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.suite.job import Job, Outcome, do_job
+
+CONNECT_S = 30
+
+
+def outcomes(jobs: list[Job], processes: int = 1, scheduler: str = '') -> Iterator[Outcome]:
+    """Yield what comes of the jobs, as they finish. scheduler: address of a Dask scheduler, whose
+    workers do them; else so many processes of this machine. Raises SettingsError.
+    """
+    if not scheduler and processes == 1:
+        yield from map(do_job, jobs)
+        return
+    with _client(processes, scheduler) as client:
+        yield from _distributed(client, jobs)
+
+
+def _distributed(client: Any, jobs: list[Job]) -> Iterator[Outcome]:
+    """A worker that dies has its job done again by another one (Dask sees to that, a few times)."""
+    from distributed import as_completed
+
+    names = {}
+    futures = []
+    for job in jobs:
+        future = client.submit(do_job, job, pure=False)
+        names[future.key] = job.entry.name
+        futures.append(future)
+    finished = as_completed(futures)
+    for future in finished:
+        if future.status == 'finished':
+            outcome = future.result()
+        else:
+            outcome = Outcome(names[future.key], {}, problem=f'{future.exception()}')
+        # The cluster need not keep what is here now.
+        future.release()
+        yield outcome
+
+
+@contextlib.contextmanager
+def _client(processes: int, scheduler: str) -> Iterator[Any]:
+    try:
+        import distributed
+    except ImportError:
+        raise SettingsError(
+            "--jobs and --scheduler need Dask: pip install 'segfloor_ros[cluster]'"
+        ) from None
+    with contextlib.ExitStack() as stack:
+        address: Any = scheduler
+        if not scheduler:
+            address = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=processes,
+                    threads_per_worker=1,
+                    memory_limit=0,
+                    dashboard_address=None,
+                    silence_logs='CRITICAL',
+                )
+            )
+        try:
+            client = distributed.Client(address, timeout=CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise SettingsError(f'--scheduler {scheduler}: cannot be reached ({error})') from None
+        yield stack.enter_context(client)

@@ -1,0 +1,130 @@
+"""`segfloor check` for real, on a drive through a generated room."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from junitparser import JUnitXml
+
+from segfloor_ros.suite.description import Entry
+from segfloor_ros.suite.job import Job, do_job
+from segfloor_ros.suite.recordings import digest_of
+
+SAME = ('map.pgm', 'map.yaml', 'trajectory.txt', 'labelled_cloud.ply', 'floor_masks')
+SUITE = """
+name: rooms
+defaults:
+  set: {{stereo_slam.num_features: 700}}
+recordings:
+  - input: {room}
+    name: good
+    expect: {{tracked_percent: 100, path_error_m: 0.02, return_m: 1}}
+  - input: {empty}
+    name: empty
+    expect: {{tracked_percent: 100}}
+"""
+
+
+def check(*arguments) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'check', *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240)
+
+
+def suite_of(folder: Path, room: Path, text: str = SUITE) -> Path:
+    (folder / 'empty').mkdir(exist_ok=True)
+    path = folder / 'suite.yaml'
+    path.write_text(text.format(room=room, empty=folder / 'empty'))
+    return path
+
+
+def good_alone(text: str = SUITE) -> str:
+    return text.partition('  - input: {empty}')[0]
+
+
+def test_a_suite_is_checked_kept_and_resumed(room, tmp_path):
+    out, cache = tmp_path / 'out', tmp_path / 'cache'
+    done = check(suite_of(tmp_path, room), '--out', out, '--cache', cache)
+    # A recording that cannot be mapped fails alone.
+    assert done.returncode == 1, done.stderr
+    assert 'empty: ' in done.stderr
+    document = JUnitXml.fromfile(str(out / 'junit.xml'))
+    assert (document.tests, document.failures, document.errors, document.skipped) == (6, 0, 1, 1)
+    assert '1 of 2 recordings' in (out / 'suite.html').read_text()
+    assert '<h2>Time per stage</h2>' in (out / 'good' / 'report.html').read_text()
+    measured = json.loads((out / 'good' / 'measured.json').read_text())
+    assert measured['tracked_percent'] == 100
+    assert 0 < measured['path_error_m'] < 0.02
+    # Driven 0.3 m straight on.
+    assert measured['return_m'] == pytest.approx(0.3, abs=0.02)
+    assert measured['time_ratio'] > 0
+
+    # The same content elsewhere is not mapped again; bounds are always looked at anew.
+    copy = tmp_path / 'moved'
+    shutil.copytree(room, copy)
+    strict = good_alone().replace('path_error_m: 0.02', 'path_error_m: 0.000001')
+    again = check(suite_of(tmp_path, copy, strict), '--out', tmp_path / 'new', '--cache', cache)
+    assert again.returncode == 1
+    assert 'good: fails (kept)' in again.stdout
+    assert 'good: path_error_m: ' in again.stderr
+    assert 'wanted at most 1e-06 m' in again.stderr
+    for name in SAME:
+        assert digest_of(tmp_path / 'new' / 'good' / name) == digest_of(out / 'good' / name)
+
+    # An interrupted check goes on with what is there, without any cache.
+    resumed = check(suite_of(tmp_path, room, good_alone()), '--out', out, '--resume', '--no-cache')
+    assert resumed.returncode == 0, resumed.stderr
+    assert 'good: ok (kept)' in resumed.stdout
+
+
+def test_what_became_worse_than_the_baseline_is_named(room, tmp_path):
+    baseline = tmp_path / 'baseline.json'
+    common = ('--out', tmp_path / 'out', '--cache', tmp_path / 'cache')
+    first = check(suite_of(tmp_path, room, good_alone()), *common, '--write-baseline', baseline)
+    assert first.returncode == 0, first.stderr
+    worse = good_alone().replace('700', '700, floor_segmentation.scan_range_m: 1.0')
+    second = check(suite_of(tmp_path, room, worse), *common, '--baseline', baseline)
+    assert second.returncode == 1
+    assert 'good: known_area_m2: ' in second.stderr
+    assert '(baseline ' in second.stderr
+
+
+def test_a_bad_suite_ends_with_status_2(room, tmp_path):
+    path = suite_of(tmp_path, room, good_alone() + '    colour: red\n')
+    done = check(path, '--out', tmp_path / 'out')
+    assert done.returncode == 2
+    assert f'{path}, line 9: unknown colour' in done.stderr
+    assert not (tmp_path / 'out').exists()
+
+
+def job_of(room, tmp_path, **changes) -> Job:
+    entry = Entry('room', str(room), assignments=('stereo_slam.num_features=700',), **changes)
+    return Job(entry, '', str(tmp_path / 'cache'), reuse=False)
+
+
+def test_a_recording_that_hangs_ends_at_its_time_out(room, tmp_path):
+    start_s = time.monotonic()
+    outcome = do_job(job_of(room, tmp_path, timeout_s=1.0))
+    assert outcome.problem == 'no map within 1 s'
+    assert time.monotonic() - start_s < 60
+    assert not psutil.Process().children()
+
+
+def test_a_program_that_crashes_is_the_problem_of_its_recording(room, tmp_path):
+    outcomes = []
+    worker = threading.Thread(target=lambda: outcomes.append(do_job(job_of(room, tmp_path))))
+    worker.start()
+    while not (children := psutil.Process().children()):
+        time.sleep(0.02)
+    os.kill(children[0].pid, signal.SIGSEGV)
+    worker.join()
+    assert outcomes[0].problem.endswith('(signal SIGSEGV)')

@@ -1,0 +1,75 @@
+"""A suite on two worker processes of Dask, one of which is killed in the middle."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from segfloor_ros.suite.recordings import digest_of
+
+distributed = pytest.importorskip('distributed')
+
+SAME = ('map.pgm', 'map.yaml', 'trajectory.txt', 'labelled_cloud.ply', 'floor_masks')
+NAMES = ('one', 'two', 'three')
+SUITE = 'recordings:\n' + ''.join(
+    # Each differs a little, so that none is taken for another one.
+    f'  - {{{{input: {{room}}, name: {name}, set: [stereo_slam.num_features={600 + 50 * i}]}}}}\n'
+    for i, name in enumerate(NAMES)
+)
+pytestmark = pytest.mark.slow
+
+
+def start_check(room: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+    suite = folder / 'suite.yaml'
+    suite.write_text(SUITE.format(room=room))
+    command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'check', str(suite), '--no-cache',
+               '--cache', str(folder / 'cache'), *options]  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def mapping(process: psutil.Process) -> bool:
+    """Whether a worker has a program that maps."""
+    return any('segfloor_ros.cli.main' in ' '.join(c.cmdline()) for c in process.children())
+
+
+def test_a_killed_worker_changes_nothing(room, tmp_path):
+    alone = start_check(room, tmp_path, '--out', str(tmp_path / 'alone'))
+    _, errors = alone.communicate(timeout=240)
+    assert alone.returncode == 0, errors
+
+    # Without nannies nobody starts the killed worker again: the other one must do its recording.
+    with distributed.LocalCluster(
+        n_workers=0, dashboard_address=None, silence_logs='CRITICAL'
+    ) as cluster:
+        worker = [sys.executable, '-m', 'distributed.cli.dask_worker', cluster.scheduler_address,
+                  '--nthreads', '1', '--no-nanny', '--no-dashboard']  # fmt: skip
+        workers = [
+            psutil.Popen(worker, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            for _ in range(2)
+        ]
+        try:
+            with distributed.Client(cluster) as client:
+                client.wait_for_workers(2)
+            checked = start_check(
+                room, tmp_path, '--out', str(tmp_path / 'two'),
+                '--scheduler', cluster.scheduler_address,
+            )  # fmt: skip
+            while checked.poll() is None and not all(mapping(w) for w in workers):
+                time.sleep(0.05)
+            assert checked.poll() is None
+            workers[0].kill()
+            _, errors = checked.communicate(timeout=240)
+        finally:
+            for process in workers:
+                process.kill()
+                process.wait()
+    assert checked.returncode == 0, errors
+    for name in NAMES:
+        for file in SAME:
+            here, there = (tmp_path / where / name / file for where in ('alone', 'two'))
+            assert digest_of(here) == digest_of(there), (name, file)

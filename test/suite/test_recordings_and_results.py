@@ -1,0 +1,76 @@
+"""Recordings by URL, their digests, and results that are packed and kept."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+
+import pytest
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.suite.recordings import digest_of, find_recordings, local_copy
+from segfloor_ros.suite.result_files import Cache, pack, unpack
+
+
+def test_a_url_is_copied_once_and_again_when_it_changed(tmp_path):
+    drive = tmp_path / 'far' / 'drive'
+    (drive / 'image_0').mkdir(parents=True)
+    (drive / 'image_0' / '000000.png').write_bytes(b'1')
+    bag = tmp_path / 'far' / 'bag.mcap'
+    bag.write_bytes(b'first')
+    copies = tmp_path / 'copies'
+    copy = local_copy(f'file://{drive}', copies)
+    assert copy.name == 'drive'
+    assert (copy / 'image_0' / '000000.png').read_bytes() == b'1'
+    first = local_copy(f'file://{bag}', copies)
+    bag.write_bytes(b'other bytes')
+    second = local_copy(f'file://{bag}', copies)
+    assert (first.read_bytes(), second.read_bytes()) == (b'first', b'other bytes')
+    second.write_bytes(b'kept')
+    assert local_copy(f'file://{bag}', copies).read_bytes() == b'kept'
+    assert find_recordings(f'file://{tmp_path}/far/*.mcap') == {'bag': f'file://{bag}'}
+
+
+@pytest.mark.parametrize('url', ['file:///no/such/bag', 'nosuch://x/y'])
+def test_a_url_that_leads_nowhere_is_named(tmp_path, url):
+    with pytest.raises(InputError, match=url):
+        local_copy(url, tmp_path)
+
+
+def test_a_digest_follows_names_and_content_and_not_the_place(tmp_path):
+    def folder(name, **files):
+        for file, text in files.items():
+            path = tmp_path / name / 'in' / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return digest_of(tmp_path / name)
+
+    digest = folder('one', a='1', b='2')
+    assert folder('two', a='1', b='2') == digest
+    assert len({digest, folder('three', a='1', b='3'), folder('four', a='1', c='2')}) == 3
+
+
+def test_results_survive_packing_and_the_cache(tmp_path):
+    out = tmp_path / 'out'
+    (out / 'masks').mkdir(parents=True)
+    (out / 'masks' / '0.png').write_bytes(bytes(range(256)))
+    (out / 'map.yaml').write_text('x: 1')
+    cache = Cache(tmp_path / 'cache')
+    assert cache.get('key') is None
+    cache.put('key', {'recall_percent': 93.5}, pack(out))
+    cache.put('key', {'recall_percent': 1.0}, b'')  # who comes second finds it there
+    measured, archive = cache.get('key')
+    assert measured == {'recall_percent': 93.5}
+    (tmp_path / 'new').mkdir()
+    (tmp_path / 'new' / 'old').write_text('of an earlier run')
+    unpack(archive, tmp_path / 'new')
+    assert digest_of(tmp_path / 'new') == digest_of(out)
+
+
+def test_an_archive_cannot_write_elsewhere(tmp_path):
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode='w') as archive:
+        archive.addfile(tarfile.TarInfo('../outside'))
+    with pytest.raises(ValueError, match='outside'):
+        unpack(buffer.getvalue(), tmp_path / 'in' / 'new')
+    assert not (tmp_path / 'outside').exists()
