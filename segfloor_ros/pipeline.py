@@ -63,7 +63,9 @@ class KeyframeStages:
     def process(self, keyframe: Keyframe, mount: Mount) -> FloorObservation:
         """Take in one keyframe."""
         with self._times.measure('floor_segmentation'):
-            floor = self._floor.process(keyframe.left, keyframe.right, mount, keyframe.T_map_base)
+            floor = self._floor.process(
+                keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving
+            )
         self.update_map(
             MapInput(
                 keyframe.stamp_ns,

@@ -124,10 +124,12 @@ class Mount:
 @dataclass(frozen=True)
 class StereoFrame:
     """One rectified grey stereo pair: images (H, W) uint8, the frame's number in its recording,
-    its stamp in ns.
+    its stamp in ns. excluded: mask (H, W) uint8 of the left image, 255 where something moves, as
+    far as a segmentation network told.
     """
 
     index: int
     stamp_ns: int
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
+    excluded: NDArray[np.uint8] | None = None

@@ -53,6 +53,12 @@ class StereoCameraSettings(StageSettings):
         '', 'Sensors of the recording to leave out, with commas: wheel_odometry, imu.'
     )
 
+    masks: str = setting(
+        '',
+        'Folder of masks of what moves: %06d.png by frame index, on the rectified left image, 255 '
+        '= moving; empty: none.',
+    )
+
     @property
     def ignored_sensors(self) -> frozenset[str]:
         """The names in `ignore`. Raises SettingsError for one that is no sensor."""

@@ -19,6 +19,14 @@ SetOption = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option('--set', help='One parameter, e.g. occupancy_grid.resolution_m=0.02; repeatable.'),
 ]
+MasksOption = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        '--masks',
+        help='Folder of masks of what moves: %06d.png by frame index, on the rectified left image, '
+        '255 = moving.',
+    ),
+]
 ReportOption = Annotated[
     bool,
     typer.Option('--report', help='Write report.html: everything about the run on one page.'),

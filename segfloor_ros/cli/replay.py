@@ -11,6 +11,7 @@ from rich.progress import TaskID
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
     InputArgument,
+    MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
@@ -38,6 +39,7 @@ def replay(
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
+    masks: MasksOption = None,
     report: ReportOption = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
@@ -53,7 +55,8 @@ def replay(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
-    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
+    camera = {'input': input, **({'masks': str(masks)} if masks else {})}
+    configuration = resolve(params, assignments or (), stereo_camera=camera)
     # The camera node reads the recording; here it is opened so that bad input ends at once.
     frame_count = open_source(configuration.stereo_camera).frame_count
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -10,6 +10,7 @@ from rich.progress import TaskID
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
     InputArgument,
+    MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
@@ -36,10 +37,12 @@ def run(
             help='Save pictures of the floor of each keyframe: mask, v-disparity with profile.',
         ),
     ] = False,
+    masks: MasksOption = None,
     report: ReportOption = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
-    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
+    camera = {'input': input, **({'masks': str(masks)} if masks else {})}
+    configuration = resolve(params, assignments or (), stereo_camera=camera)
     source = open_source(configuration.stereo_camera)
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:

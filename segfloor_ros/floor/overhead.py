@@ -53,11 +53,13 @@ class OverheadMatcher:
         mount: Mount,
         horizon_row: int,
         min_texture_grey: float,
+        moving: NDArray[np.uint8] | None = None,
     ) -> NDArray[np.float32]:
         """Return where in the base's x-y plane something is in the way, (2, N), by the rows above
         `horizon_row` of a rectified pair (H, W); every fourth pixel at most tells.
 
-        mount: of this frame. min_texture_grey: what a disparity needs to mean something.
+        mount: of this frame. min_texture_grey: what a disparity needs to mean something. moving:
+        mask (H, W), 255 where what stands there moves and does not count.
         """
         camera = self._camera
         reach = (self._settings.robot_height_m - mount.height_m) / _NEAREST_M * camera.fy
@@ -73,7 +75,10 @@ class OverheadMatcher:
         disparity = self._matcher.compute(halves[0], halves[1])
         # A slope along the row gets steeper as the image gets smaller.
         textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
-        rows, columns = np.nonzero((disparity > 0) & textured & ~_fringes(disparity))
+        telling = (disparity > 0) & textured & ~_fringes(disparity)
+        if moving is not None:
+            telling &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
+        rows, columns = np.nonzero(telling)
         disparity_px = _SCALE * disparity[rows, columns].astype(np.float64)
         centre = 0.5 * (_SCALE - 1)
         uv_px = np.stack([_SCALE * columns + centre, _SCALE * rows + first + centre], axis=1)

@@ -19,6 +19,7 @@ from segfloor_ros.floor.filling import (
 from segfloor_ros.floor.histograms import filtered_v_disparity, rising
 from segfloor_ros.floor.observation import (
     FLOOR,
+    NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
@@ -86,11 +87,14 @@ class FloorSegmentation:
         right: NDArray[np.uint8],
         mount: Mount,
         T_map_base: Array | None = None,
+        moving: NDArray[np.uint8] | None = None,
     ) -> FloorObservation:
         """Return the floor of a rectified grey pair (H, W) uint8.
 
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
-        the map, where known; with it the floor found by earlier keyframes helps.
+        the map, where known; with it the floor found by earlier keyframes helps. moving: mask
+        (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
+        what it hides is unknown.
         """
         settings, measure = self._settings, self._times.measure
         self._prepare(mount)
@@ -105,6 +109,8 @@ class FloorSegmentation:
             texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
         with measure(DISPARITY):
             disparity = self._disparity(first_row, left, right)
+            if moving is not None:
+                disparity[moving > 0] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             fit = self._plane(first_row, below, texture, enough, expected)
@@ -118,11 +124,17 @@ class FloorSegmentation:
             table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
             evidence = judge(view, profile, below, textured, compared, table, settings)
             seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
+            if moving is not None:
+                seen[moving[columns] > 0] = NO_EVIDENCE
             evidence = Evidence(seen, evidence.height_m)
         with measure('filling'):
             mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
+            if moving is not None:
+                mask[moving[columns] > 0] = NO_EVIDENCE
         with measure(DISPARITY_ABOVE):
-            overhead_xy = self._overhead.positions(left, right, view.mount, first_row, enough)
+            overhead_xy = self._overhead.positions(
+                left, right, view.mount, first_row, enough, moving
+            )
         with measure('scan'):
             scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
         return self._observation(view, profile, disparity, mask, scan, counted)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.slam.excluded import Region, is_inside
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 OVERSAMPLING = 4
@@ -57,9 +58,12 @@ class FeatureExtractor:
             fastThreshold=settings.fast_threshold,
         )
 
-    def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Return the features of a grey image (H, W)."""
+    def extract(self, image: NDArray[np.uint8], excluded: Region | None = None) -> Features:
+        """Return the features of a grey image (H, W) outside of what is excluded."""
         corners = self._orb.detect(image, None)
+        if excluded is not None and corners:
+            inside = is_inside(excluded, cv2.KeyPoint_convert(corners))
+            corners = [corner for corner, out in zip(corners, ~inside, strict=True) if out]
         if not corners:
             return Features(
                 np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), np.zeros((0, 32), np.uint8)

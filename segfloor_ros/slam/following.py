@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.excluded import Region, is_inside
 from segfloor_ros.slam.features import spread
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.optical_flow import follow_pixels
@@ -69,11 +70,11 @@ class Follower:
 
         offset_px: the known error of all disparities, measured minus true.
         """
-        estimate = self._by_flow(images.small, sparse_map, T_predicted)
+        estimate = self._by_flow(images, sparse_map, T_predicted)
         if estimate is None:
             return None
         pose = estimate.T_camera_world
-        seen = self._select(sparse_map, local_ids, pose)
+        seen = self._select(sparse_map, local_ids, pose, images.excluded)
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, sparse_map, seen.ids, pose)]
@@ -99,7 +100,7 @@ class Follower:
 
     def _by_flow(
         self,
-        small: NDArray[np.uint8],
+        images: Images,
         sparse_map: SparseMap,
         T_predicted: Array,
     ) -> PoseEstimate | None:
@@ -114,7 +115,9 @@ class Follower:
         if len(ids) < MIN_TRACKED:
             return None
         guess = self._camera.project(points)[:, :2]
-        uv, found = follow_pixels(self._small, small, self._camera.width, uv_last, guess)
+        width = self._camera.width
+        uv, found = follow_pixels(self._small, images.small, width, uv_last, guess)
+        found &= ~is_inside(images.excluded, uv)
         if found.sum() < MIN_TRACKED:
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
@@ -125,10 +128,14 @@ class Follower:
         return estimate if self._believable(estimate, len(ids)) else None
 
     def _select(
-        self, sparse_map: SparseMap, local_ids: NDArray[np.int32], T_camera_world: Array
+        self,
+        sparse_map: SparseMap,
+        local_ids: NDArray[np.int32],
+        T_camera_world: Array,
+        excluded: Region | None,
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world)
+        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, excluded)
         budget = self._tracked_points
         if len(seen.ids) <= budget:
             return seen

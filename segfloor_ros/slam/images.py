@@ -8,21 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.slam.excluded import Region, dilate
 from segfloor_ros.slam.optical_flow import shrink
 
 
 @dataclass(frozen=True)
 class Images:
     """left, right: rectified grey images (H, W) float32, for patches. small: the left one as
-    optical flow takes it.
+    optical flow takes it. excluded: where something moves, in the left image.
     """
 
     left: NDArray[np.float32]
     right: NDArray[np.float32]
     small: NDArray[np.uint8]
+    excluded: Region | None = None
 
     @staticmethod
-    def of(frame: StereoFrame) -> Images:
-        """Prepare the images of a frame."""
+    def of(frame: StereoFrame, mask_dilation_px: int = 0) -> Images:
+        """Prepare the images of a frame. mask_dilation_px: of the mask that came with it."""
         left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
-        return Images(left, right, shrink(frame.left))
+        excluded = None
+        if frame.excluded is not None:
+            excluded = dilate(frame.excluded, mask_dilation_px)
+        return Images(left, right, shrink(frame.left), excluded)

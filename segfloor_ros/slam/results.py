@@ -49,7 +49,9 @@ class KeyframePath:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Everything published about one keyframe. All parts share its stamp."""
+    """Everything published about one keyframe. All parts share its stamp. moving: mask (H, W)
+    uint8 of the left image, 255 where something moves.
+    """
 
     stamp_ns: int
     frame_index: int
@@ -59,6 +61,7 @@ class Keyframe:
     features: KeyframeFeatures
     path: KeyframePath
     cloud: SparseCloud
+    moving: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,16 @@ class StereoSlamSettings(StageSettings):
         minimum=0.1,
         maximum=100.0,
     )
+    detect_moving: bool = setting(
+        False, 'Leave out what moves, as far as the stereo pairs show it.'
+    )
+    mask_dilation_px: int = setting(
+        5,
+        'A mask of moving things (`dynamic_mask`, `--masks`) is widened by this much.',
+        unit='px',
+        minimum=0,
+        maximum=100,
+    )
     keyframe_max_frames: int = setting(
         30, 'A new keyframe is due after this many frames (condition A1).', minimum=1, maximum=1000
     )

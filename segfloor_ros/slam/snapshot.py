@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.slam.excluded import Region
 from segfloor_ros.slam.results import (
     NO_POINT,
     Keyframe,
@@ -15,7 +16,9 @@ from segfloor_ros.slam.results import (
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 
 
-def take_snapshot(sparse_map: SparseMap, keyframe: KeyframeRecord, frame: StereoFrame) -> Keyframe:
+def take_snapshot(
+    sparse_map: SparseMap, keyframe: KeyframeRecord, frame: StereoFrame, moving: Region | None
+) -> Keyframe:
     """Copy the map as it is at a keyframe made of `frame`, in optical axes: the camera stands for
     the base and frame `world` for `map` until `held_results.in_map` turns them.
     """
@@ -38,4 +41,5 @@ def take_snapshot(sparse_map: SparseMap, keyframe: KeyframeRecord, frame: Stereo
             np.stack([k.T_world_camera for k in sparse_map.keyframes]),
         ),
         SparseCloud(sparse_map.stable_id[in_cloud], sparse_map.xyz_world[in_cloud]),
+        moving,
     )

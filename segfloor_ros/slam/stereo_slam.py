@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
+from segfloor_ros.slam.excluded import is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.following import Follower
 from segfloor_ros.slam.held_results import HeldResults
@@ -18,6 +22,7 @@ from segfloor_ros.slam.local_map import LocalMap
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.motion import CameraMotion
 from segfloor_ros.slam.mount_meter import MountMeter
+from segfloor_ros.slam.moving_regions import MovingRegions
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -57,6 +62,7 @@ class StereoSlam:
         self.mount = mount
         self._mount_meter = mount_meter
         self._camera = camera
+        self._settings = settings
         self._background = background
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
@@ -69,6 +75,7 @@ class StereoSlam:
         self._mapper = LocalMapper(camera, settings)
         self._adjusting = AdjustmentRunner(self._mapper, background)
         self._held = HeldResults()
+        self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._recovery_turn = 0
         self._frames_since_keyframe = 0
 
@@ -82,7 +89,7 @@ class StereoSlam:
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
             fault = self._fault(frame)
-            images = Images.of(frame)
+            images = Images.of(frame, self._settings.mask_dilation_px)
             track = self._track(frame, images) if self.map.keyframes and not fault else None
         keyframe = None
         if not fault and self._wants_keyframe(track):
@@ -144,7 +151,7 @@ class StereoSlam:
 
     def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
         """Find the pose by the features of the frame, without its predecessor."""
-        features = self._extractor.extract(frame.left)
+        features = self._extractor.extract(frame.left, images.excluded)
         track = self._tracker.track(
             images,
             features,
@@ -187,6 +194,7 @@ class StereoSlam:
         self, frame: StereoFrame, images: Images, track: Track | None
     ) -> Keyframe | None:
         """Make the frame a keyframe; None where its features do not show what was tracked."""
+        images, seen = self._exclude_moving(frame, images)
         observed = self._observe(frame, images, track)
         if observed is None:
             return None
@@ -203,10 +211,22 @@ class StereoSlam:
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
+        if self._moving is not None and seen is not None:
+            self._moving.remember(keyframe, seen)
         self._adjust(keyframe)
         self._go_on_from(images, keyframe)
         self._measure_mount(frame, keyframe)
-        return take_snapshot(self.map, keyframe, frame)
+        return take_snapshot(self.map, keyframe, frame, images.excluded)
+
+    def _exclude_moving(
+        self, frame: StereoFrame, images: Images
+    ) -> tuple[Images, NDArray[np.float32] | None]:
+        """Return the images without what moves, and the coarse disparity that showed it."""
+        if self._moving is None:
+            return images, None
+        seen = self._moving.measure(frame.left, frame.right)
+        moving = self._moving.find(seen, self._motion.T_camera_world, self.mount)
+        return replace(images, excluded=join(images.excluded, moving)), seen
 
     def _observe(
         self, frame: StereoFrame, images: Images, track: Track | None
@@ -215,8 +235,9 @@ class StereoSlam:
         known; it is refined by all of them. None where too few do.
         """
         if track is not None and track.observed is not None:
-            return track.observed
-        features = self._extractor.extract(frame.left)
+            inside = is_inside(images.excluded, track.observed.features.uv_px)
+            return track.observed.take(np.flatnonzero(~inside))
+        features = self._extractor.extract(frame.left, images.excluded)
         if track is None:
             self._motion.take(self._motion.T_camera_world, frame.stamp_ns)
             none = np.full(len(features), NO_POINT, np.int32)

@@ -25,6 +25,12 @@ class ObservedFeatures:
     observations: Observations
     point_id: NDArray[np.int32]
 
+    def take(self, rows: NDArray[np.intp]) -> ObservedFeatures:
+        """Return the chosen rows."""
+        return ObservedFeatures(
+            self.features.take(rows), self.observations.take(rows), self.point_id[rows]
+        )
+
 
 @dataclass(frozen=True)
 class Track:

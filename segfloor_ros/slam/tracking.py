@@ -102,7 +102,7 @@ class Tracker:
         if len(features) == 0 or len(local_ids) == 0:
             return None
         observations = self.pixel_observations(features)
-        seen = self._predict(sparse_map, local_ids, T_camera_world)
+        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
         if len(rows) < MIN_TRACKED:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.excluded import Region, is_inside
 from segfloor_ros.slam.features import PYRAMID_LEVELS, PYRAMID_SCALE
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -37,9 +38,11 @@ def predict_points(
     sparse_map: SparseMap,
     ids: NDArray[np.int32],
     T_camera_world: Array,
+    excluded: Region | None = None,
 ) -> Prediction:
     """Project points (N,) into the image and keep those that a camera there should recognise:
-    inside the image, from about the known direction, at a size the pyramid has.
+    inside the image, from about the known direction, at a size the pyramid has, and not in a region
+    that is excluded.
     """
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
     front = points[:, 2] > MIN_DEPTH_M
@@ -60,4 +63,5 @@ def predict_points(
         & (octave < PYRAMID_LEVELS + 0.5)
     )
     uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
+    visible[visible] = ~is_inside(excluded, uvr[visible, :2])
     return Prediction(ids[visible], uvd[visible], octave[visible])

@@ -253,6 +253,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
         (['--set', 'occupancy_grid.resolution_m=7'], 'occupancy_grid.resolution_m = 7'),
         (['--set', 'occupancy_grid.resolution=0.05'], 'did you mean resolution_m'),
         (['--params', 'nowhere.yaml'], 'nowhere.yaml'),
+        (['--masks', 'nowhere'], 'nowhere: no such folder'),
     ],
 )
 def test_bad_settings_are_one_line(recording, tmp_path, arguments, words):

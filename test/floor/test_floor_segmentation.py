@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT, Patch, Scene, box, floor_patch, ramp, wall
@@ -218,3 +219,23 @@ def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_
     alone = anew.process(*blank, scene.mount, np.eye(4)).mask == FLOOR
     more = found.sum() - alone.sum()
     assert (more > 1000) if is_remembered else (more == 0)
+
+
+def test_what_moves_is_no_obstacle_and_the_floor_it_hides_is_unknown():
+    with_box = Scene([floor_patch(), *box(1.5, 0.0, 0.6, 0.6, 0.8)])
+    left, right, _, _ = with_box.render()
+    empty = Scene([floor_patch()]).render()
+    moving = np.where(np.abs(left.astype(int) - empty[0]) > 12, 255, 0).astype(np.uint8)
+    moving = cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((21, 21), np.uint8))
+    moving = cv2.dilate(moving, np.ones((9, 9), np.uint8))
+    assert 0.03 < (moving > 0).mean() < 0.4
+    stage = FloorSegmentation(with_box.camera, SETTINGS)
+    seen = stage.process(left, right, with_box.mount)
+    unseen = stage.process(left, right, with_box.mount, None, moving)
+    ahead = np.abs(seen.scan.bearings_rad) < np.radians(8)
+    assert np.nanmedian(seen.scan.obstacle_m[ahead]) == pytest.approx(1.5, abs=0.1)
+    assert np.isnan(unseen.scan.obstacle_m[ahead]).all()
+    assert np.nanmax(unseen.scan.ranges_m[ahead]) < 1.6
+    # The mask is found in every other column.
+    inside = cv2.erode(moving, np.ones((3, 3), np.uint8)) > 0
+    assert (unseen.mask[inside] != FLOOR).all()

@@ -10,6 +10,7 @@ from segfloor_ros.camera.sources.bag_file import is_bag
 from segfloor_ros.camera.sources.euroc import is_euroc, open_euroc
 from segfloor_ros.camera.sources.image_folders import has_image_sides, open_image_folders
 from segfloor_ros.camera.sources.kitti import is_kitti, open_kitti
+from segfloor_ros.camera.sources.masks import MaskFolder
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.camera.sources.video import is_device, is_video, open_device, open_video
 from segfloor_ros.errors import InputError
@@ -29,7 +30,10 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
     if not settings.input:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
     try:
-        return _open(settings)
+        source = _open(settings)
+        if settings.masks:
+            source.masks = MaskFolder(Path(settings.masks).expanduser(), source.camera)
+        return source
     except OSError as error:
         raise InputError(
             f'{error.filename or settings.input}: cannot be read ({error.strerror})'

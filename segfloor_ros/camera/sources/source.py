@@ -14,6 +14,7 @@ from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.sources.masks import MaskFolder
 from segfloor_ros.camera.sources.prefetch import prefetched
 from segfloor_ros.errors import InputError
 from segfloor_ros.measurements import RecordedSensor
@@ -53,7 +54,7 @@ class StereoSource(ABC):
     name: of the recording, for messages. calibration: of the raw pairs. camera: the rectified
     one. frame_count: pairs expected, None when unknown. rate_hz: frames per second.
     skipped_frames: pairs left out so far because an image was damaged or the stamp was there
-    before. sensors: what else was found in the recording.
+    before. sensors: what else was found in the recording. masks: of what moves, where given.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class StereoSource(ABC):
         self.calibration = calibration
         self.frame_count = frame_count
         self.rate_hz = rate_hz
+        self.masks: MaskFolder | None = None
         self.skipped_frames = 0
         self._warned_of: set[int] = set()
         self._eight_bit = EightBitScale(bit_depth)
@@ -108,7 +110,8 @@ class StereoSource(ABC):
         rectifier = StereoRectifier(self.calibration)
         for pair in self._decoded():
             left, right = rectifier.rectify(pair.left, pair.right)
-            yield StereoFrame(pair.index, pair.stamp_ns, left, right)
+            mask = self.masks.read(pair.index) if self.masks is not None else None
+            yield StereoFrame(pair.index, pair.stamp_ns, left, right, mask)
 
     def _decoded(self) -> Iterator[RawPair]:
         self.skipped_frames = 0

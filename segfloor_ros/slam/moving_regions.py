@@ -1,0 +1,177 @@
+"""Which parts of an image move: what now stands where earlier keyframes saw through.
+
+The geometric half of DynaSLAM (Bescos et al., RA-L 2018, section III-C) compares the depth of old
+points with the new one, and takes what is nearer for moving; but what stands still hides things too
+when the camera moves. Here the test is turned around and made for every pixel: a thing that is
+seen now is carried into an earlier keyframe, and moves if that keyframe saw what lies behind it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.excluded import Region
+from segfloor_ros.slam.sparse_map import KeyframeRecord
+
+WIDTH_PX = 160
+"""Images are shrunk to about this width: a person 4 m away is still eight pixels wide."""
+
+DISPARITIES = 64
+BLOCK_PX = 5
+P1, P2 = 100, 400
+"""Of semi-global matching (Hirschmueller 2008), for the sum of differences over a block."""
+
+SPECKLE_PX = 40
+TOLERANCE_PX = 0.6
+"""Disparities of the shrunk images that differ by more do not show the same thing."""
+
+MAX_PARALLAX = float(np.tan(np.radians(30.0)))
+COMPARED_VIEWS = 5
+KEPT_VIEWS = 30
+MIN_HEIGHT_M = 0.05
+"""What is lower may be floor, whose disparities repeat and mirror."""
+
+MIN_AREA_PX = 12
+SHARE_OF_REGION = 0.2
+"""So much of a region must have been seen through for all of it to move."""
+
+Disparity = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """What an earlier keyframe saw: the disparity (h, w) in px of the shrunk image, 0 where none
+    was found, and the largest and smallest one around each pixel.
+    """
+
+    keyframe: KeyframeRecord
+    disparity: Disparity
+    nearest: Disparity
+    farthest: Disparity
+
+    @staticmethod
+    def of(keyframe: KeyframeRecord, disparity: Disparity) -> DepthView:
+        """Prepare the disparity of a keyframe for comparisons."""
+        around = np.ones((3, 3), np.uint8)
+        known = np.where(disparity > 0, disparity, np.float32(np.inf))
+        return DepthView(
+            keyframe, disparity, cv2.dilate(disparity, around), cv2.erode(known, around)
+        )
+
+
+class MovingRegions:
+    """Finds what moves in the images of keyframes."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        factor = max(1, round(camera.width / WIDTH_PX))
+        self._camera, self._factor = camera, factor
+        self._size = (camera.width // factor, camera.height // factor)
+        self._disparity_m = camera.disparity_times_depth / factor
+        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._size))
+        full_u, full_v = ((axis + 0.5) * factor - 0.5 for axis in (u, v))
+        rays = [(full_u - camera.cx) / camera.fx, (full_v - camera.cy) / camera.fy, np.ones_like(u)]
+        self._rays = np.stack(rays).reshape(3, -1).astype(np.float32)
+        self._focal = np.array([camera.fx, camera.fy]) / factor
+        self._centre = (np.array([camera.cx, camera.cy]) + 0.5) / factor - 0.5
+        self._matcher = cv2.StereoSGBM_create(
+            0, DISPARITIES, BLOCK_PX, P1, P2, disp12MaxDiff=1, uniquenessRatio=5,
+            speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_HH4,
+        )  # fmt: skip
+        self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
+
+    def measure(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Disparity:
+        """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
+        small = (cv2.resize(i, self._size, interpolation=cv2.INTER_AREA) for i in (left, right))
+        # Without a margin the matcher leaves the leftmost columns empty.
+        wide = (cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for i in small)
+        found = self._matcher.compute(*wide)[:, DISPARITIES:].astype(np.float32) / 16
+        found[found > np.arange(self._size[0]) + 1] = 0.0
+        return np.maximum(found, 0.0)
+
+    def remember(self, keyframe: KeyframeRecord, disparity: Disparity) -> None:
+        """Take in what a keyframe saw."""
+        self._views.append(DepthView.of(keyframe, disparity))
+
+    def find(
+        self, disparity: Disparity, T_camera_world: Array, mount: Mount | None
+    ) -> Region | None:
+        """Return what moves in an image with this disparity and pose, None for nothing."""
+        rows = np.flatnonzero(disparity > 0)
+        if len(self._views) < 2 or len(rows) == 0:
+            return None
+        points = self._rays[:, rows] * (self._disparity_m / disparity.ravel()[rows])
+        through, solid = self._compare(points, disparity.ravel()[rows], T_camera_world)
+        high = np.ones(len(rows), bool)
+        if mount is not None:
+            high = mount.heights_m(points.T) > MIN_HEIGHT_M
+        seeds, doubtful = (np.zeros(disparity.size, np.uint8) for _ in range(2))
+        seeds[rows] = (through > solid) & (through > 1) & high
+        doubtful[rows] = (solid <= through) & high
+        moving = self._regions(
+            seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
+        )
+        return self._enlarged(moving) if moving.any() else None
+
+    def _enlarged(self, region: NDArray[np.uint8]) -> Region:
+        """Return a region of the shrunk image in that of the camera (H, W)."""
+        factor = self._factor
+        whole = cv2.resize(region, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+        below, right = self._camera.height - whole.shape[0], self._camera.width - whole.shape[1]
+        return np.asarray(
+            cv2.copyMakeBorder(whole, 0, below, 0, right, cv2.BORDER_REPLICATE), np.uint8
+        )
+
+    def _compare(
+        self, points: NDArray[np.float32], disparity: Disparity, T_camera_world: Array
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return how many earlier views saw through points (3, N), and how many saw them."""
+        through, solid = (np.zeros(points.shape[1], np.uint8) for _ in range(2))
+        T_world_camera = invert(T_camera_world)
+        for view in self._chosen():
+            T = (view.keyframe.T_camera_world @ T_world_camera).astype(np.float32)
+            x, y, z = T[:3, :3] @ points + T[:3, 3:]
+            apart = float(np.linalg.norm(T[:3, 3]))
+            depth = np.maximum(z, 0.01)
+            u = np.rint(self._focal[0] * x / depth + self._centre[0])
+            v = np.rint(self._focal[1] * y / depth + self._centre[1])
+            inside = (z > 0.05) & (apart < MAX_PARALLAX * z)
+            inside &= (u >= 0) & (u < self._size[0]) & (v >= 0) & (v < self._size[1])
+            at = np.where(inside, v * self._size[0] + u, 0).astype(np.intp)
+            inside &= view.disparity.ravel()[at] > 0
+            expected = self._disparity_m / depth
+            tolerance = TOLERANCE_PX * np.sqrt(1 + (expected / disparity) ** 4)
+            behind = view.nearest.ravel()[at] < expected - tolerance
+            before = view.farthest.ravel()[at] > expected + tolerance
+            through += inside & behind
+            solid += inside & ~behind & ~before
+        return through, solid
+
+    def _chosen(self) -> list[DepthView]:
+        """Return a few views spread over the time that is remembered."""
+        count = len(self._views)
+        chosen = np.unique(
+            np.linspace(0, count - 1, min(count, COMPARED_VIEWS)).round().astype(int)
+        )
+        return [self._views[i] for i in chosen]
+
+    def _regions(
+        self, seeds: NDArray[np.uint8], doubtful: NDArray[np.uint8], disparity: Disparity
+    ) -> NDArray[np.uint8]:
+        """Return the seeds and the connected regions of one depth that consist of them."""
+        around = np.ones((3, 3), np.uint8)
+        seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, around)
+        edge = cv2.dilate(disparity, around) - disparity > 2 * TOLERANCE_PX
+        _, labels = cv2.connectedComponents(np.where(edge, 0, doubtful | seeds).astype(np.uint8))
+        area = np.bincount(labels.ravel())
+        seeded = np.bincount(labels.ravel(), weights=seeds.ravel())
+        whole = (seeded > SHARE_OF_REGION * area) & (seeded >= MIN_AREA_PX)
+        whole[0] = False
+        moving = whole[labels] | ((seeds > 0) & (seeded[labels] >= MIN_AREA_PX))
+        return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), around)

@@ -1,0 +1,94 @@
+"""What moves is found, and neither bends the path nor enters the map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from moving_drive import MovingDrive
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.geometry import invert
+from segfloor_ros.slam.excluded import dilate, is_inside, join
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+FRAMES = 36
+
+
+def crossing(index):
+    """From the right to the left at 1.6 m ahead of the camera, 4.5 cm a frame, after a second."""
+    return (0.03 * index + 1.6, -1.3 + 0.045 * (index - 8)) if index >= 8 else None
+
+
+def standing(index):
+    return (2.6, 0.3)
+
+
+def run(drive, with_masks=False, detect_moving=True, **settings):
+    own = StereoSlamSettings(detect_moving=detect_moving, **settings)
+    slam = StereoSlam(CAMERA, own, MOUNT)
+    results = []
+    for index in range(FRAMES):
+        frame = drive.frame(index)
+        if with_masks:
+            frame = replace(frame, excluded=drive.mask(index))
+        results += slam.process(frame)
+    return results
+
+
+def worst_error_m(drive, results):
+    assert all(result.tracked for result in results)
+    poses = [invert(drive.pose(r.index)) @ r.T_map_odom @ r.T_odom_base for r in results]
+    return max(float(np.linalg.norm(pose[:3, 3])) for pose in poses)
+
+
+def keyframes(results):
+    return [result.keyframe for result in results if result.keyframe is not None]
+
+
+def test_regions_join_and_grow():
+    a, b = (np.zeros((5, 8), np.uint8) for _ in range(2))
+    a[2, 2], b[2, 5] = 255, 255
+    both = join(a, b)
+    assert (both > 0).sum() == 2 and join(None, None) is None and join(a, None) is a
+    grown = dilate(both, 1)
+    assert grown[2, 1] == grown[1, 2] == 255 and grown[0, 2] == grown[1, 1] == 0
+    inside = is_inside(both, np.array([[2.4, 1.6], [3.6, 2.0], [-3.0, 2.0]]))
+    np.testing.assert_array_equal(inside, [True, False, False])
+    assert not is_inside(None, np.zeros((3, 2))).any()
+
+
+def test_features_and_points_stay_out_of_the_masks_that_are_given():
+    drive = MovingDrive(crossing)
+    results = run(drive, with_masks=True, detect_moving=False, mask_dilation_px=3)
+    assert worst_error_m(drive, results) < 0.01
+    for keyframe in keyframes(results):
+        wide = dilate(drive.mask(keyframe.frame_index), 3)
+        # Once matched, features are moved by up to two pixels to where their points lie.
+        assert not is_inside(drive.mask(keyframe.frame_index), keyframe.features.uv_px).any()
+        np.testing.assert_array_equal(keyframe.moving, wide)
+    without = keyframes(run(drive, detect_moving=False))
+    on_board = [is_inside(drive.mask(k.frame_index), k.features.uv_px).sum() for k in without]
+    assert max(on_board) > 50
+
+
+def test_what_crosses_is_found_without_masks():
+    drive = MovingDrive(crossing)
+    results = run(drive)
+    assert worst_error_m(drive, results) < 0.01
+    overlaps = []
+    for keyframe in keyframes(results):
+        truth = drive.mask(keyframe.frame_index) > 0
+        found = keyframe.moving > 0 if keyframe.moving is not None else np.zeros_like(truth)
+        # Its fringe is as wide as the matcher's block.
+        assert (found & ~(dilate(drive.mask(keyframe.frame_index), 12) > 0)).mean() < 0.003
+        if truth.mean() > 0.05:
+            overlaps.append((found & truth).sum() / truth.sum())
+    assert np.median(overlaps) > 0.8
+
+
+@pytest.mark.parametrize('place', [lambda index: None, standing])
+def test_what_stands_is_kept(place):
+    results = run(MovingDrive(place))
+    shares = [0.0 if k.moving is None else (k.moving > 0).mean() for k in keyframes(results)]
+    assert max(shares) < 0.01 and np.mean(shares) < 0.001
