@@ -24,11 +24,27 @@ ARGUMENTS = {
         'info',
         'From which level on the nodes log.',
     ),
+    'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
+    'right_image': ('', 'Topic of the right images.'),
+    'left_camera_info': ('', 'Topic of the calibration of the left camera.'),
+    'right_camera_info': ('', 'Topic of the calibration of the right camera.'),
+    'depth': ('', 'Topic of depth images, by default depth/image_raw.'),
+    'odometry': ('', 'Topic of the odometry of the wheels, by default wheel_odometry.'),
+    'imu': ('', 'Topic of the IMU, by default imu.'),
+    'camera': (
+        'false',
+        'The camera of the recording, whose driver has named the topics: realsense, zed, oak, '
+        'orbbec; or false.',
+    ),
     'rviz': ('false', 'Show the map in RViz: true or false.'),
 }
 """By name default and description; a list is a file of the package."""
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
-HANDED_ON = ('namespace', 'params_file', 'composed', 'log_level', 'rviz')
+HANDED_ON = (
+    *('namespace', 'params_file', 'composed', 'log_level', 'rviz', 'camera'),
+    *('left_image', 'right_image', 'left_camera_info', 'right_camera_info'),
+    *('depth', 'odometry', 'imu'),
+)
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -37,11 +53,11 @@ def generate_launch_description() -> LaunchDescription:
     handed_on = {name: LaunchConfiguration(name) for name in HANDED_ON}
     return LaunchDescription(
         [
-            DeclareLaunchArgument('bag', description='Folder of the rosbag2 recording.'),
+            DeclareLaunchArgument('bag', description='rosbag2 recording: a folder, or a file.'),
             *(declare(name, default, text) for name, (default, text) in ARGUMENTS.items()),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(nodes),
-                launch_arguments={**handed_on, 'camera': 'false', 'use_sim_time': 'true'}.items(),
+                launch_arguments={**handed_on, 'use_sim_time': 'true'}.items(),
             ),
             player(),
         ]

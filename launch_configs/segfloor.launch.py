@@ -13,6 +13,51 @@ STAGES = ('stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_gri
 RESPAWN_DELAY_S = 2.0
 YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
+CAMERAS = {
+    'realsense': {
+        'left_image': '/camera/camera/infra1/image_rect_raw',
+        'right_image': '/camera/camera/infra2/image_rect_raw',
+        'left_camera_info': '/camera/camera/infra1/camera_info',
+        'right_camera_info': '/camera/camera/infra2/camera_info',
+        'depth': '/camera/camera/depth/image_rect_raw',
+        'imu': '/camera/camera/imu',
+    },
+    'zed': {
+        'left_image': '/zed/zed_node/left/color/rect/image',
+        'right_image': '/zed/zed_node/right/color/rect/image',
+        'left_camera_info': '/zed/zed_node/left/color/rect/camera_info',
+        'right_camera_info': '/zed/zed_node/right/color/rect/camera_info',
+        'depth': '/zed/zed_node/depth/depth_registered',
+        'imu': '/zed/zed_node/imu/data',
+    },
+    'oak': {
+        'left_image': '/oak/left/image_rect',
+        'right_image': '/oak/right/image_rect',
+        'left_camera_info': '/oak/left/camera_info',
+        'right_camera_info': '/oak/right/camera_info',
+        'depth': '/oak/stereo/image_raw',
+        'imu': '/oak/imu/data',
+    },
+    'orbbec': {
+        'left_image': '/camera/left_ir/image_raw',
+        'right_image': '/camera/right_ir/image_raw',
+        'left_camera_info': '/camera/left_ir/camera_info',
+        'right_camera_info': '/camera/right_ir/camera_info',
+        'depth': '/camera/depth/image_raw',
+        'imu': '/camera/gyro_accel/sample',
+    },
+}
+"""Topics by the names that the drivers document; params/camera_NAME.yaml says what to ask of them.
+"""
+INPUTS = {
+    'left_camera_info': 'left/camera_info',
+    'right_camera_info': 'right/camera_info',
+    'depth': 'depth/image_raw',
+    'odometry': 'wheel_odometry',
+    'imu': 'imu',
+}
+"""Arguments, and the topics of the nodes that they name."""
+
 
 ARGUMENTS = {
     'namespace': ('', 'Namespace of all nodes and topics.'),
@@ -28,9 +73,17 @@ ARGUMENTS = {
     ),
     'camera': (
         'auto',
-        'Start the node stereo_camera: true, false, or auto, which does so where input is given; '
-        'with true the input may stand in params_file.',
+        'A camera whose driver runs: realsense, zed, oak or orbbec, which names its topics. Or '
+        'whether to start the node stereo_camera: true, false, or auto, which does so where input '
+        'is given; with true the input may stand in params_file.',
     ),
+    'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
+    'right_image': ('', 'Topic of the right images.'),
+    'left_camera_info': ('', 'Topic of the calibration of the left camera.'),
+    'right_camera_info': ('', 'Topic of the calibration of the right camera.'),
+    'depth': ('', 'Topic of depth images, by default depth/image_raw.'),
+    'odometry': ('', 'Topic of the odometry of the wheels, by default wheel_odometry.'),
+    'imu': ('', 'Topic of the IMU, by default imu.'),
     'lossless': (
         'auto',
         'A recording slows down rather than lose a frame where the nodes cannot follow: true, '
@@ -98,9 +151,13 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     own_tf = truth('namespaced_tf', LaunchConfiguration('namespaced_tf').perform(context))
     log_level = LaunchConfiguration('log_level').perform(context)
     lossless = LaunchConfiguration('lossless').perform(context)
-    with_camera = bool(source) if camera.lower() == 'auto' else truth('camera', camera)
+    with_camera = has_camera_node(camera, source)
     with_rviz = truth('rviz', LaunchConfiguration('rviz').perform(context))
-    remappings = [('/tf', 'tf'), ('/tf_static', 'tf_static')] if own_tf else []
+    if with_rviz:
+        require('rviz2', 'rviz:=true', context)
+    tf = [('/tf', 'tf'), ('/tf_static', 'tf_static')] if own_tf else []
+    topics, kind = remapped_topics(camera, context)
+    files = [in_package(['params', f'camera_{camera}.yaml'])] if camera in CAMERAS else []
 
     def node(executable: str, *arguments: str, name: str | None = None) -> Node:
         # Plain command-line parameters win over every section of the file.
@@ -109,11 +166,11 @@ def make_nodes(context: LaunchContext) -> list[Node]:
             executable=executable,
             name=name,
             namespace=LaunchConfiguration('namespace'),
-            parameters=[LaunchConfiguration('params_file'), {'use_sim_time': sim_time}],
-            remappings=remappings,
+            parameters=[*files, LaunchConfiguration('params_file'), {'use_sim_time': sim_time}],
+            remappings=[*topics, *tf],
             ros_arguments=[
                 *('--log-level', log_level),
-                *('-p', f'autostart:={str(autostart).lower()}', *arguments),
+                *('-p', f'autostart:={str(autostart).lower()}', *kind, *arguments),
             ],
             respawn=respawn,
             respawn_delay=RESPAWN_DELAY_S,
@@ -131,11 +188,58 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     else:
         nodes = [node('stereo_camera', *given, name='stereo_camera')] if with_camera else []
         nodes += [node(stage, name=stage) for stage in STAGES]
-    return [*nodes, rviz(sim_time, remappings)] if with_rviz else nodes
+    return [*nodes, rviz(sim_time, tf)] if with_rviz else nodes
+
+
+def has_camera_node(camera: str, source: str) -> bool:
+    """Return whether the node stereo_camera is wanted. Raises ValueError."""
+    if camera in CAMERAS:
+        return False
+    if camera.lower() == 'auto':
+        return bool(source)
+    if camera.strip().lower() not in (*YES, *NO):
+        names = ', '.join(CAMERAS)
+        raise ValueError(f'camera:={camera}: expected true, false, auto, {names}')
+    return truth('camera', camera)
+
+
+def remapped_topics(
+    camera: str, context: LaunchContext
+) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
+    """Return the remappings of the inputs, and the parameter that says which images they are: those
+    with rect in their name are taken for rectified.
+    """
+    preset, found = CAMERAS.get(camera, {}), []
+    kind: tuple[str, ...] = ()
+
+    def topic(argument: str) -> str:
+        return LaunchConfiguration(argument).perform(context) or preset.get(argument, '')
+
+    for side in ('left', 'right'):
+        image = topic(f'{side}_image').removesuffix('/compressed')
+        if image:
+            kind_name = 'rect' if 'rect' in image else 'raw'
+            name = f'{side}/image_{kind_name}'
+            found += [(name, image), (f'{name}/compressed', f'{image}/compressed')]
+            kind = ('-p', f'image_kind:={kind_name}')
+    found += [(name, topic(argument)) for argument, name in INPUTS.items() if topic(argument)]
+    return found, kind
+
+
+def require(package: str, wish: str, context: LaunchContext) -> None:
+    """Raise RuntimeError where a package is missing, before anything has been started."""
+    try:
+        FindPackageShare(package).perform(context)
+    except Exception:
+        name = package.replace('_', '-')
+        raise RuntimeError(
+            f'{wish} needs the package {package}: apt install ros-$ROS_DISTRO-{name}, or leave it '
+            'out; nothing has been started'
+        ) from None
 
 
 def rviz(sim_time: bool, remappings: list[tuple[str, str]]) -> Node:
-    """Return RViz with the package's layout."""
+    """Return RViz with the package's layout, whose topics are relative to the namespace."""
     return Node(
         package='rviz2',
         executable='rviz2',

@@ -96,14 +96,17 @@ class StereoSlamNodeSettings(NodeSettings):
         'Adjust the map beside tracking, so that no frame waits for it; off: results do not '
         'depend on timing.',
     )
-    rectified_input: bool = setting(
-        False, 'Take left/image_rect and right/image_rect instead of the raw images.'
+    image_kind: str = setting(
+        'auto',
+        'Take raw images, which are rectified here, or rectified ones (left/image_rect and '
+        'right/image_rect); auto: what is published, raw ones first.',
+        choices=('auto', 'raw', 'rect'),
     )
     image_transport: str = setting(
-        'raw',
-        'Subscribe to raw or to compressed images, the latter on the topics with /compressed '
-        'behind their names.',
-        choices=('raw', 'compressed'),
+        'auto',
+        'Take images as they are or compressed, the latter on the topics with /compressed behind '
+        'their names; auto: what is published, uncompressed ones first.',
+        choices=('auto', 'raw', 'compressed'),
     )
     image_reliability: str = setting(
         'auto',

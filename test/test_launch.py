@@ -8,10 +8,12 @@ import ast
 import importlib.util
 import itertools
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import launch_stand_in
 import pytest
+import yaml
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / 'launch_configs'
@@ -23,7 +25,8 @@ NODES = {
 STAGES = NODES - {'stereo_camera'}
 ARGUMENTS = {
     'namespace', 'params_file', 'use_sim_time', 'input', 'camera', 'composed', 'autostart',
-    'respawn', 'namespaced_tf', 'log_level', 'lossless', 'rviz', 'rviz_config',
+    'respawn', 'namespaced_tf', 'log_level', 'lossless', 'rviz', 'rviz_config', 'left_image',
+    'right_image', 'left_camera_info', 'right_camera_info', 'depth', 'odometry', 'imu',
 }  # fmt: skip
 
 
@@ -67,6 +70,7 @@ def test_only_launch_is_imported(path) -> None:
 def launched(monkeypatch, tmp_path):
     """Return the processes that a launch file makes of arguments, by executable."""
     monkeypatch.setitem(launch_stand_in.SHARE, 'segfloor_ros', REPOSITORY)
+    monkeypatch.setitem(launch_stand_in.SHARE, 'rviz2', tmp_path)
 
     def launched(path: Path = SEGFLOOR, **arguments: str):
         processes = launch_stand_in.launch(path, tmp_path, arguments)
@@ -121,6 +125,95 @@ def test_what_the_arguments_say_is_handed_on(launched) -> None:
     assert not any(process.respawn for process in launched().values())
     with pytest.raises(ValueError, match='rviz:=maybe: expected true or false'):
         launched(rviz='maybe')
+
+
+def test_without_rviz_nothing_is_started(launched, monkeypatch) -> None:
+    monkeypatch.delitem(launch_stand_in.SHARE, 'rviz2')
+    with pytest.raises(RuntimeError, match='rviz:=true needs the package rviz2: apt install'):
+        launched(rviz='true')
+    assert launched().keys() == STAGES
+
+
+def test_the_topics_of_rviz_are_relative_to_the_namespace() -> None:
+    layout = yaml.safe_load((FOLDER / 'segfloor.rviz').read_text())
+    topics = list(topics_of(layout))
+    assert {'map', 'keyframe/path', 'obstacle_points'} <= set(topics)
+    assert not [topic for topic in topics if topic.startswith('/')]
+
+
+def topics_of(found) -> Iterator[str]:
+    """Yield the topics of a layout."""
+    if isinstance(found, list):
+        for one in found:
+            yield from topics_of(one)
+    elif isinstance(found, dict):
+        for name, value in found.items():
+            if name.endswith('Topic') and isinstance(value, dict):
+                yield value['Value']
+            else:
+                yield from topics_of(value)
+
+
+def remappings(process) -> dict[str, str]:
+    """Return the remappings of a process."""
+    found = (word.split(':=') for word in after(process.arguments, '-r'))
+    return {source: target for source, target in found if not source.startswith('__')}
+
+
+def test_topics_are_arguments(launched) -> None:
+    names = {
+        'left_image': '/cam/left/image_mono', 'right_image': '/cam/right/image_mono',
+        'left_camera_info': '/cam/left/info', 'right_camera_info': '/cam/right/info',
+        'depth': '/cam/depth', 'odometry': '/wheels/odom', 'imu': '/imu/data',
+    }  # fmt: skip
+    expected = {
+        'left/image_raw': '/cam/left/image_mono', 'right/image_raw': '/cam/right/image_mono',
+        'left/image_raw/compressed': '/cam/left/image_mono/compressed',
+        'right/image_raw/compressed': '/cam/right/image_mono/compressed',
+        'left/camera_info': '/cam/left/info', 'right/camera_info': '/cam/right/info',
+        'depth/image_raw': '/cam/depth', 'wheel_odometry': '/wheels/odom', 'imu': '/imu/data',
+    }  # fmt: skip
+    for node in ('stereo_slam', 'floor_segmentation'):
+        process = launched(**names)[node]
+        assert remappings(process) == expected
+        assert 'image_kind:=raw' in after(process.arguments, '-p')
+    assert remappings(launched(BAG, bag='/b', **names)['stereo_slam']) == expected
+    assert remappings(launched()['stereo_slam']) == {}
+    rectified = launched(left_image='/l/rect/compressed', right_image='/r/rect/compressed')
+    found = remappings(rectified['stereo_slam'])
+    assert found['left/image_rect/compressed'] == '/l/rect/compressed'
+    assert 'image_kind:=rect' in after(rectified['stereo_slam'].arguments, '-p')
+
+
+@pytest.mark.parametrize(
+    ('camera', 'left', 'kind'),
+    [
+        ('realsense', '/camera/camera/infra1/image_rect_raw', 'rect'),
+        ('zed', '/zed/zed_node/left/color/rect/image', 'rect'),
+        ('oak', '/oak/left/image_rect', 'rect'),
+        ('orbbec', '/camera/left_ir/image_raw', 'raw'),
+    ],
+)
+def test_a_camera_is_called_by_its_name(launched, camera, left, kind) -> None:
+    processes = launched(camera=camera)
+    assert processes.keys() == STAGES
+    slam = processes['stereo_slam']
+    found = remappings(slam)
+    assert found[f'left/image_{kind}'] == left
+    assert {f'{s}/{n}' for s in ('left', 'right') for n in ('camera_info', f'image_{kind}')} <= (
+        found.keys()
+    )
+    assert len(set(found.values())) == len(found), 'each topic once'
+    assert f'image_kind:={kind}' in after(slam.arguments, '-p')
+    files = [Path(file).name for file in after(slam.arguments, '--params-file')]
+    assert files[:2] == [f'camera_{camera}.yaml', 'default.yaml']
+    mine = remappings(launched(camera=camera, left_image='/mine/image_raw')['stereo_slam'])
+    assert mine['left/image_raw'] == '/mine/image_raw'
+
+
+def test_a_camera_that_is_not_known_is_refused_with_those_that_are(launched) -> None:
+    with pytest.raises(ValueError, match=r'camera:=kinect: .*realsense, zed, oak, orbbec'):
+        launched(camera='kinect')
 
 
 def test_rviz_shows_the_layout_of_the_package(launched, tmp_path) -> None:

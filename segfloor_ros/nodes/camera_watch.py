@@ -31,12 +31,14 @@ class CameraWatch:
     rectified, and an implausible floor.
     """
 
-    def __init__(
-        self, node: AnyStageNode, own: StereoSlamNodeSettings, left: str, right: str
-    ) -> None:
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
         self._node = node
         self._own = own
+
+    def expect(self, left: str, right: str, is_rectified: bool) -> None:
+        """Watch these two topics from now on."""
         self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
+        self._is_rectified = is_rectified
         self._last_image_s: dict[str, float] = {}
         self._is_live = False
         self._pairs_until_check = 0
@@ -91,8 +93,8 @@ class CameraWatch:
             return
         topics = ' and '.join(self._stamps)
         what = (
-            f'{topics} are not rectified; take image_raw (rectified_input: false) or rectify them'
-            if self._own.rectified_input
+            f'{topics} are not rectified; take image_raw (image_kind: raw) or rectify them'
+            if self._is_rectified
             else f'the calibration on camera_info is not that of {topics}; calibrate again'
         )
         self._node.reporter.diagnose(

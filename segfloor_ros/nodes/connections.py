@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -11,10 +11,17 @@ from rclpy.publisher import Publisher
 from segfloor_ros.messages.diagnostics import CONNECTIONS, NEED_LASTS_S, Level
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.nodes.inputs import Inputs
+from segfloor_ros.nodes.lookalikes import in_words, lookalikes, published_kinds
 from segfloor_ros.nodes.qos_check import incompatible_topics
 from segfloor_ros.nodes.reporter import PROBLEM_LASTS_S, Reporter
 
 FALLS_BEHIND_S = 2.0
+KILLED_SEEN_S = 20.0
+"""How long Fast DDS shows a process that was killed."""
+
+REPEAT_SILENT_S = 30.0
+SILENT_S = 3.0
+"""A topic that nobody publishes for so long is logged."""
 
 
 class Connections:
@@ -26,6 +33,7 @@ class Connections:
         self._inputs = inputs
         self._reported: dict[str, str] = {}
         self._last_needed_s = time.monotonic()
+        self._silent_since_s: dict[str, float] = {}
         self.outputs: dict[str, Publisher] = {}
         """The publishers by the topic's name as in the code."""
 
@@ -50,9 +58,10 @@ class Connections:
         return now_s - self._last_needed_s < NEED_LASTS_S
 
     def find_problems(self) -> None:
-        """Report topics that do not connect, and queues that grow."""
+        """Report topics that do not connect, a node of the same name, and queues that grow."""
         self._find_incompatible()
         self._find_silent()
+        self._find_twin()
         topic, waited_s = self._reporter.health.longest_wait()
         if waited_s > FALLS_BEHIND_S:
             text = (
@@ -68,14 +77,47 @@ class Connections:
             self._reporter.diagnose(f'QoS of {topic}', text, Level.ERROR)
 
     def _find_silent(self) -> None:
-        count: Callable[[str], int] = self._inputs.publisher_count
+        """Report inputs that nobody publishes, each with what is published that looks like it."""
+        inputs = self._inputs
         silent = [
             name
-            for name in self._inputs.subscriptions
-            if not TOPICS[name].is_optional and not count(name)
+            for name in inputs.subscriptions
+            if not TOPICS[name].is_optional and not inputs.publisher_count(name)
         ]
-        if silent:
-            text = f'nobody publishes {", ".join(silent)}; start the node that does, or remap'
-            self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
-        else:
+        now_s = time.monotonic()
+        self._silent_since_s = {name: self._silent_since_s.get(name, now_s) for name in silent}
+        if not silent:
             self._reporter.health.over('publishers')
+            return
+        text = f'nobody publishes {", ".join(silent)}; start the node that does, or remap'
+        if now_s - min(self._silent_since_s.values()) < SILENT_S:
+            self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
+            return
+        hints = [hint for name in silent if (hint := self._hint(name))]
+        text = '; '.join([text, *hints])
+        self._reporter.diagnose('publishers', text, repeat_s=REPEAT_SILENT_S)
+
+    def _hint(self, name: str) -> str:
+        """Return what is published that looks like a topic, in words; '' where nothing does."""
+        topic, kind = self._node.resolve_topic_name(name), TOPICS[name].type_name
+        others = [k for k in published_kinds(self._node, topic) if k != kind]
+        if others:
+            return f'{topic} is published as {in_words(others)}, not as {kind}'
+        found = lookalikes(self._node, topic, kind)
+        if not found:
+            return f'{topic}: no other topic of the type {kind} is published'
+        return f'{topic}: published with this type are {in_words(found)} (-r {name}:={found[0]})'
+
+    def _find_twin(self) -> None:
+        """Report another node of the same name: both would publish on the same topics."""
+        name, namespace = self._node.get_name(), self._node.get_namespace()
+        same = [
+            one for one in self._node.get_node_names_and_namespaces() if one == (name, namespace)
+        ]
+        if len(same) > 1:
+            text = (
+                f'{len(same)} nodes are called {self._node.get_fully_qualified_name()} and publish '
+                'on the same topics; stop the other one, or give this one a namespace; one that '
+                f'was killed is seen for up to {KILLED_SEEN_S:g} s'
+            )
+            self._reporter.diagnose('twin', text, Level.ERROR, repeat_s=REPEAT_SILENT_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,8 +20,18 @@ from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.reporter import Reporter
 
 LEAST_PERIOD_S = 0.001
-Open = tuple[Any, Callable[[Any], Any]]
-"""Something that is open, and what closes it."""
+
+
+@dataclass
+class Input:
+    """A subscription or timer: what makes it, what ends it, and when it is wanted while the node
+    works. entity: what has been made; None while it is closed.
+    """
+
+    make: Callable[[], Any]
+    destroy: Callable[[Any], Any]
+    is_wanted: Callable[[], bool] = lambda: True
+    entity: Any = None
 
 
 class Inputs:
@@ -33,24 +44,23 @@ class Inputs:
         self._node = node
         self._reporter = reporter
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._openers: list[Callable[[], Open]] = []
-        self._open: list[Open] = []
+        self._inputs: list[Input] = []
         self._joiners: list[StampJoiner] = []
         self.subscriptions: dict[str, Subscription] = {}
         """The open subscriptions by the topic's name as in the code, before remapping."""
-
-    @property
-    def is_open(self) -> bool:
+        self.is_open = False
         """Whether messages are received."""
-        return bool(self._open)
 
     def subscribe(
         self,
         name: str,
         callback: Callable[[Any], None],
         choose_profile: Callable[[], QoSProfile] | None = None,
+        is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Receive a topic of `TOPICS`. choose_profile: asked whenever the inputs open."""
+        """Receive a topic of `TOPICS`. choose_profile: asked whenever the subscription is made.
+        is_wanted: asked whenever the inputs open, and by `update`.
+        """
         topic = TOPICS[name]
 
         def take(message: Any, info: Mapping[str, Any]) -> None:
@@ -61,7 +71,7 @@ class Inputs:
             except Exception as error:
                 self._reporter.log_fault(name, error)
 
-        def subscribe() -> Open:
+        def subscribe() -> Subscription:
             profile = choose_profile() if choose_profile else topic.profile
             # What does not connect is reported by `qos_check`, in words and on /diagnostics.
             quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -71,9 +81,13 @@ class Inputs:
                 topic.type, name, two_arguments, profile, event_callbacks=quiet
             )
             self.subscriptions[name] = made
-            return made, self._node.destroy_subscription
+            return made
 
-        self._openers.append(subscribe)
+        def unsubscribe(made: Subscription) -> None:
+            self.subscriptions.pop(name)
+            self._node.destroy_subscription(made)
+
+        self._inputs.append(Input(subscribe, unsubscribe, is_wanted))
 
     def join(
         self,
@@ -81,6 +95,7 @@ class Inputs:
         process: Callable[[int, dict[str, Any]], None],
         on_message: Callable[[str, int], None] | None = None,
         choose_profile: Callable[[], QoSProfile] | None = None,
+        is_wanted: Callable[[], bool] = lambda: True,
         **limits: Any,
     ) -> None:
         """Receive topics whose messages belong together by their stamps; `process` gets the stamp
@@ -100,47 +115,55 @@ class Inputs:
                 process(stamp_ns, complete)
 
         for part in joiner.all_parts:
-            self.subscribe(part, partial(take, part), choose_profile)
+            self.subscribe(part, partial(take, part), choose_profile, is_wanted)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""
-        self._openers.append(
-            lambda: (self.steady_timer(period_s, callback), self._node.destroy_timer)
-        )
+        make = partial(self.steady_timer, period_s, callback)
+        self._inputs.append(Input(make, self._node.destroy_timer))
 
     def repeat(self, step: Callable[[], float]) -> None:
         """Call something while the inputs are open, each time after as many seconds as it has
         returned the time before.
         """
 
-        def start() -> Open:
+        def start() -> Timer:
             def run() -> None:
                 timer.timer_period_ns = round(1e9 * max(step(), LEAST_PERIOD_S))
                 timer.reset()
 
             timer = self.steady_timer(LEAST_PERIOD_S, run)
-            return timer, self._node.destroy_timer
+            return timer
 
-        self._openers.append(start)
+        self._inputs.append(Input(start, self._node.destroy_timer))
 
     def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Make a timer that also runs while the time of a recording stands still."""
         return self._node.create_timer(period_s, callback, clock=self._steady_clock)
 
     def open(self) -> None:
-        """Receive from now on."""
-        self._open = [opener() for opener in self._openers]
+        """Receive from now on what is wanted."""
+        self.is_open = True
+        self.update()
+
+    def update(self) -> None:
+        """While the inputs are open, open those that are wanted by now, and close the others."""
+        for one in self._inputs:
+            is_wanted = self.is_open and one.is_wanted()
+            if is_wanted and one.entity is None:
+                one.entity = one.make()
+            elif not is_wanted and one.entity is not None:
+                entity, one.entity = one.entity, None
+                one.destroy(entity)
 
     def close(self) -> None:
         """Receive nothing any more, and give up what waits for a partner."""
-        while self._open:
-            entity, destroy = self._open.pop()
-            destroy(entity)
-        self.subscriptions.clear()
+        self.is_open = False
+        self.update()
         self.give_up_waiting()
 
     def reopen(self) -> None:
-        """Subscribe again, with other profiles or topics."""
+        """Subscribe again, with other profiles."""
         if self.is_open:
             self.close()
             self.open()
@@ -153,7 +176,7 @@ class Inputs:
     def remove_all(self) -> None:
         """Close the inputs and declare none any more."""
         self.close()
-        self._openers.clear()
+        self._inputs.clear()
         self._joiners.clear()
 
     def publisher_count(self, name: str) -> int:

@@ -34,7 +34,7 @@ class Reporter:
         )
         self.health = Health()
         self._losses: dict[str, LossCounter] = {}
-        self._logged_s: dict[str, float] = {}
+        self._silent_until_s: dict[str, float] = {}
 
     def note_received(
         self, topic: Topic, stamp_ns: int, info: Mapping[str, Any], subscription: Subscription
@@ -100,17 +100,22 @@ class Reporter:
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def diagnose(
-        self, about: str, text: str, level: Level = Level.WARN, lasts_s: float = PROBLEM_LASTS_S
+        self,
+        about: str,
+        text: str,
+        level: Level = Level.WARN,
+        lasts_s: float = PROBLEM_LASTS_S,
+        repeat_s: float = REPEAT_S,
     ) -> None:
         """Tell what is wrong and what to do about it: in the log now and then, on /diagnostics as
         long as it is found again within `lasts_s`.
         """
         self.health.found(about, level, text, lasts_s)
-        self.warn(text, about)
+        self.warn(text, about, repeat_s)
 
-    def warn(self, text: str, about: str = '') -> None:
-        """Log a warning, at most every few seconds about the same."""
-        if self._is_due(about or text):
+    def warn(self, text: str, about: str = '', repeat_s: float = REPEAT_S) -> None:
+        """Log a warning, at most every so many seconds about the same."""
+        if self._is_due(about or text, repeat_s):
             self._node.get_logger().warning(text)
 
     def log_fault(self, where: str, error: Exception) -> None:
@@ -138,10 +143,13 @@ class Reporter:
         texts = {key: str(value) for key, value in values.items()}
         self.publisher.publish(status_message(Status(stamp_ns, name, level, message, texts)))
 
-    def _is_due(self, about: str) -> bool:
+    def _is_due(self, about: str, repeat_s: float = REPEAT_S) -> bool:
         now_s = time.monotonic()
-        self._logged_s = {key: s for key, s in self._logged_s.items() if now_s - s < REPEAT_S}
-        return self._logged_s.setdefault(about, now_s) == now_s
+        self._silent_until_s = {key: s for key, s in self._silent_until_s.items() if s > now_s}
+        if about in self._silent_until_s:
+            return False
+        self._silent_until_s[about] = now_s + repeat_s
+        return True
 
 
 def one_line(error: Exception) -> str:

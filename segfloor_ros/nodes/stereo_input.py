@@ -24,6 +24,15 @@ from segfloor_ros.nodes.stage_node import AnyStageNode
 
 INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
+KINDS = {
+    'image_raw': ('raw', 'raw'),
+    'image_rect': ('rect', 'raw'),
+    'image_raw/compressed': ('raw', 'compressed'),
+    'image_rect/compressed': ('rect', 'compressed'),
+}
+"""The image topics of one side, in order of preference: as `image_kind` and `image_transport` have
+them.
+"""
 Pair = dict[str, Any]
 """A left and a right message of the same time, by topic."""
 
@@ -47,24 +56,43 @@ class StereoInput:
         self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
         self._takes_best_effort = own.image_reliability == 'best_effort'
-        kind = 'image_rect' if own.rectified_input else 'image_raw'
-        kind += '/compressed' if own.image_transport == 'compressed' else ''
-        self.left, self.right = f'left/{kind}', f'right/{kind}'
-        self.watch = CameraWatch(node, own, self.left, self.right)
+        self._kinds = [
+            kind
+            for kind, (image, transport) in KINDS.items()
+            if own.image_kind in ('auto', image) and own.image_transport in ('auto', transport)
+        ]
+        self.watch = CameraWatch(node, own)
         self.reset()
+        self._choose(self._kinds[0])
         for info in INFOS:
             node.inputs.subscribe(info, partial(self._take_info, info), self._choose_profile)
-        node.inputs.join(
-            (self.left, self.right),
-            on_pair,
+        for kind in self._kinds:
+            self._join_images(kind, on_pair)
+
+    def _join_images(self, kind: str, on_pair: Callable[[int, Pair], None]) -> None:
+        def take(stamp_ns: int, pair: Pair) -> None:
+            self._is_settled = True
+            on_pair(stamp_ns, pair)
+
+        self._node.inputs.join(
+            (f'left/{kind}', f'right/{kind}'),
+            take,
             on_message=self.watch.saw_image,
             choose_profile=self._choose_profile,
+            is_wanted=lambda: self._kind == kind,
             capacity=MAX_UNPAIRED,
-            tolerance_ns=round(own.sync_tolerance_s * 1e9),
+            tolerance_ns=round(self._own.sync_tolerance_s * 1e9),
         )
 
+    def _choose(self, kind: str) -> None:
+        self._kind = kind
+        self.left, self.right = f'left/{kind}', f'right/{kind}'
+        self._is_rectified = KINDS[kind][0] == 'rect'
+        self.watch.expect(self.left, self.right, self._is_rectified)
+
     def reset(self) -> None:
-        """Take over the latest calibration with the next pair."""
+        """Take over the latest calibration with the next pair, and whatever images come."""
+        self._is_settled = False
         self._rectifier: StereoRectifier | None = None
         self._eight_bit = EightBitScale(self._own.bit_depth)
 
@@ -82,7 +110,7 @@ class StereoInput:
     def rectifier(self) -> StereoRectifier:
         """What rectifies, made for the calibration at the first pair."""
         if self._rectifier is None:
-            taken = self.calibration if self._own.rectified_input else self._raw_calibration()
+            taken = self.calibration if self._is_rectified else self._raw_calibration()
             self._rectifier = StereoRectifier(taken)
         return self._rectifier
 
@@ -97,7 +125,26 @@ class StereoInput:
         """Return the names of both optical frames."""
         return pair[self.left].header.frame_id, pair[self.right].header.frame_id
 
-    def adapt(self) -> None:
+    def find_images(self) -> None:
+        """Before the first pair, take the kind of images that is published, if the choice is left
+        to the node.
+        """
+        if self._is_settled or not self._node.inputs.is_open:
+            return
+        published = [kind for kind in self._kinds if self._is_published(kind)]
+        if published and self._kind not in published:
+            self._choose(published[0])
+            self._node.get_logger().info(
+                f'receives {self.left} and {self.right}, which are published; set image_kind and '
+                'image_transport to choose others'
+            )
+            self._node.inputs.update()
+
+    def _is_published(self, kind: str) -> bool:
+        topics = (f'{side}/{kind}' for side in ('left', 'right'))
+        return all(self._node.get_publishers_info_by_topic(topic) for topic in topics)
+
+    def adapt_reliability(self) -> None:
         """Take the images best effort where a driver offers no more, if the choice is left to the
         node.
         """
@@ -108,7 +155,7 @@ class StereoInput:
             self._takes_best_effort = True
             names = ', '.join(lossy)
             self._node.get_logger().info(
-                f'taken best effort, as offered: {names}; images may get lost'
+                f'receives best effort, as offered: {names}; images may get lost'
             )
             self._node.inputs.reopen()
 

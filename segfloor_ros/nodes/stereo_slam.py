@@ -46,7 +46,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._transforms = Transforms(self, own)
         self._work = WhenIdle(self, self._process_waiting)
         self._camera = StereoInput(self, own, self._take_pair, self._work.request)
-        self.inputs.every(LOOK_AGAIN_S, self._work.request)
+        self.inputs.every(LOOK_AGAIN_S, self._look_again)
         self.at_clean_up(self._end_stage)
 
     def reset_stage(self) -> None:
@@ -81,12 +81,16 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
 
     def find_problems(self) -> None:
         """Follow what the driver offers, and report what is wrong with the camera."""
-        self._camera.adapt()
+        self._camera.adapt_reliability()
         missing = self._camera.missing_calibrations if self._waiting else []
         self._camera.watch.find_problems(missing)
 
     def _take_pair(self, stamp_ns: int, pair: Pair) -> None:
         self._waiting.add((stamp_ns, pair))
+        self._work.request()
+
+    def _look_again(self) -> None:
+        self._camera.find_images()
         self._work.request()
 
     def _process_waiting(self) -> None:

@@ -151,7 +151,7 @@ def test_images_without_calibration_are_named(make_graph, frames) -> None:
 
 
 def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
-    graph = make_graph(*GIVEN, '-p', 'rectified_input:=true')
+    graph = make_graph(*GIVEN, '-p', 'image_kind:=rect')
     driver = Driver(graph, image='image_rect')
     graph.add(StereoSlamNode())
     driver.connect()

@@ -62,7 +62,7 @@ def test_compressed_images_take_the_place_of_raw_ones(make_graph, tmp_path, node
 
 
 def test_slam_takes_rectified_images_by_parameter(make_graph) -> None:
-    graph = make_graph('-p', 'rectified_input:=true', '-p', 'image_reliability:=best_effort')
+    graph = make_graph('-p', 'image_kind:=rect', '-p', 'image_reliability:=best_effort')
     node = make('stereo_slam', graph)
     names = dict(node.get_subscriber_names_and_types_by_node('stereo_slam', '/'))
     assert '/left/image_rect' in names

@@ -25,8 +25,8 @@ MAKERS = (StereoCameraNode, StereoSlamNode, FloorSegmentationNode, CloudLabellin
 ALTERNATIVES = (
     (),
     ('-p', 'image_transport:=compressed'),
-    ('-p', 'rectified_input:=true'),
-    ('-p', 'rectified_input:=true', '-p', 'image_transport:=compressed'),
+    ('-p', 'image_kind:=rect'),
+    ('-p', 'image_kind:=rect', '-p', 'image_transport:=compressed'),
 )
 OF_ROS = ('/parameter_events', '/rosout', '/clock', '/transition_event', '/tf', '/tf_static')
 SERVICES_OF_ROS = re.compile(

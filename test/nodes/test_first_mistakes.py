@@ -1,0 +1,160 @@
+"""What somebody meets who starts the nodes for the first time: other topics, none, or twins."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
+from stereo_drive import room_drive
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
+from segfloor_ros.messages.diagnostics import HEALTH, Level
+from segfloor_ros.messages.images import compressed_message, image_message
+from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.lookalikes import likeness
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+
+GIVEN = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+    '-p', 'camera_roll_rad:=0.0',
+)  # fmt: skip
+CALIBRATION = rectified_calibration(CAMERA)
+CONSOLE_S = 5.0
+
+
+@pytest.fixture
+def console(monkeypatch):
+    """The warnings of all nodes with the time since the start."""
+    lines: list[tuple[float, str]] = []
+    from rclpy.impl.rcutils_logger import RcutilsLogger
+
+    begun_s, log = time.monotonic(), RcutilsLogger.warning
+
+    def warning(self, message, **options):
+        lines.append((time.monotonic() - begun_s, message))
+        return log(self, message, **options)
+
+    monkeypatch.setattr(RcutilsLogger, 'warning', warning)
+    return lines
+
+
+@contextlib.contextmanager
+def another_participant() -> Iterator[Node]:
+    """A node as in another process."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = Node('driver', context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+@pytest.mark.parametrize(
+    'kind', ['image_raw', 'image_rect', 'image_raw/compressed', 'image_rect/compressed']
+)
+def test_slam_takes_the_images_that_are_published(make_graph, kind) -> None:
+    (frame, *_), _ = room_drive(1)
+    graph = make_graph(*GIVEN)
+    node = graph.add(StereoSlamNode())
+    names = [f'{side}/{what}' for side in ('left', 'right') for what in (kind, 'camera_info')]
+    publishers = {name: graph.publisher(name) for name in names}
+    graph.connected(list(publishers.values()))
+    for side in ('left', 'right'):
+        info = camera_info_message(0, side, getattr(CALIBRATION, side))
+        publishers[f'{side}/camera_info'].publish(info)
+        image = getattr(frame, side)
+        message = (
+            compressed_message(0, side, image, None)
+            if kind.endswith('compressed')
+            else image_message(0, side, image)
+        )
+        publishers[f'{side}/{kind}'].publish(message)
+    graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
+    assert graph.reports('stereo_slam')[0].values['tracked'] == '1'
+    others = {f'/left/{other}' for other in ('image_raw', 'image_rect')} - {f'/left/{kind}'}
+    assert not {s.topic_name for s in node.subscriptions} & others
+
+
+def test_raw_images_come_first_and_an_explicit_choice_holds(make_graph) -> None:
+    graph = make_graph(*GIVEN, '-p', 'image_kind:=rect')
+    for kind in ('image_raw', 'image_rect'):
+        for side in ('left', 'right'):
+            graph.publisher(f'{side}/{kind}')
+    node = graph.add(StereoSlamNode())
+    graph.until(lambda: node.count_publishers('left/image_raw'), 'the driver')
+    graph.comes(lambda: False, 0.5)
+    assert node.count_subscribers('left/image_rect') == 1
+    assert node.count_subscribers('left/image_raw') == 0
+    graph.close()
+    graph = make_graph(*GIVEN)
+    for kind in ('image_rect', 'image_raw'):
+        for side in ('left', 'right'):
+            graph.publisher(f'{side}/{kind}')
+    node = graph.add(StereoSlamNode())
+    graph.until(lambda: node.count_publishers('left/image_rect'), 'the driver')
+    graph.comes(lambda: False, 0.5)
+    assert node.count_subscribers('left/image_raw') == 1
+
+
+def test_a_topic_that_nobody_publishes_is_on_the_console_with_its_lookalike(
+    make_graph, console
+) -> None:
+    graph = make_graph()
+    for name in ('/camera/infra1/image_rect_raw', '/camera/infra2/image_rect_raw', '/map_image'):
+        graph.tester.create_publisher(Image, name, TOPICS['left/image_raw'].profile)
+    graph.add(StereoSlamNode())
+
+    def line() -> list[tuple[float, str]]:
+        return [(s, text) for s, text in console if 'nobody publishes left/camera_info' in text]
+
+    graph.until(line, 'the warning')
+    seconds, text = line()[0]
+    assert seconds < CONSOLE_S
+    assert 'right/image_raw' in text
+    assert '-r left/image_raw:=/camera/infra1/image_rect_raw' in text
+    assert '-r right/image_raw:=/camera/infra2/image_rect_raw' in text
+    assert '/left/camera_info: no other topic of the type sensor_msgs/msg/CameraInfo' in text
+    assert not graph.comes(lambda: len(line()) > 1, 6.0), 'once is enough for a while'
+
+
+def test_a_topic_of_another_type_is_named_as_that(make_graph, console) -> None:
+    graph = make_graph('-p', 'image_transport:=raw')
+    profile = TOPICS['left/image_raw'].profile
+    # A process has a topic with one type only.
+    with another_participant() as driver:
+        driver.create_publisher(CompressedImage, 'left/image_raw', profile)
+        graph.add(StereoSlamNode())
+        words = (
+            '/left/image_raw is published as sensor_msgs/msg/CompressedImage, not as sensor_msgs'
+        )
+        graph.until(lambda: any(words in text for _, text in console), 'the warning')
+
+
+def test_a_node_of_the_same_name_is_named(make_graph, console) -> None:
+    graph = make_graph()
+    graph.add(CloudLabellingNode())
+    graph.until(lambda: graph.reports_any('cloud_labelling'), 'a sign of life')
+    assert not any('nodes are called' in text for _, text in console)
+    twin = Node('cloud_labelling')
+    graph.add(twin)
+    words = '2 nodes are called /cloud_labelling and publish on the same topics'
+    graph.until(lambda: any(words in text for _, text in console), 'the warning')
+    health = [s for s in graph.statuses if s.kind == HEALTH and words in s.message]
+    graph.until(lambda: health or any(words in s.message for s in graph.statuses), 'the status')
+    found = [s for s in graph.statuses if words in s.message]
+    assert found[-1].level is Level.ERROR
+
+
+def test_the_side_of_a_topic_counts_more_than_its_letters() -> None:
+    wanted = '/right/image_raw'
+    assert likeness(wanted, '/camera/infra2/image_rect_raw') > likeness(wanted, '/left/image_raw')
+    assert likeness(wanted, '/cam1/image_raw') > likeness(wanted, '/cam0/image_raw')
