@@ -25,7 +25,8 @@ _WIDE_WINDOW = 15
 _WIDE_RATIO = 1.15
 _WIDE_MARGIN_GREY = 0.05
 _WIDE_SHARE = 0.65
-_SHIFT_PX = 2.0
+_MARGIN_PX = 4.0
+"""So near to the right image's border interpolation is unsure."""
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
@@ -57,7 +58,6 @@ def compare(
         return _local_difference(sampled, seen)
 
     floor, matched = difference(floor_px), difference(matched_px)
-    shifted = np.minimum(difference(floor_px - _SHIFT_PX), difference(floor_px + _SHIFT_PX))
     margin = settings.against_grey + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
     unlike = floor > settings.likeness_grey + _NOISE_SHARE * noise_grey
@@ -67,13 +67,9 @@ def compare(
     denied &= (matched_px > 0) & worse
     denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
     contrary = against | (floor > 2 * settings.likeness_grey + _NOISE_SHARE * noise_grey)
-    closer = shifted - floor > 0.4 * settings.against_grey + 0.1 * noise_grey
-    closer &= (floor < 1.1 * matched) | (matched_px <= 0)
-    closer &= floor_px >= settings.min_disparity_px
-    reached = columns >= floor_px + 2 * _SHIFT_PX
-    distinct = closer & reached & ~against & ~unlike
+    reached = columns >= floor_px + _MARGIN_PX
     contradicted = (against, denied, unlike)
-    masks = (*(mask & reached for mask in contradicted), distinct, ~(contrary & reached))
+    masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
     return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
 
 

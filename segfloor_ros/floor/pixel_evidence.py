@@ -28,15 +28,13 @@ class Comparison:
 
     floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
     against: clearly more like the matched disparity than like floor. denied: the same of the
-    surroundings taken together. unlike: unlike floor, whatever it is. distinct: like floor, and
-    less so a little off the floor. consistent: may be floor.
+    surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor.
     """
 
     floor_px: NDArray[np.float32]
     against: NDArray[np.bool_]
     denied: NDArray[np.bool_]
     unlike: NDArray[np.bool_]
-    distinct: NDArray[np.bool_]
     consistent: NDArray[np.bool_]
 
 
@@ -113,7 +111,7 @@ def judge(
     sill &= up < np.float32(_SURE_SHARE * settings.step_height_m)
     floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
-    mask[floor | compared.distinct] = FLOOR
+    mask[floor] = FLOOR
     mask[off & sure] = NOT_FLOOR
     low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR

@@ -43,9 +43,9 @@ class FloorMemory:
     ) -> NDArray[np.uint8]:
         """Return the mask (R, W) with floor where nothing is seen now and floor was before.
 
-        open_: (R, W), where the images do not deny it. Beyond the crest of a ramp the floor that
-        was seen lies lower, out of sight. What stands at the border of what only the left camera
-        sees is taken to go on there.
+        open_: (R, W), where that may be: remembered floor may lie behind what stands there now, a
+        blank wall for one. What stands at the border of what only the left camera sees is taken
+        to go on there.
         """
         nearest_row = _first_row_within_reach(view)
         rows, columns = pixels_where((mask[nearest_row:] == NO_EVIDENCE) & open_[nearest_row:])

@@ -307,7 +307,9 @@ class FloorSegmentation:
         """Return the mask with floor where this pair of images alone cannot tell."""
         settings = self._settings
         if T_map_base is not None:
-            mask = self._memory.fill(view, mask, ~compared.denied, T_map_base)
+            # What is remembered may lie behind a blank wall that stands in front of it now.
+            unshared = view.columns < profile.at_pixels(view.derolled)
+            mask = self._memory.fill(view, mask, textured & unshared, T_map_base)
         consistent = compared.consistent
         mask = fill_regions(
             view, mask, left_rows, disparity, compared, textured, settings.fill_support

@@ -30,9 +30,8 @@ def filled(wall_px_of_floor: float, seen_row: int = SEEN_ROW) -> np.ndarray:
     mask[rows >= seen_row], mask[wall] = FLOOR, NOT_FLOOR
     foot_px = float(profile.at_rows(np.array([FIRST_ROW + CONTACT_ROW]))[0])
     disparity = np.where(wall, wall_px_of_floor * foot_px, 0).astype(np.float32)
-    nothing = np.zeros(shape, bool)
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
-    compared = Comparison(floor_px, wall, wall, wall, nothing, ~wall)
+    compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
     result = fill_to_contact(view, mask, plain, disparity, compared)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()

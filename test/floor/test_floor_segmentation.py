@@ -177,21 +177,29 @@ def test_same_input_same_output():
     assert first.scan.ranges_m.tobytes() == second.scan.ranges_m.tobytes()
 
 
-def test_the_left_border_is_known_from_before():
-    """Driving ahead, the corner that the right camera cannot see was seen from farther away."""
+LEFT_CORNER = np.s_[440:, 5:40]
+
+
+def approach(stage):
+    """Drive ahead, to where the corner that the right camera cannot see was seen from farther
+    away. Returns the last images and the pose; the corner is floor in the last mask alone.
+    """
     patches = [floor_patch(seed=4), wall(6.0)]
-    stage = FloorSegmentation(CAMERA, FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0))
-    corner = np.s_[440:, 5:40]
     shares_of_corner = []
     for x_m in (0.0, 0.1, 0.2, 0.3, 0.4):
         moved = [dataclasses.replace(p, corner=(p.corner[0] - x_m, *p.corner[1:])) for p in patches]
-        left, right, _, _ = Scene(moved).render()
+        images = Scene(moved).render()[:2]
         T_map_base = np.eye(4)
         T_map_base[0, 3] = x_m
-        mask = stage.process(left, right, MOUNT, T_map_base).mask
-        shares_of_corner.append(np.mean(mask[corner] == FLOOR))
+        mask = stage.process(*images, MOUNT, T_map_base).mask
+        shares_of_corner.append(np.mean(mask[LEFT_CORNER] == FLOOR))
     assert shares_of_corner[0] < 0.3
     assert shares_of_corner[-1] > 0.7
+    return images, T_map_base
+
+
+def test_the_left_border_is_known_from_before():
+    approach(FloorSegmentation(CAMERA, FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)))
 
 
 @pytest.mark.parametrize(
@@ -204,21 +212,31 @@ def test_the_left_border_is_known_from_before():
     ],
 )
 def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_remembered):
-    """A patch of floor has lost its texture, and nothing but what was seen before fills it."""
-    scene, wet = Scene([floor_patch(), wall(3.0)]), floor_patch(0.6, 1.5, 0.4, 0.001, contrast=0.0)
-    left, right, _, _ = scene.render()
-    blank = Scene([wet, *scene.patches]).render()[:2]
+    """The left border is known from before alone."""
     before = dataclasses.replace(SETTINGS, fill_support=1.0, fill_gap_m=0.0)
-    changed = dataclasses.replace(before, **change)
-    stage = FloorSegmentation(scene.camera, before)
+    stage = FloorSegmentation(CAMERA, before)
+    last, T_map_base = approach(stage)
+    stage.change_settings(dataclasses.replace(before, **change))
+    mask = stage.process(*last, MOUNT, T_map_base).mask
+    share = np.mean(mask[LEFT_CORNER] == FLOOR)
+    assert (share > 0.7) if is_remembered else (share < 0.3)
+
+
+@pytest.mark.parametrize(('grey', 'wall_m'), [(70.0, 1.2), (120.0, 2.5), (200.0, 1.8)])
+def test_floor_known_from_the_other_side_is_not_drawn_through_a_blank_wall(grey, wall_m):
+    stage = FloorSegmentation(CAMERA, SETTINGS)
+    left, right, _, _ = Scene([floor_patch(), wall(6.0)]).render()
     for _ in range(3):
-        stage.process(left, right, scene.mount, np.eye(4))
-    stage.change_settings(changed)
-    found = stage.process(*blank, scene.mount, np.eye(4)).mask == FLOOR
-    anew = FloorSegmentation(scene.camera, changed)
-    alone = anew.process(*blank, scene.mount, np.eye(4)).mask == FLOOR
-    more = found.sum() - alone.sum()
-    assert (more > 1000) if is_remembered else (more == 0)
+        stage.process(left, right, MOUNT, np.eye(4))
+    blank = Scene([floor_patch(), wall(wall_m, contrast=0.0, grey=grey)])
+    left, right, floor, _ = blank.render()
+    observation = stage.process(left, right, MOUNT, np.eye(4))
+    called = observation.mask == FLOOR
+    assert (called & ~floor).sum() / called.sum() < 0.01
+    scan = observation.scan
+    ahead = np.abs(scan.bearings_rad) < np.radians(35)
+    beyond_m = scan.ranges_m[ahead] - wall_m / np.cos(scan.bearings_rad[ahead])
+    assert np.nanquantile(beyond_m, 0.9) < 0.1
 
 
 def test_what_moves_is_no_obstacle_and_the_floor_it_hides_is_unknown():
