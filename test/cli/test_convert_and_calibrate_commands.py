@@ -1,6 +1,7 @@
 """`segfloor convert` and `segfloor calibrate` for real."""
 
 import numpy as np
+from chessboards import BOARD, K_TRUE, SQUARE_M, write_boards
 from stereo_drive import room_drive, write_kitti
 from test_run_command import segfloor
 
@@ -31,7 +32,17 @@ def test_convert_does_not_overwrite(tmp_path):
     assert (tmp_path / 'drive.mcap').read_text() == 'precious'
 
 
-def test_calibrate_writes_what_the_reader_reads(shared_data, tmp_path):
+def test_calibrate_writes_what_the_reader_reads(tmp_path):
+    boards = write_boards(tmp_path / 'boards', 8)
+    form = ('--square', SQUARE_M, '--board', 'x'.join(map(str, BOARD)))
+    done = segfloor('calibrate', boards, *form, '--out', tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert '8 of 8' in done.stdout
+    calibration = read_calibration(tmp_path / 'left.yaml', tmp_path / 'right.yaml')
+    np.testing.assert_allclose(calibration.left.K, K_TRUE, atol=3.0)
+
+
+def test_calibrate_solves_the_pictures_of_opencv(shared_data, tmp_path):
     done = segfloor('calibrate', shared_data / 'chessboard', '--square', 0.025, '--out', tmp_path)
     assert done.returncode == 0, done.stderr
     assert '13 of 13' in done.stdout

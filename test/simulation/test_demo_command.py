@@ -38,6 +38,14 @@ def simulate(out, *options):
     return run('simulate', 'corridor2', '--out', out, *settings, *options)
 
 
+@pytest.fixture(scope='module')
+def files(tmp_path_factory):
+    """A small drive as files."""
+    folder = tmp_path_factory.mktemp('simulated') / 'files'
+    assert 'pairs, 0.6 m' in simulate(folder)
+    return folder
+
+
 def test_the_demo_drive_is_small_and_complete():
     assert sum(file.stat().st_size for file in DRIVE.iterdir()) < 15e6
     truth = load_truth(DRIVE)
@@ -61,35 +69,37 @@ def test_demo_maps_and_scores(tmp_path):
     path = next(line for line in output if line.startswith('path: '))
     assert '7.8 m, 100.0 % of the frames tracked' in path
     free = next(line for line in output if 'free cells' in line).split('│')
-    assert float(free[2]) > 98.0
-    assert float(free[3]) > 75.0
+    # Measured: 99.1 and 97.4 of the free cells, 99.8 and 97.0 of the occupied ones.
+    assert float(free[2]) > 98.5
+    assert float(free[3]) > 95.0
+    occupied = next(line for line in output if 'occupied cells' in line).split('│')
+    assert float(occupied[2]) > 98.5
+    assert float(occupied[3]) > 94.0
 
 
-def test_simulate_writes_a_folder_that_can_be_read(tmp_path):
-    assert 'pairs, 0.6 m' in simulate(tmp_path / 'drive')
-    source = open_source(StereoCameraSettings(input=str(tmp_path / 'drive')))
+def test_simulate_writes_a_folder_that_can_be_read(files):
+    source = open_source(StereoCameraSettings(input=str(files)))
     assert source.calibration.camera.fx == pytest.approx(80.0)
     frames = list(source.frames())
-    assert len(frames) == len(load_truth(tmp_path / 'drive').base_poses)
+    assert len(frames) == len(load_truth(files).base_poses)
 
 
 @pytest.mark.parametrize('coding', ['bag-png', 'bag-jpeg'])
-def test_simulate_writes_a_bag_with_the_true_odometry(tmp_path, coding):
+def test_simulate_writes_a_bag_with_the_true_odometry(tmp_path, files, coding):
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     simulate(tmp_path / 'bag', '--images', coding)
-    simulate(tmp_path / 'files')
     pairs = [
         list(open_source(StereoCameraSettings(input=str(path))).raw_pairs())
-        for path in (tmp_path / 'bag' / 'drive.mcap', tmp_path / 'files')
+        for path in (tmp_path / 'bag' / 'drive.mcap', files)
     ]
     assert len(pairs[0]) == len(pairs[1])
     largest = 0 if coding == 'bag-png' else 30
     for from_bag, from_files in zip(*pairs, strict=True):
         assert from_bag.stamp_ns == from_files.stamp_ns
         assert cv2.absdiff(from_bag.right, from_files.right).max() <= largest
-    base = np.loadtxt(tmp_path / 'files' / 'base_poses.txt')
+    base = np.loadtxt(files / 'base_poses.txt')
     store = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([tmp_path / 'bag' / 'drive.mcap'], default_typestore=store) as reader:
         wanted = [c for c in reader.connections if c.topic == ODOMETRY_TOPIC]

@@ -46,6 +46,7 @@ def test_a_single_frame_is_no_drive(tmp_path) -> None:
         write_endless_drive(source, tmp_path / 'endless', 1.0)
 
 
+@pytest.mark.slow
 def test_a_soak_loses_nothing(tmp_path) -> None:
     drive = write_kitti(tmp_path / 'drive', room_drive(5, step_m=0.04)[0])
     command = [sys.executable, '-m', 'tools.benchmark_nodes', str(drive),
@@ -57,6 +58,7 @@ def test_a_soak_loses_nothing(tmp_path) -> None:
         assert f'{node}: CPU' in done.stdout
 
 
+@pytest.mark.slow
 def test_what_nodes_cost_that_do_nothing_is_told(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(idle_nodes, 'SETTLE_S', 0.5)
     monkeypatch.setattr(idle_nodes, 'ALL_IDLE_S', 0.1)

@@ -29,6 +29,7 @@ def test_the_published_scenes_are_shipped():
     assert set(PUBLISHED) <= set(shipped_scenes())
 
 
+@pytest.mark.slow
 def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     steps = []
 
@@ -38,7 +39,7 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
 
     def scene_result(*changes):
         steps.clear()
-        small = ('camera.width=320', 'camera.height=240', *changes)
+        small = ('camera.width=160', 'camera.height=120', *changes)
         scene = open_scene('corridor2', small)
         return run_scene('corridor2', scene, tmp_path, CONFIGURATION, 1, announce)
 

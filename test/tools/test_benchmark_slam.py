@@ -70,7 +70,7 @@ def test_a_recording_without_its_true_path_is_refused(drive, tmp_path) -> None:
 def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
     scene = tmp_path / 'short.yaml'
     scene.write_text(
-        'like: corridor2\ncamera: {width: 320, height: 240}\n'
+        'like: corridor2\ncamera: {width: 160, height: 120}\n'
         'path: {waypoints: [[0.1, 0.0], [0.5, 0.0]]}\n'
     )
     arguments = [str(scene), '--seeds', '2', '--workdir', str(tmp_path / 'work')]
