@@ -18,6 +18,7 @@ from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.robot_check import RobotCheck
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
 
@@ -32,6 +33,7 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
 
     def __init__(self) -> None:
         super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
+        self._robot_check = RobotCheck(self, 'floor_segmentation')
 
     def set_up(self) -> None:
         """Make the topics."""
@@ -51,6 +53,12 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         self._keyframes.map_start_ns, self._stage = state
         self._stage.settings = self.parameters.stage
         self.get_logger().warning('resumed with the labels of a node that was killed')
+
+    def find_problems(self) -> None:
+        """Report when the floor is segmented for another robot."""
+        difference = self._robot_check.difference(self.parameters.stage)
+        if difference is not None:
+            self.reporter.diagnose('robot', difference)
 
     def on_settings_changed(self) -> None:
         """Label the next keyframe with the new settings."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from node_messages import cloud_messages, publish
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive
@@ -271,3 +272,13 @@ def test_a_mount_that_the_floor_confirms_is_not_mentioned(frames) -> None:
     words = [check.add(frame.left, frame.right, np.eye(4)) for frame in frames[:1]]
     assert words == [None]
     assert check.is_done
+
+
+def test_nodes_with_different_robots_say_so(make_graph) -> None:
+    graph = make_graph()
+    graph.add(FloorSegmentationNode())
+    labelling = graph.add(CloudLabellingNode())
+    (set_,) = labelling.set_parameters([Parameter('robot_height_m', value=0.4)])
+    assert set_.successful
+    status = says(graph, 'cloud_labelling', 'robot_height_m is 0.4 here', '1 in floor_segmentation')
+    assert status.level == Level.WARN
