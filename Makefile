@@ -20,7 +20,7 @@ APART_FROM := nodes/test_faults nodes/test_restarts nodes/test_two_hosts nodes/t
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 # Tests of one module stay together where they can: its fixtures are made once.
 PARALLEL := -n 2 --dist worksteal
-CODE := segfloor_ros test launch_configs docs tools setup.py
+CODE := segfloor_ros test launch_configs docs tools .ci setup.py
 
 .PHONY: all test test-slow test-noble noble-python demo lint format docs clean
 

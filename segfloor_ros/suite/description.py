@@ -18,25 +18,28 @@ from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES
 from segfloor_ros.suite.recordings import find_recordings, is_url
 
 RUN, REPLAY = 'run', 'replay'
+RECORDING, SCENE, RESULTS = SOURCES = ('input', 'simulate', 'results')
 TIMEOUT_S = 3600.0
 SUITE_KEYS = ('name', 'defaults', 'recordings')
-SHARED_KEYS = ('mode', 'rate', 'params', 'set', 'timeout_s', 'expect', 'no_worse_by')
-RECORDING_KEYS = ('input', 'simulate', 'seed', 'scene', 'name', 'truth', 'reference_map')
+SHARED_KEYS = ('truth', 'reference_map', 'mode', 'rate', 'params', 'set', 'timeout_s', 'expect',
+               'no_worse_by')  # fmt: skip
+RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name')
 
 
 @dataclass(frozen=True)
 class Entry:
     """One recording of a suite.
 
-    input: a path or URL, or the name of a scene where `simulated`; scene_assignments: what differs
-    from that scene. mode: `run`, or `replay` through the nodes at `rate`. truth, reference_map:
-    paths or URLs; truth '' means the recording itself where it holds one. params: a parameter file,
-    '' for none. slacks: by measure, for a baseline.
+    source: what `input` names: a recording (path or URL), a scene to simulate, or a results folder
+    that is there already and only measured. scene_assignments: what differs from the scene. mode:
+    `run`, or `replay` through the nodes at `rate`. truth, reference_map: paths or URLs; truth ''
+    means the recording itself where it holds one. params: a parameter file, '' for none. slacks: by
+    measure, for a baseline.
     """
 
     name: str
     input: str
-    simulated: bool = False
+    source: str = RECORDING
     scene_assignments: tuple[str, ...] = ()
     mode: str = RUN
     rate: float = 0.0
@@ -99,25 +102,30 @@ class _Reader:
             'slacks': self._slacks(),
         }
         self._check_parameters(shared['params'], shared['assignments'])
-        if ('input' in self._own) == ('simulate' in self._own):
-            raise self._error((), 'expected either input (a recording) or simulate (a scene)')
-        if 'simulate' in self._own:
+        given = [source for source in SOURCES if source in self._own]
+        if len(given) != 1:
+            raise self._error(
+                (), 'expected one of input (a recording), simulate (a scene), results (a folder)'
+            )
+        if given[0] == SCENE:
             return [self._simulated(shared)]
-        return self._recorded(shared)
+        return self._found(given[0], shared)
 
-    def _recorded(self, shared: dict[str, Any]) -> list[Entry]:
+    def _found(self, source: str, shared: dict[str, Any]) -> list[Entry]:
         for name in ('seed', 'scene'):
             if name in self._own:
-                raise self._error((name,), f'{name} is for simulate, not for input')
-        pattern = self._resolved(str(self._own['input']))
+                raise self._error((name,), f'{name} is for simulate, not for {source}')
+        pattern = self._resolved(str(self._own[source]))
         try:
             found = find_recordings(pattern)
         except SegfloorError as error:
-            raise self._error(('input',), str(error)) from None
+            raise self._error((source,), str(error)) from None
         given = self._own.get('name')
         if given and len(found) > 1:
             raise self._error(('name',), f'{given} would name {len(found)} recordings')
-        return [Entry(_file_name(given or stem), path, **shared) for stem, path in found.items()]
+        return [
+            Entry(_file_name(given or stem), path, source, **shared) for stem, path in found.items()
+        ]
 
     def _simulated(self, shared: dict[str, Any]) -> Entry:
         scene = str(self._own['simulate'])
@@ -134,7 +142,7 @@ class _Reader:
         except SegfloorError as error:
             raise self._error(('simulate',), str(error)) from None
         name = Path(scene).stem + (f'-{seed}' if seed is not None else '')
-        return Entry(_file_name(self._own.get('name') or name), scene, True, words, **shared)
+        return Entry(_file_name(self._own.get('name') or name), scene, SCENE, words, **shared)
 
     def _bounds(self) -> list[Bound]:
         bounds = []

@@ -25,7 +25,7 @@ from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.drive_files import RecordingOptions
 from segfloor_ros.simulation.render_once import render_once
-from segfloor_ros.suite.description import REPLAY, Entry
+from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import measure_run
 from segfloor_ros.suite.recordings import digest_of, local_copy
 from segfloor_ros.suite.result_files import Cache, pack
@@ -115,6 +115,8 @@ def _map_and_measure(job: Job) -> tuple[dict[str, float], bytes, bool]:
     reference_map = (
         local_copy(entry.reference_map, folder / 'recordings') if entry.reference_map else None
     )
+    if entry.source == RESULTS:
+        return measure_run(recording, truth, reference_map), pack(recording), False
     cache = Cache(folder / 'results')
     files = dict.fromkeys(path for path in (recording, truth, reference_map) if path is not None)
     key = job.content_digest(files) if job.reuse else ''
@@ -134,7 +136,7 @@ def _map_and_measure(job: Job) -> tuple[dict[str, float], bytes, bool]:
 
 
 def _recording(entry: Entry, folder: Path) -> Path:
-    if not entry.simulated:
+    if entry.source != SCENE:
         return local_copy(entry.input, folder / 'recordings')
     scene = open_scene(entry.input, entry.scene_assignments)
     recording = folder / 'renderings' / _digest_of_text(repr((__version__, scene)))
@@ -146,6 +148,8 @@ def _truth(entry: Entry, recording: Path, folder: Path) -> Path | None:
     """Return the truth that is named, else the recording's own."""
     if entry.truth:
         return local_copy(entry.truth, folder / 'recordings')
+    if entry.source == RESULTS:
+        return None
     names = ('map.yaml', 'poses.txt', 'floor')
     return recording if any((recording / name).exists() for name in names) else None
 

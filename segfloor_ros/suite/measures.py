@@ -58,21 +58,21 @@ MEASURES = {
 
 
 def measure_run(
-    run: Path, truth: Path | None, reference_map: Path | None, reference_ms: float
+    run: Path, truth: Path | None, reference_map: Path | None, reference_ms: float = float('nan')
 ) -> dict[str, float]:
-    """Return the measures of a results folder by name, those that the truth allows.
+    """Return the measures of a results folder by name, those that its files and the truth allow.
 
     truth: a folder with map.yaml (and scene.yaml, base_poses.txt), poses.txt or floor/, or a map
     YAML. reference_map: a map of an earlier run from the same start. reference_ms: median time of
     the reference workload. Raises InputError naming what cannot be read.
     """
-    summary = json.loads((run / 'summary.json').read_text())
     grid = read_map(run / 'map.yaml')
-    measured = {
-        **_of_summary(summary, reference_ms),
-        'return_m': _return_m(run / 'trajectory.txt'),
-        'known_area_m2': float((states(grid) != UNKNOWN).sum()) * grid.resolution_m**2,
-    }
+    known = float((states(grid) != UNKNOWN).sum())
+    measured = {'known_area_m2': known * grid.resolution_m**2}
+    if (run / 'summary.json').is_file():
+        measured.update(_of_summary(json.loads((run / 'summary.json').read_text()), reference_ms))
+    if (run / 'trajectory.txt').is_file():
+        measured['return_m'] = _return_m(run / 'trajectory.txt')
     if truth is not None:
         measured.update(_against_truth(run, grid, truth))
     if reference_map is not None:
@@ -121,7 +121,7 @@ def _against_truth(run: Path, grid: OccupancyGrid, truth: Path) -> dict[str, flo
         measured['recall_percent'] = 100 * score.opened.recall.mean
         measured['free_precision_percent'] = 100 * score.cells.free_precision
         measured['free_recall_percent'] = 100 * score.cells.free_recall
-    if (truth / 'poses.txt').is_file():
+    if (truth / 'poses.txt').is_file() and (run / 'camera_trajectory.txt').is_file():
         # Imported here: evo takes a second that no other command should wait for.
         from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 

@@ -8,7 +8,7 @@ import pytest
 
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.suite.bounds import Bound, Slack
-from segfloor_ros.suite.description import read_suite
+from segfloor_ros.suite.description import SCENE, read_suite
 
 
 def write(folder, text):
@@ -56,7 +56,7 @@ def test_a_suite_is_read_with_its_defaults(tmp_path):
         'recall_percent': Slack(2.0),
         'memory_peak_mb': Slack(0.3, relative=True),
     }
-    assert simulated.simulated
+    assert simulated.source == SCENE
     assert (simulated.name, simulated.input) == ('corridor2-4', 'corridor2')
     assert simulated.scene_assignments == ('camera.width=160', 'seed=4')
     assert all(entry.params == str(tmp_path / 'robot.yaml') for entry in suite.entries)
@@ -84,7 +84,7 @@ def test_a_pattern_is_all_it_matches(tmp_path):
         ('recordings:\n  - input: bags/a\n    expect: {keyframes: 3}\n', 3, 'expected {min'),
         ('recordings:\n  - input: bags/no\n', 2, 'no such recording'),
         ('recordings:\n  - input: bags/no*\n', 2, 'matches no recording'),
-        ('recordings:\n  - name: x\n', 2, 'expected either input'),
+        ('recordings:\n  - name: x\n', 2, 'expected one of input'),
         ('recordings:\n  - input: bags/a\n  - input: bags/a\n', 3, 'two recordings are called a'),
         ('recordings:\n  - simulate: coridor2\n', 2, 'did you mean corridor2'),
         ('recordings:\n  - simulate: corridor2\n    seed: x\n', 3, 'not a whole number'),

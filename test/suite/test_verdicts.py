@@ -7,12 +7,13 @@ import pytest
 from junitparser import JUnitXml
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.suite.bounds import Bound, Slack, bounds_of_baseline, judge
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
 from segfloor_ros.suite.junit import write_junit
-from segfloor_ros.suite.measures import agreement
+from segfloor_ros.suite.measures import agreement, measure_run
 from segfloor_ros.suite.page import write_page
 from segfloor_ros.suite.verdicts import SuiteResult, check, read_baseline, write_baseline
 
@@ -107,3 +108,14 @@ def test_agreement_is_that_of_the_cells_known_in_both():
     # The same place, a column cut off on the left: four cells are known in both, three are alike.
     assert agreement(grid(['.#', '##'], (0.5, 0.0)), reference) == 0.75
     assert np.isnan(agreement(grid(['?']), reference))
+
+
+def test_a_map_from_elsewhere_is_measured_by_itself(tmp_path):
+    cells = np.full((20, 30), FREE, np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = OCCUPIED
+    save_map(OccupancyGrid(cells, 0.1, (-1.0, -1.0)), tmp_path / 'map.yaml')
+    measured = measure_run(tmp_path, tmp_path / 'map.yaml', tmp_path / 'map.yaml')
+    assert measured['known_area_m2'] == pytest.approx(6.0)
+    assert measured['agreement_percent'] == 100.0
+    assert measured['precision_percent'] == measured['recall_percent'] == 100.0
+    assert 'tracked_percent' not in measured

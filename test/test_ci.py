@@ -1,0 +1,61 @@
+"""The project's own CI, and the files that docs/ci.md gives to copy."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from segfloor_ros.suite.description import read_suite
+from segfloor_ros.suite.measures import MEASURES
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PAGE = (REPOSITORY / 'docs' / 'ci.md').read_text()
+SCRIPTS = sorted(p for p in (REPOSITORY / '.ci').iterdir() if not p.suffix)
+
+
+@pytest.mark.parametrize('workflow', ['pip', 'ros'])
+def test_workflows_call_scripts_that_there_are(workflow) -> None:
+    text = (REPOSITORY / '.github' / 'workflows' / f'{workflow}.yml').read_text()
+    (job,) = yaml.safe_load(text)['jobs'].values()
+    called = re.findall(r'\.ci/([\w-]+)', ' '.join(step.get('run', '') for step in job['steps']))
+    assert called
+    assert set(called) <= {script.name for script in SCRIPTS}
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda path: path.name)
+def test_scripts_can_be_run(script) -> None:
+    assert script.stat().st_mode & 0o111
+    shell = script.read_text().splitlines()[0].removeprefix('#!')
+    assert subprocess.run([shell, '-n', script]).returncode == 0
+
+
+def test_the_launch_test_can_be_read() -> None:
+    ast.parse((REPOSITORY / '.ci' / 'bag_test.launch.py').read_text())
+
+
+def test_the_suite_of_the_demo_can_be_read() -> None:
+    suite = read_suite(REPOSITORY / '.ci' / 'demo.yaml')
+    assert [entry.mode for entry in suite.entries] == ['run', 'replay']
+
+
+def test_the_files_of_the_page_can_be_copied(tmp_path) -> None:
+    suite, github, gitlab = re.findall(r'```yaml\n(.*?)```', PAGE, re.DOTALL)
+    for name in ('bags/warehouse.mcap', 'bags/night-1', 'bags/night-2', 'drives/aisle'):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / 'maps').mkdir()
+    (tmp_path / 'maps' / 'warehouse.yaml').touch()
+    (tmp_path / 'suite.yaml').write_text(suite)
+    names = [entry.name for entry in read_suite(tmp_path / 'suite.yaml').entries]
+    assert names == ['warehouse', 'night-1', 'night-2', 'aisle', 'corridor2-7']
+    assert 'segfloor check' in yaml.safe_load(github)['jobs']['bags']['steps'][4]['run']
+    assert yaml.safe_load(gitlab)['bags']['artifacts']['reports'] == {'junit': 'results/junit.xml'}
+
+
+def test_the_page_lists_every_measure() -> None:
+    rows = re.findall(r'^\| `(\w+)` \|', PAGE, re.MULTILINE)
+    assert rows == list(MEASURES)
