@@ -89,6 +89,17 @@ def se3_log(T: Array) -> Array:
     return np.concatenate([inverse_left_jacobian @ T[:3, 3], phi])
 
 
+def adjoint(T: Array) -> Array:
+    """Return the matrix (6, 6) that carries twists (rho, phi): T exp(twist) = exp(adjoint twist) T
+    (Barfoot 2017, eq. 7.49).
+    """
+    R, t = T[:3, :3], T[:3, 3]
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = R
+    matrix[:3, 3:] = skew(t) @ R
+    return matrix
+
+
 def quaternion_xyzw(R: Array) -> Array:
     """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
     # SciPy 1.11 takes no array that is read-only.

@@ -16,6 +16,7 @@ from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.resident_memory import MemoryLog
 from segfloor_ros.results_folder import OutputFolder, RunResult, RunSummary, lost_intervals
@@ -95,8 +96,11 @@ class LockstepRun:
 
     def _process_frames(self, on_progress: ProgressListener | None) -> None:
         try:
+            measurements = MeasurementLog(self._source.sensors)
             for frame in self._source.frames():
                 self._frames += 1
+                for measurement in measurements.until(frame.stamp_ns):
+                    self._pipeline.slam.add(measurement)
                 if self._save_masks is SaveMasks.all:
                     self._unmasked.append(frame)
                 for result in self._pipeline.process(frame):
@@ -165,6 +169,7 @@ class LockstepRun:
             camera_height_m=round(mount.height_m, 4),
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
+            sensors={name: n for name, n in self._pipeline.slam.sensors.messages.items() if n},
             stages=self._pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )

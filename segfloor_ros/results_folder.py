@@ -48,9 +48,9 @@ OUTPUT_NAMES = (
 class RunSummary:
     """The figures of a run, as written to summary.json.
 
-    lost_intervals: first and last frame number of every stretch without a pose. stages: by
-    name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update in
-    MB, and samples over the updates.
+    lost_intervals: first and last frame number of every stretch without a pose. sensors: messages
+    used, by name. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and
+    slope_per_update in MB, and samples over the updates.
     """
 
     frames: int
@@ -65,6 +65,7 @@ class RunSummary:
     camera_height_m: float
     camera_pitch_rad: float
     camera_roll_rad: float
+    sensors: dict[str, int]
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
 
@@ -173,7 +174,9 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the summary as (what, value with unit) for people."""
     tracked = f'{summary.tracked_frames} of {summary.frames}'
     lost = ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'
+    used = ', '.join(f'{name} ({count})' for name, count in summary.sensors.items())
     rows: list[tuple[str, Any]] = [
+        *([('sensors used (messages)', used)] if used else []),
         ('frames tracked', tracked),
         ('frames lost', lost),
         ('frames skipped (unreadable)', summary.skipped_frames),

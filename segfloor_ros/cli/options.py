@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 
@@ -27,7 +27,19 @@ MasksOption = Annotated[
         '255 = moving.',
     ),
 ]
+IgnoreOption = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option('--ignore', help='Sensors to leave out, with commas: wheel_odometry, imu.'),
+]
 ReportOption = Annotated[
     bool,
     typer.Option('--report', help='Write report.html: everything about the run on one page.'),
 ]
+
+
+def recording_settings(
+    input: str, masks: Path | None = None, ignore: str | None = None
+) -> dict[str, Any]:
+    """Return the settings of `stereo_camera` that options of a command stand for."""
+    given = {'masks': masks and str(masks), 'ignore': ignore}
+    return {'input': input} | {name: value for name, value in given.items() if value is not None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from segfloor_ros.measurements import RecordedSensor
 from segfloor_ros.results_folder import RunSummary, summary_rows
 
 console = Console()
@@ -64,6 +65,17 @@ def figure_table(names: str, *numbers: str) -> Table:
     for column in table.columns[1:]:
         column.justify = 'right'
     return table
+
+
+def print_sensors(sensors: Sequence[RecordedSensor]) -> None:
+    """Print what a recording holds besides stereo images, where there is such."""
+    if not sensors:
+        return
+    table = Table('sensor', 'found in', 'messages', 'used')
+    for sensor in sensors:
+        used = 'yes' if sensor.used else 'no'
+        table.add_row(sensor.name, sensor.where, str(sensor.messages), used)
+    console.print(table)
 
 
 def print_summary(title: str, summary: RunSummary) -> None:

@@ -10,14 +10,23 @@ from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
+    IgnoreOption,
     InputArgument,
     MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
     SetOption,
+    recording_settings,
 )
-from segfloor_ros.cli.output import console, finish_run, print_error, print_summary, progress_bar
+from segfloor_ros.cli.output import (
+    console,
+    finish_run,
+    print_error,
+    print_sensors,
+    print_summary,
+    progress_bar,
+)
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import SaveMasks
@@ -36,6 +45,7 @@ def replay(
     ] = 1.0,
     params: ParamsOption = None,
     assignments: SetOption = None,
+    ignore: IgnoreOption = None,
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
@@ -55,14 +65,16 @@ def replay(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
-    camera = {'input': input, **({'masks': str(masks)} if masks else {})}
-    configuration = resolve(params, assignments or (), stereo_camera=camera)
+    configuration = resolve(
+        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore)
+    )
     # The camera node reads the recording; here it is opened so that bad input ends at once.
-    frame_count = open_source(configuration.stereo_camera).frame_count
+    source = open_source(configuration.stereo_camera)
+    print_sensors(source.sensors)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with OutputFolder(out) as folder:
         on_mask = folder.add_mask if save_masks is SaveMasks.keyframes else None
-        with progress_bar('replaying', frame_count) as progress:
+        with progress_bar('replaying', source.frame_count) as progress:
             result, session = ReplaySession(
                 configuration,
                 params,

@@ -182,6 +182,7 @@ class ReplaySession:
             camera_height_m=round(mount.height_m, 4),
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
+            sensors={},
             stages=recorder.times.summary(),
             rss_mb=recorder.memory.summary(),
         )

@@ -9,14 +9,16 @@ from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
+    IgnoreOption,
     InputArgument,
     MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
     SetOption,
+    recording_settings,
 )
-from segfloor_ros.cli.output import finish_run, print_summary, progress_bar
+from segfloor_ros.cli.output import finish_run, print_sensors, print_summary, progress_bar
 from segfloor_ros.configuration import resolve
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.results_folder import OutputFolder
@@ -27,6 +29,7 @@ def run(
     out: OutOption,
     params: ParamsOption = None,
     assignments: SetOption = None,
+    ignore: IgnoreOption = None,
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save.')
     ] = SaveMasks.keyframes,
@@ -41,9 +44,11 @@ def run(
     report: ReportOption = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
-    camera = {'input': input, **({'masks': str(masks)} if masks else {})}
-    configuration = resolve(params, assignments or (), stereo_camera=camera)
+    configuration = resolve(
+        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore)
+    )
     source = open_source(configuration.stereo_camera)
+    print_sensors(source.sensors)
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:
             result = LockstepRun(source, configuration, folder, save_masks, save_debug).execute(

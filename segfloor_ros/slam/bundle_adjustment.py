@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, se3_exp, transform_points
 from segfloor_ros.slam.disparity_offset import NO_OFFSET, OffsetEstimate
+from segfloor_ros.slam.motion_links import Link, with_links
 from segfloor_ros.slam.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.residuals import (
     MIN_DEPTH_M,
@@ -33,7 +34,8 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once. offset: what was known before of the error that all disparities share.
+    most once. offset: what was known before of the error that all disparities share. links: motions
+    between keyframes that wheels measured.
     """
 
     T_camera_world: Array
@@ -43,6 +45,7 @@ class BundleProblem:
     point: NDArray[np.intp]
     observations: Observations
     offset: OffsetEstimate = NO_OFFSET
+    links: tuple[Link, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,7 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimat
     chi2 = squared_norms(residual, problem.observations.information)
     cost = huber_cost(chi2, problem.observations.chi2_limit)
     cost += prior.information * (problem.offset.value_px - prior.value_px) ** 2
+    cost += sum(link.cost(problem.T_camera_world) for link in problem.links)
     return _State(points, residual, chi2, front, cost)
 
 
@@ -147,9 +151,10 @@ def _linearise(
         state.residual,
         weight * state.front[:, None],
     )
-    return normal_equations(camera, at).with_prior(
+    system = normal_equations(camera, at).with_prior(
         prior.information, problem.offset.value_px - prior.value_px
     )
+    return with_links(system, problem.T_camera_world, problem.links)
 
 
 def _apply(problem: BundleProblem, step: Step) -> BundleProblem:

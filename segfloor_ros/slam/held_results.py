@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.geometry import Array, invert, skew, transform_points
+from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.results import FrameResult, Keyframe
 
 MAX_HELD_KEYFRAMES = 50
@@ -57,17 +57,11 @@ def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
 
 
 def _covariance_of_base(result: FrameResult, T_base_left: Array) -> Array:
-    """Carry the covariance of the camera twist to the base, in odom axes (Barfoot 2017, eq.
-    7.49: adjoint).
-    """
-    R, t = T_base_left[:3, :3], T_base_left[:3, 3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[:3, 3:] = skew(t) @ R
+    """Carry the covariance of the camera twist to the base, in odom axes."""
     T_odom_base = T_base_left @ result.T_odom_base @ invert(T_base_left)
     axes = np.zeros((6, 6))
     axes[:3, :3] = axes[3:, 3:] = T_odom_base[:3, :3]
-    A = axes @ adjoint
+    A = axes @ adjoint(T_base_left)
     return A @ result.covariance @ A.T
 
 

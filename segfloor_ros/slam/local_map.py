@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import Array, transform_points
-from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe
+from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.slam.keyframe_policy import SEEN_BY_SEVERAL, View, is_keyframe, novelty
 from segfloor_ros.slam.places import view_novelty, views_near
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
@@ -30,6 +30,7 @@ class LocalMap:
         self._camera = camera
         self._settings = settings
         self._map = sparse_map
+        self._depth_m = MIN_DEPTH_M
 
     def move_to(self, ids: NDArray[np.int32], T_camera_world: Array) -> None:
         """Take the points around a camera that sees points `ids` (N,)."""
@@ -64,6 +65,14 @@ class LocalMap:
         view = View(frames_since, len(track.point_ids), num_reliable, novelty, mapper_idle)
         return is_keyframe(view, self._settings)
 
+    def is_new_view(self, T_camera_world: Array) -> bool:
+        """Whether a camera that sees no point has come to where the last keyframe was not."""
+        T_last_now = self._map.keyframes[-1].T_camera_world @ invert(T_camera_world)
+        return novelty(T_last_now, self._depth_m, self._settings) > 1
+
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
-        depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
-        return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M
+        """Return the depth of points `ids` (N,); without any, that of those seen last."""
+        if len(ids):
+            depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
+            self._depth_m = max(float(np.median(depth)), MIN_DEPTH_M)
+        return self._depth_m

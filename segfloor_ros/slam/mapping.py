@@ -14,6 +14,7 @@ from segfloor_ros.slam.coarse_disparity import guess_disparity
 from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.motion_links import Link
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import Observations
@@ -120,8 +121,10 @@ class LocalMapper:
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
-    def plan_adjustment(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> Adjustment:
-        """Copy the neighbourhood of a keyframe, not the first one, out of the map."""
+    def plan_adjustment(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> Adjustment | None:
+        """Copy the neighbourhood of a keyframe, not the first one, out of the map; None where no
+        two keyframes share a point.
+        """
         free, fixed = self._choose_keyframes(sparse_map, keyframe)
         ids = sparse_map.points_of(free)
         edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
@@ -137,6 +140,8 @@ class LocalMapper:
         edge_point, edge_keyframe, edge_row = (
             edges[taking_part] for edges in (edge_point, edge_keyframe, edge_row)
         )
+        if len(ids) == 0:
+            return None
         problem = BundleProblem(
             np.stack([sparse_map.keyframes[k].T_camera_world for k in chosen]),
             len(free),
@@ -145,6 +150,7 @@ class LocalMapper:
             np.searchsorted(ids, edge_point),
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
+            _links(sparse_map, slot),
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 
@@ -175,9 +181,13 @@ class LocalMapper:
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = sparse_map.covisible(own)
         near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        near = np.concatenate([near, np.setdiff1d(_linked(sparse_map, keyframe), near)[::-1]])
         free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
         free = free[free != 0]
         around, _ = sparse_map.covisible(sparse_map.points_of(free))
+        if keyframe.motion is not None:
+            # What wheels tie to the oldest that moves holds it.
+            around = np.append(around, max(int(free.min()) - 1, 0))
         fixed = around[~np.isin(around, free)][:FIXED_KEYFRAMES]
         if len(fixed) == 0:
             fixed, free = free[-1:], free[:-1]
@@ -205,6 +215,27 @@ class LocalMapper:
         for k in np.unique(edge_keyframe[~inliers]):
             rows = edge_row[~inliers & (edge_keyframe == k)]
             sparse_map.unlink(sparse_map.keyframes[k], rows)
+
+
+def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+    """Return the keyframes before one that wheels tie to it without a gap, the oldest first."""
+    linked: list[int] = []
+    while keyframe.motion is not None and len(linked) < LOCAL_KEYFRAMES - 1:
+        keyframe = sparse_map.keyframes[keyframe.index - 1]
+        if keyframe.retired is None:
+            linked.append(keyframe.index)
+    return np.array(linked[::-1], np.intp)
+
+
+def _links(sparse_map: SparseMap, slot: NDArray[np.intp]) -> tuple[Link, ...]:
+    """Return the motions that wheels measured between keyframes of a problem; slot: (K,) their
+    place in it, -1 for others.
+    """
+    return tuple(
+        Link(int(slot[k - 1]), int(slot[k]), motion)
+        for k in np.flatnonzero(slot[1:] >= 0) + 1
+        if (motion := sparse_map.keyframes[k].motion) is not None and slot[k - 1] >= 0
+    )
 
 
 def _gather(

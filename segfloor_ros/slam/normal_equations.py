@@ -37,7 +37,8 @@ class System:
     """The normal equations by blocks: cameras U (K, 6, 6), points V (3, 3, P), and W (6, 3, M) of
     each pair (keyframe, point[m]) that an observation ties together, those of camera k from
     starts[k] to starts[k + 1]; right-hand sides. The disparity offset is one more unknown: its
-    products with cameras (K, 6), points (3, P), itself.
+    products with cameras (K, 6), points (3, P), itself. between: two cameras and the block (6, 6)
+    that ties them without points.
     """
 
     U: Array
@@ -51,6 +52,7 @@ class System:
     offset_point: Array
     offset_offset: float
     offset_rhs: float
+    between: tuple[tuple[int, int, Array], ...] = ()
 
     def with_prior(self, information: float, offset_error_px: float) -> System:
         """Return the system with what was known before of the offset."""
@@ -76,8 +78,11 @@ class System:
         S = np.empty((size + 1, size + 1))
         S[:-1, :-1] = -(Y @ Y.T)
         for k, U in enumerate(self.U):
-            block = slice(6 * k, 6 * k + 6)
-            S[block, block] += U + np.diag(damping * np.diag(U) + 1e-9)
+            own = slice(6 * k, 6 * k + 6)
+            S[own, own] += U + np.diag(damping * np.diag(U) + 1e-9)
+        for j, k, block in self.between:
+            S[6 * j : 6 * j + 6, 6 * k : 6 * k + 6] += block
+            S[6 * k : 6 * k + 6, 6 * j : 6 * j + 6] += block.T
         S[-1, :-1] = S[:-1, -1] = self.offset_camera.ravel() - Y @ y_offset
         S[-1, -1] = self.offset_offset - y_offset @ y_offset
         rhs = np.append(self.camera_rhs.ravel() - Y @ y_rhs, self.offset_rhs - y_offset @ y_rhs)

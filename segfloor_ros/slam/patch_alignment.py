@@ -161,6 +161,8 @@ def sample_patches(
     du = np.arange(-half_width, half_width + 1, dtype=np.float32)
     dv = np.arange(-half_height, half_height + 1, dtype=np.float32)
     shape = (len(uv_px), len(dv), len(du))
+    if len(uv_px) == 0:
+        return np.zeros(shape, np.float32)
     uv = uv_px.astype(np.float32)
     u = np.broadcast_to(uv[:, 0, None, None] + du, shape).reshape(len(uv), -1)
     v = np.broadcast_to(uv[:, 1, None, None] + dv[:, None], shape).reshape(len(uv), -1)

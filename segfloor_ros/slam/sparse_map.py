@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.body_motion import RelativeMotion
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.growing_array import GrowingArray
 from segfloor_ros.slam.patch_alignment import SIDE_PX
@@ -39,7 +40,8 @@ class KeyframeRecord:
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
-    patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature.
+    patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature. motion: since the keyframe
+    before, as the wheels tell it.
     """
 
     index: int
@@ -49,6 +51,7 @@ class KeyframeRecord:
     features: Features
     observations: Observations
     point_id: NDArray[np.int32]
+    motion: RelativeMotion | None = None
     retired: Retirement | None = None
 
     @property

@@ -10,7 +10,9 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.measurements import Measurement
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
+from segfloor_ros.slam.body_motion import BodyMotion
 from segfloor_ros.slam.excluded import is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.following import Follower
@@ -37,7 +39,19 @@ RECOVERY_RATIO = 0.15
 """Share of the points expected in view that a camera which was lost must find: far points alone
 fit many places."""
 
+CERTAIN_POINTS, CERTAIN_RATIO = 100, 0.3
+"""Points, and their share, that must be found where the sensors have the camera somewhere else."""
+
+FEW_POINTS = 60
+"""Wheels tell the pose better than fewer points than this: on blank walls they are edges, along
+which they slide.
+"""
+
+MAX_BLIND_SIGMA_M = 0.5
+"""Uncertainty of where the sensors have the camera up to which keyframes are made of it."""
+
 UNKNOWN_COVARIANCE = 1e6
+NOTHING_SEEN = 'too few known points in view'
 
 
 class StereoSlam:
@@ -68,7 +82,8 @@ class StereoSlam:
         self._extractor = FeatureExtractor(settings)
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
-        self._motion = CameraMotion(settings.max_speed_mps)
+        self._body = BodyMotion()
+        self._motion = CameraMotion(settings.max_speed_mps, self._body)
         self._local = LocalMap(camera, settings, self.map)
         self._follower = Follower(camera, settings.tracked_points)
         self._tracker = Tracker(camera)
@@ -84,13 +99,25 @@ class StereoSlam:
         """The error that all disparities share, measured minus true, as estimated so far."""
         return self._mapper.offset.value_px
 
+    @property
+    def sensors(self) -> BodyMotion:
+        """What wheels and IMU told, and what was found to be wrong with them."""
+        return self._body
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in what wheels or an IMU measured; those up to a frame come before it."""
+        self._body.add(measurement)
+
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
+            self._body.T_base_left = self.mount.T_base_left if self.mount else None
             fault = self._fault(frame)
             images = Images.of(frame, self._settings.mask_dilation_px)
             track = self._track(frame, images) if self.map.keyframes and not fault else None
+            if track is None and self.map.keyframes:
+                self._bridge(frame, fault)
         keyframe = None
         if not fault and self._wants_keyframe(track):
             with self._times.measure('mapping'):
@@ -129,25 +156,42 @@ class StereoSlam:
         )
         if track is None:
             track = self._search(frame, images, predictions)
-        motion = self._motion
-        if track is None or not (
-            motion.is_lost or motion.is_plausible(track.T_camera_world, frame.stamp_ns)
-        ):
-            motion.stop()
+        if track is None or not self._is_believable(track, frame.stamp_ns):
             self._follower.reset()
             return None
-        motion.take(track.T_camera_world, frame.stamp_ns)
+        self._motion.take(track.T_camera_world, track.covariance, frame.stamp_ns)
         self._follower.see(images, track.point_ids, track.uv_px)
         self._local.move_to(track.point_ids, track.T_camera_world)
         self.map.note_tracking(track.visible_ids, track.point_ids)
         self._frames_since_keyframe += 1
         return track
 
+    def _is_believable(self, track: Track, stamp_ns: int) -> bool:
+        """Whether the camera can have come to where the images have it."""
+        motion, pose = self._motion, track.T_camera_world
+        if motion.is_lost:
+            return True
+        if motion.is_held and len(track.point_ids) < FEW_POINTS:
+            return False
+        if motion.is_consistent(pose, track.covariance, stamp_ns):
+            return motion.is_plausible(pose, stamp_ns)
+        return len(track.point_ids) >= CERTAIN_POINTS and _recognised(track, CERTAIN_RATIO)
+
+    def _bridge(self, frame: StereoFrame, fault: str) -> None:
+        """Go on without the images, where the sensors allow it."""
+        if self._motion.bridge(frame.stamp_ns):
+            self._local.move_to(np.zeros(0, np.int32), self._motion.T_camera_world)
+            self._frames_since_keyframe += 1
+        elif not fault:
+            self._motion.stop()
+
     def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
         self._rotation.see(images.left)
         turned = self._rotation.turn_since_last() @ self._motion.T_camera_world
-        return [self._motion.predict(frame.stamp_ns), turned]
+        steady = self._motion.steady(frame.stamp_ns)
+        measured = self._motion.measured_pose(frame.stamp_ns)
+        return [steady, turned] if measured is None else [measured, steady, turned]
 
     def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
         """Find the pose by the features of the frame, without its predecessor."""
@@ -160,7 +204,7 @@ class StereoSlam:
             predictions,
             self.disparity_offset_px,
         )
-        if not self._motion.is_lost:
+        if not (self._motion.is_lost or self._motion.is_blind):
             return track
         if track is None or not _recognised(track):
             track = self._recover(images, features)
@@ -187,8 +231,15 @@ class StereoSlam:
 
     def _wants_keyframe(self, track: Track | None) -> bool:
         if track is None:
-            return not self.map.keyframes
+            return not self.map.keyframes or self._wants_blind_keyframe()
         return self._local.wants_keyframe(track, self._frames_since_keyframe, self._adjusting.idle)
+
+    def _wants_blind_keyframe(self) -> bool:
+        """Whether the sensors have the camera somewhere new: the map goes on from there."""
+        motion = self._motion
+        if not motion.is_blind or motion.sigma_m > MAX_BLIND_SIGMA_M:
+            return False
+        return self._local.is_new_view(motion.T_camera_world)
 
     def _add_keyframe(
         self, frame: StereoFrame, images: Images, track: Track | None
@@ -208,6 +259,7 @@ class StereoSlam:
             observed.features,
             observed.observations,
             self.map.living(observed.point_id),
+            self._motion.start_keyframe(),
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
@@ -239,7 +291,8 @@ class StereoSlam:
             return track.observed.take(np.flatnonzero(~inside))
         features = self._extractor.extract(frame.left, images.excluded)
         if track is None:
-            self._motion.take(self._motion.T_camera_world, frame.stamp_ns)
+            if not self.map.keyframes:
+                self._motion.take(self._motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
             none = np.full(len(features), NO_POINT, np.int32)
             return ObservedFeatures(features, self._tracker.pixel_observations(features), none)
         pose = self._motion.T_camera_world
@@ -254,8 +307,9 @@ class StereoSlam:
 
     def _adjust(self, keyframe: KeyframeRecord) -> None:
         """Adjust the neighbourhood of a new keyframe."""
-        if keyframe.index > 0:
-            self._adjusting.submit(self._mapper.plan_adjustment(self.map, keyframe))
+        plan = self._mapper.plan_adjustment(self.map, keyframe) if keyframe.index > 0 else None
+        if plan is not None:
+            self._adjusting.submit(plan)
             if not self._background:
                 self._take_adjustment(wait=True)
 
@@ -290,22 +344,24 @@ class StereoSlam:
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None
     ) -> FrameResult:
         """Return the outcome of a frame in optical axes."""
-        tracked = track is not None or keyframe is not None
-        covariance: Array = np.eye(6) * (0.0 if tracked else UNKNOWN_COVARIANCE)
+        motion, why = self._motion, fault or NOTHING_SEEN
+        tracked = track is not None or keyframe is not None or motion.is_blind
+        state = f'on wheels: {why}' if motion.is_blind else 'tracking'
+        unknown: Array = np.eye(6) * UNKNOWN_COVARIANCE
         return FrameResult(
             frame.index,
             frame.stamp_ns,
             tracked,
-            self._motion.T_odom_camera,
-            self._motion.T_world_odom,
-            track.covariance if track else covariance,
+            motion.T_odom_camera,
+            motion.T_world_odom,
+            motion.covariance if tracked else unknown,
             len(track.point_ids) if track else 0,
-            'tracking' if tracked else f'lost: {fault or "too few known points in view"}',
+            state if tracked else f'lost: {why}',
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
             keyframe,
         )
 
 
-def _recognised(track: Track) -> bool:
+def _recognised(track: Track, ratio: float = RECOVERY_RATIO) -> bool:
     """Whether a camera that was lost sees enough of what it should see there."""
-    return len(track.point_ids) >= RECOVERY_RATIO * len(track.visible_ids)
+    return len(track.point_ids) >= ratio * len(track.visible_ids)

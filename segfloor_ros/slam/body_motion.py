@@ -1,0 +1,180 @@
+"""The motion of the camera between two frames as wheels and gyroscope tell it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.geometry import Array, adjoint, invert, make_transform
+from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
+from segfloor_ros.slam.gyroscope import Gyroscope
+from segfloor_ros.slam.wheel_odometry import (
+    WheelCalibrator,
+    WheelOdometry,
+    Window,
+    yaw_of,
+)
+
+SIGMA_ROOT_M = 0.01
+"""Error of a way told by wheels, per root metre, in any direction of the floor."""
+
+SIGMA_ROOT_UP_M, SIGMA_ROOT_TILT_RAD = 0.01, 0.02
+"""How far a floor that wheels take for a plane goes up and tilts, per root metre."""
+
+SIGMA_TURN_SHARE = 0.03
+"""Error of a turn told by wheels, as a share of it."""
+
+SIGMA_ROOT_TURN_RAD = 0.01
+"""Error of the heading told by wheels, per root metre."""
+
+SLIP_M_S = 0.5
+"""Error of a speed told by wheels that slip."""
+
+SLIP_NS = 1_000_000_000
+"""Wheels that slipped are not believed for so long."""
+
+WINDOW_M, WINDOW_RAD, WINDOW_NS = 0.1, 0.1, 1_000_000_000
+"""A stretch of the drive to learn from ends when one of these is reached."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RelativeMotion:
+    """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
+    twist in exp(twist) T_now_before, translation first. with_way: whether the translation was
+    measured, too.
+    """
+
+    T_now_before: Array
+    covariance: Array
+    with_way: bool = True
+
+    @classmethod
+    def none(cls) -> RelativeMotion:
+        """Return the motion of no time at all."""
+        return cls(np.eye(4), np.zeros((6, 6)))
+
+    def then(self, later: RelativeMotion) -> RelativeMotion:
+        """Return the motion over both stretches (Barfoot 2017, section 7.3.3, to second order)."""
+        A = adjoint(later.T_now_before)
+        return RelativeMotion(
+            later.T_now_before @ self.T_now_before,
+            A @ self.covariance @ A.T + later.covariance,
+            self.with_way and later.with_way,
+        )
+
+
+class BodyMotion:
+    """Tells the motion between frames, and learns from the images what is wrong with the sensors.
+
+    T_base_left: (4, 4), the mount; without it wheels cannot be used. messages: used, by sensor.
+    slips: stretches in which the wheels did not agree with the images. remarks: what seems wrong
+    with the wheels, in words.
+    """
+
+    def __init__(self) -> None:
+        self.T_base_left: Array | None = None
+        self.messages = {'wheel_odometry': 0, 'imu': 0}
+        self.slips = 0
+        self.remarks: dict[str, str] = {}
+        self.gyroscope = Gyroscope()
+        self._wheels = WheelOdometry()
+        self._calibrator = WheelCalibrator()
+        self._window: tuple[int, Array] | None = None
+        self._slipped_ns: int | None = None
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in what a sensor measured."""
+        if isinstance(measurement, WheelPose):
+            self.messages['wheel_odometry'] += 1
+            self._wheels.add(measurement)
+        elif isinstance(measurement, ImuSample):
+            self.messages['imu'] += 1
+            self.gyroscope.add(measurement)
+
+    def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
+        """Return R_now_before (3, 3) of the camera as the gyroscope tells it, and the standard
+        deviation of its angles in radians.
+        """
+        turn = self.gyroscope.turn(before_ns, now_ns)
+        if turn is None:
+            return None
+        return turn.T, self.gyroscope.sigma_rad(turn, (now_ns - before_ns) * 1e-9)
+
+    def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
+        """Return the motion of the camera between two times; None where wheels tell nothing."""
+        told = self._wheels.motion(before_ns, now_ns)
+        if told is None or self.T_base_left is None:
+            return None
+        R_base_left = self.T_base_left[:3, :3]
+        seconds = (now_ns - before_ns) * 1e-9
+        turn = self.gyroscope.turn(before_ns, now_ns)
+        sigma_turn = None if turn is None else self.gyroscope.sigma_rad(turn, seconds)
+        R = None if turn is None else R_base_left @ turn @ R_base_left.T
+        way_m, turn_rad = self._calibrator.current.base_motion(
+            told, None if R is None else float(np.arctan2(R[1, 0], R[0, 0]))
+        )
+        if R is None:
+            R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+        T_before_now = make_transform(R, np.append(way_m, 0.0))
+        variance = self._variance(told, seconds, sigma_turn)
+        if self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS:
+            variance[:2] += (SLIP_M_S * seconds) ** 2
+        A = adjoint(invert(self.T_base_left))
+        return RelativeMotion(
+            invert(self.T_base_left) @ invert(T_before_now) @ self.T_base_left,
+            A @ np.diag(variance) @ A.T,
+        )
+
+    def _variance(self, told: Array, seconds: float, sigma_turn: float | None) -> Array:
+        """Return the variances (6,) of a motion in the base's axes."""
+        length_m = float(np.linalg.norm(told[:3, 3]))
+        scale_sigma = self._calibrator.current.sigma[0]
+        on_floor = (SIGMA_ROOT_M**2 + scale_sigma**2) * length_m
+        up = SIGMA_ROOT_UP_M**2 * length_m
+        tilt = SIGMA_ROOT_TILT_RAD**2 * length_m
+        yaw = SIGMA_ROOT_TURN_RAD**2 * length_m + (SIGMA_TURN_SHARE * yaw_of(told)) ** 2
+        if sigma_turn is not None:
+            tilt = yaw = sigma_turn**2
+        return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
+
+    def learn(self, stamp_ns: int, T_odom_camera: Array) -> None:
+        """Learn from the pose of a frame that the images tell well."""
+        if self._window is None:
+            self._window = stamp_ns, T_odom_camera
+            return
+        before_ns, T_odom_before = self._window
+        T_before_now = invert(T_odom_before) @ T_odom_camera
+        angle = np.linalg.norm(Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec())
+        if (
+            np.linalg.norm(T_before_now[:3, 3]) < WINDOW_M
+            and angle < WINDOW_RAD
+            and stamp_ns - before_ns < WINDOW_NS
+        ):
+            return
+        self._window = stamp_ns, T_odom_camera
+        self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
+        self._learn_wheels(T_before_now, before_ns, stamp_ns)
+
+    def stop_learning(self) -> None:
+        """Note that there is a frame without a pose from the images."""
+        self._window = None
+
+    def _learn_wheels(self, T_before_now: Array, before_ns: int, now_ns: int) -> None:
+        told = self._wheels.motion(before_ns, now_ns)
+        if told is None or self.T_base_left is None:
+            return
+        seen = self.T_base_left @ T_before_now @ invert(self.T_base_left)
+        window = Window(seen[:2, 3], yaw_of(seen), told[:2, 3], yaw_of(told))
+        if not self._calibrator.add(window):
+            self.slips += 1
+            self._slipped_ns = now_ns
+            logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
+        for what, remark in self._calibrator.current.remarks().items():
+            if what not in self.remarks:
+                logger.warning('%s', remark)
+            self.remarks[what] = remark
