@@ -38,7 +38,7 @@ class CameraMotion:
 
     T_camera_world: the latest pose (4, 4). covariance: (6, 6) of its twist. T_world_odom: the
     correction of the odometry; both frames are the camera's first pose. is_lost: whether the last
-    frame had no pose. is_blind: whether it had one from the sensors alone.
+    frame had no pose. carried_by: the sensor that told the last pose alone, or ''.
     """
 
     def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
@@ -46,7 +46,7 @@ class CameraMotion:
         self.covariance: Array = np.zeros((6, 6))
         self.T_world_odom: Array = np.eye(4)
         self.is_lost = False
-        self.is_blind = False
+        self.carried_by = ''
         self._body = body
         self._max_speed_mps = max_speed_mps
         self._velocity: Array = np.zeros(6)
@@ -58,6 +58,11 @@ class CameraMotion:
     def T_odom_camera(self) -> Array:
         """The camera in the continuous frame."""
         return invert(self.T_world_odom) @ invert(self.T_camera_world)
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the last pose was not seen in the images."""
+        return bool(self.carried_by)
 
     @property
     def is_held(self) -> bool:
@@ -116,7 +121,7 @@ class CameraMotion:
         self._note(measured)
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = self._seen_ns = stamp_ns
-        self.is_lost = self.is_blind = False
+        self.is_lost, self.carried_by = False, ''
         self._body.learn(stamp_ns, self.T_odom_camera)
 
     def bridge(self, stamp_ns: int) -> bool:
@@ -132,14 +137,14 @@ class CameraMotion:
         self._note(measured)
         self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]
         self._last_stamp_ns = stamp_ns
-        self.is_blind = True
+        self.carried_by = 'wheels' if measured.with_way else 'gyroscope'
         self._body.stop_learning()
         return True
 
     def stop(self) -> None:
         """Note that a frame has no pose."""
         self._velocity = np.zeros(6)
-        self.is_lost, self.is_blind = True, False
+        self.is_lost, self.carried_by = True, ''
         self._since_keyframe = None
         self._body.stop_learning()
 

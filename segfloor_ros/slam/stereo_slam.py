@@ -182,7 +182,7 @@ class StereoSlam:
         if self._motion.bridge(frame.stamp_ns):
             self._local.move_to(np.zeros(0, np.int32), self._motion.T_camera_world)
             self._frames_since_keyframe += 1
-        elif not fault:
+        elif not fault or self._motion.is_blind:
             self._motion.stop()
 
     def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
@@ -206,9 +206,9 @@ class StereoSlam:
         )
         if not (self._motion.is_lost or self._motion.is_blind):
             return track
-        if track is None or not _recognised(track):
+        if track is None or not _recognised(track, RECOVERY_RATIO):
             track = self._recover(images, features)
-        return track if track and _recognised(track) else None
+        return track if track and _recognised(track, RECOVERY_RATIO) else None
 
     def _recover(self, images: Images, features: Features) -> Track | None:
         """Look for the view among the keyframes, a few per frame, the latest ones first."""
@@ -346,7 +346,7 @@ class StereoSlam:
         """Return the outcome of a frame in optical axes."""
         motion, why = self._motion, fault or NOTHING_SEEN
         tracked = track is not None or keyframe is not None or motion.is_blind
-        state = f'on wheels: {why}' if motion.is_blind else 'tracking'
+        state = f'on {motion.carried_by}: {why}' if motion.is_blind else 'tracking'
         unknown: Array = np.eye(6) * UNKNOWN_COVARIANCE
         return FrameResult(
             frame.index,
@@ -362,6 +362,6 @@ class StereoSlam:
         )
 
 
-def _recognised(track: Track, ratio: float = RECOVERY_RATIO) -> bool:
+def _recognised(track: Track, ratio: float) -> bool:
     """Whether a camera that was lost sees enough of what it should see there."""
     return len(track.point_ids) >= ratio * len(track.visible_ids)
