@@ -1,38 +1,57 @@
-"""A suite's verdicts as JUnit XML, which GitHub, GitLab and Jenkins show."""
+"""A suite's verdicts as JUnit XML, which GitHub, GitLab and Jenkins show. It keeps to both schemas
+that are in use: that of Ant's JUnit task and the looser one of Jenkins's xUnit plugin.
+"""
 
 from __future__ import annotations
 
+import datetime
+import socket
 from pathlib import Path
 
-from junitparser import Error, Failure, JUnitXml, Skipped, TestCase, TestSuite
+from junitparser import Attr, Error, Failure, IntAttr, JUnitXml, Skipped, TestCase, TestSuite
+from junitparser.junitparser import SystemErr, SystemOut
 
+from segfloor_ros import __version__
 from segfloor_ros.suite.bounds import Bound
 from segfloor_ros.suite.verdicts import Checked, SuiteResult
 
 
+class _Suite(TestSuite):
+    """A suite among others, as Ant's schema wants it."""
+
+    id = IntAttr()
+    package = Attr()
+
+
 def write_junit(result: SuiteResult, path: Path) -> None:
     """Write a test case for each recording's map and for each of its bounds."""
-    suite = TestSuite(result.name)
-    for checked in result.recordings:
-        for case in _cases(result.name, checked):
-            suite.add_testcase(case)
+    suite = _Suite(result.name)
+    suite.id, suite.package = 0, 'segfloor'
+    suite.hostname = socket.gethostname()
+    now = datetime.datetime.now(tz=datetime.timezone.utc)
+    suite.timestamp = now.strftime('%Y-%m-%dT%H:%M:%S')
+    suite.add_property('segfloor_ros', __version__)
+    suite.add_testcases([case for c in result.recordings for case in _cases(result.name, c)])
+    complaints = [line for checked in result.recordings for line in checked.complaints]
+    for element, text in ((SystemOut(), ''), (SystemErr(), '\n'.join(complaints))):
+        element.text = text
+        suite.append(element)
     document = JUnitXml()
-    document.add_testsuite(suite)
-    document.update_statistics()
+    document.append(suite)
     document.write(str(path), pretty=True)
 
 
 def _cases(suite: str, checked: Checked) -> list[TestCase]:
     mapped = TestCase('map', f'{suite}.{checked.name}', round(checked.seconds, 3))
     if checked.problem:
-        mapped.result = [Error(checked.problem)]
+        mapped.result = [Error(checked.problem, 'no map')]
     cases = [mapped]
     for verdict in checked.verdicts:
         case = TestCase(_case_name(verdict.bound), f'{suite}.{checked.name}', 0.0)
         if checked.problem:
             case.result = [Skipped('there is no map')]
         elif not verdict.holds:
-            case.result = [Failure(str(verdict))]
+            case.result = [Failure(str(verdict), 'bound')]
         cases.append(case)
     return cases
 
