@@ -81,7 +81,7 @@ demo: $(STAMP) $(TF)
 lint: $(STAMP)
 	$(BIN)/ruff check $(CODE)
 	$(BIN)/ruff format --check $(CODE)
-	$(BIN)/mypy segfloor_ros
+	$(BIN)/mypy segfloor_ros tools
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix $(CODE)

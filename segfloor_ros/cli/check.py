@@ -28,7 +28,7 @@ from segfloor_ros.suite.verdicts import (
 from segfloor_ros.suite.workers import outcomes
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
-HEADINGS = ('tracked %', 'path error m', 'precision %', 'recall %', 'time ratio')
+HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
 
 
 def check_suite(

@@ -118,7 +118,8 @@ def _map_and_measure(job: Job) -> tuple[dict[str, float], bytes, bool]:
     if entry.source == RESULTS:
         return measure_run(recording, truth, reference_map), pack(recording), False
     cache = Cache(folder / 'results')
-    files = dict.fromkeys(path for path in (recording, truth, reference_map) if path is not None)
+    named = [recording, truth, reference_map, *_files_of(entry.assignments)]
+    files = dict.fromkeys(path for path in named if path is not None)
     key = job.content_digest(files) if job.reuse else ''
     if job.reuse and (kept := cache.get(key)) is not None:
         return *kept, True
@@ -152,6 +153,12 @@ def _truth(entry: Entry, recording: Path, folder: Path) -> Path | None:
         return None
     names = ('map.yaml', 'poses.txt', 'floor')
     return recording if any((recording / name).exists() for name in names) else None
+
+
+def _files_of(assignments: Iterable[str]) -> list[Path]:
+    """Return the files and folders that parameters name, e.g. masks."""
+    values = (assignment.partition('=')[2] for assignment in assignments)
+    return [Path(value) for value in values if '/' in value and Path(value).exists()]
 
 
 def _run(job: Job, recording: Path, temporary: Path, out: Path) -> None:

@@ -29,7 +29,10 @@ PARAMETERS = {
     'resume_within_s': 0.0,
 }
 
-pytestmark = pytest.mark.skipif(bool(thin_link.why_not()), reason=thin_link.why_not())
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(thin_link.why_not()), reason=thin_link.why_not()),
+]
 
 
 @pytest.fixture(scope='module')

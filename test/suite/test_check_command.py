@@ -110,6 +110,19 @@ def job_of(room, tmp_path, **changes) -> Job:
     return Job(entry, '', str(tmp_path / 'cache'), reuse=False)
 
 
+def test_what_decides_the_result_is_in_its_key(room, tmp_path):
+    job = job_of(room, tmp_path)
+    elsewhere = job_of('/elsewhere', tmp_path, timeout_s=7.0)
+    replayed = job_of(room, tmp_path, mode='replay')
+    (masks := tmp_path / 'masks').mkdir()
+    keys = [job.content_digest([room]), job.content_digest([room, masks])]
+    (masks / '000000.png').write_bytes(b'1')
+    keys += [job.content_digest([room, masks]), replayed.content_digest([room])]
+    assert len(set(keys)) == 4
+    assert elsewhere.content_digest([room]) == keys[0]
+    assert elsewhere.digest() != job.digest()
+
+
 def programs() -> list[psutil.Process]:
     """Return the programs that map for this process."""
     children = psutil.Process().children()
