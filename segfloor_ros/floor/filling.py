@@ -23,6 +23,11 @@ _MIN_SLOPE = 1.5
 _STRONG_SLOPE = 10.0
 """Stronger edges than this are the border of something."""
 _TEXTURE_MARGIN = 7
+_HOLE_ROWS = 12
+"""As high as the window in which texture is measured."""
+_TEXTURED_SHARE = 0.7
+_UNMATCHED_PX = 12
+"""So wide a strip at the border of what both cameras see may be without matches."""
 _EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
 
@@ -34,15 +39,17 @@ def fill_regions(
     disparity: NDArray[np.float32],
     compared: Comparison,
     textured: NDArray[np.bool_],
+    barred: NDArray[np.bool_],
     min_share: float,
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    image: whole image rows (R, image width). A region is bounded by edges of the image stronger
-    than most of the floor's own; floor by evidence must be in `min_share` of its columns. In it a
-    pixel becomes floor below floor, the next evidence up its column; or between floor on its left
-    and right; or, if it is not blank, nearer than any of its floor.
+    image: whole image rows (R, image width). barred: (R, W), where no region goes on. A region is
+    bounded by edges of the image stronger than most of the floor's own; floor by evidence must be
+    in `min_share` of its columns. In it a pixel becomes floor below floor, the next evidence up its
+    column; or between floor on its left and right; or, if it is not blank, nearer than any of its
+    floor.
     """
     part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
     small = mask[part]
@@ -66,6 +73,7 @@ def fill_regions(
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
     nearer = (rows >= highest) & (not_blank > 0)
     fill = inside & (nearer | _next_to_floor(small))
+    fill &= ~barred[part]
     mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     to_contact = fill_to_contact(view, mask, agreed & (slope < _STRONG_SLOPE), disparity, compared)
@@ -118,9 +126,52 @@ def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     across, turned = Runs.of(nothing), np.ascontiguousarray(mask.T)
     between = across.before(mask, NO_EVIDENCE) == FLOOR
     between &= across.after(mask, NO_EVIDENCE) == FLOOR
-    down = Runs.of(turned == NO_EVIDENCE)
-    under = down.painted(down.before(turned, NO_EVIDENCE) == FLOOR)
-    return across.painted(between) | under.T
+    return across.painted(between) | _below_floor(turned).T
+
+
+def _below_floor(turned: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of NO_EVIDENCE in a mask that is turned, (W, R), where the next evidence up the column
+    is floor.
+    """
+    nothing = Runs.of(turned == NO_EVIDENCE)
+    return nothing.painted(nothing.before(turned, NO_EVIDENCE) == FLOOR)
+
+
+def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
+    not lie beside floor that both cameras see: what stands there is taken to go on.
+    """
+    floor_px = view.line.slope * (view.derolled - view.line.horizon)
+    first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
+    begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
+    begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
+    # Rows in between begin with a hole.
+    near = cv2.dilate(begins_with_floor.view(np.uint8), np.ones((_HOLE_ROWS + 1, 1), np.uint8))
+    return (view.columns < floor_px) & (near == 0)
+
+
+def beyond_texture(mask: NDArray[np.uint8], textured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which blank pixels of a mask (R, W) lie beyond the end of a floor that has texture.
+
+    Up a column nearly all of the floor showed its texture, and now more is blank than a hole in
+    it, up to what is no floor or to the horizon: a blank wall looks like that, and what is known
+    left and right of it says nothing about it. A wall hides what is behind it; where floor is
+    seen farther up, there is none.
+    """
+    turned = np.ascontiguousarray(mask.T)
+    blank = (turned == NO_EVIDENCE) & ~textured.T
+    runs = Runs.of(blank)
+    last = turned.shape[1] - 1
+    foot = np.minimum(runs.stop, last)
+    seen, holes = (
+        np.cumsum(where[:, ::-1], axis=1, dtype=np.int32)[:, ::-1][runs.row, foot]
+        for where in (turned == FLOOR, blank)
+    )
+    ended = (runs.stop - runs.first > _HOLE_ROWS) & (runs.stop <= last)
+    ended &= seen > _TEXTURED_SHARE * (seen + holes)
+    ended &= ~_below_floor(turned)[runs.row, runs.first]
+    beyond: NDArray[np.bool_] = runs.painted(ended).T
+    return beyond
 
 
 def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:

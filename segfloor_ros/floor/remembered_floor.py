@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.view import FloorView
 from segfloor_ros.geometry import Array
@@ -53,7 +53,6 @@ class FloorMemory:
         xy = view.floor_positions(rows, columns)
         index, inside = self._index(_in_map(T_map_base, xy))
         known = inside & (self._votes.reshape(-1)[index] >= _ENOUGH_VOTES)
-        known &= columns >= _hidden_up_to(view, mask)[rows]
         filled = mask.copy()
         filled[rows[known], columns[known]] = FLOOR
         return filled
@@ -133,16 +132,6 @@ def _within(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """
     upward = np.ones((_UNSURE_ROWS + 1, 1), np.uint8)
     return cv2.erode(mask, upward, anchor=(0, _UNSURE_ROWS))
-
-
-def _hidden_up_to(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """Return the columns (R,) in which rows of a mask (R, W) begin with something other than
-    floor, next to what only the left camera sees; 0 where they do not.
-    """
-    nearest_floor_px = view.line.slope * (view.derolled.max() - view.line.horizon)
-    first = (mask != NO_EVIDENCE).argmax(axis=1)
-    begins = np.take_along_axis(mask, first[:, None], axis=1)[:, 0] == NOT_FLOOR
-    return np.where(begins & (first * view.step <= nearest_floor_px), first, 0)
 
 
 def _floor_at(mask: NDArray[np.uint8], pixels: NDArray[np.float32]) -> NDArray[np.bool_]:

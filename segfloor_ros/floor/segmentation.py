@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, equal_exposure
 from segfloor_ros.floor.filling import (
+    beside_something,
+    beyond_texture,
     drop_islands,
     fill_gaps,
     fill_regions,
@@ -306,15 +308,17 @@ class FloorSegmentation:
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell."""
         settings = self._settings
+        beside = beside_something(view, mask)
         if T_map_base is not None:
             # What is remembered may lie behind a blank wall that stands in front of it now.
             unshared = view.columns < profile.at_pixels(view.derolled)
-            mask = self._memory.fill(view, mask, textured & unshared, T_map_base)
-        consistent = compared.consistent
+            mask = self._memory.fill(view, mask, textured & unshared & ~beside, T_map_base)
+        barred = beside | beyond_texture(mask, textured)
         mask = fill_regions(
-            view, mask, left_rows, disparity, compared, textured, settings.fill_support
+            view, mask, left_rows, disparity, compared, textured, barred, settings.fill_support
         )
-        mask = fill_gaps(view, profile, mask, consistent & ~compared.denied, settings.fill_gap_m)
+        may_be = compared.consistent & ~compared.denied & ~barred
+        mask = fill_gaps(view, profile, mask, may_be, settings.fill_gap_m)
         return drop_islands(mask, settings.island_share)
 
     def _scan(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.fan import SUBPIXEL_BITS, fixed_point
 from segfloor_ros.grid.placing import PlacedEvidence
+
+_RAY_STEP = 0.25
+"""Cells between two samples of a ray."""
 
 
 def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uint8]:
@@ -56,13 +57,13 @@ def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
 def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: float) -> None:
     """Set the cells that rays from the base to base + offset (2, N) cross to 1.
 
-    The rays end `short` cells before that.
+    The rays end `short` cells before that. (OpenCV's lines begin and end in the middle of cells.)
     """
-    length = np.sqrt((offset**2).sum(axis=0))
-    ends = np.empty((2, offset.shape[1], 2))
-    ends[:, :, 0] = base[:, None]
-    shortened = np.maximum(length - short, 0) / np.maximum(length, 1e-9)
-    ends[:, :, 1] = base[:, None] + offset * shortened
-    pixels = fixed_point(ends.reshape(2, -1)).reshape(-1, 2, 2)
-    if len(pixels):
-        cv2.polylines(raster, list(pixels), False, 1, shift=SUBPIXEL_BITS)
+    length = np.maximum(np.sqrt((offset**2).sum(axis=0)) - short, 0)
+    if len(length) == 0:
+        return
+    along = np.arange(0, length.max() + _RAY_STEP, _RAY_STEP)
+    direction = offset / np.maximum(np.sqrt((offset**2).sum(axis=0)), 1e-9)
+    distance = np.minimum(along, length[:, None])
+    column, row = (base[:, None, None] + direction[:, :, None] * distance).astype(np.intp)
+    raster[row, column] = 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
 from segfloor_ros.floor.remembered_floor import FloorMemory
 from segfloor_ros.floor.view import FloorView
 
@@ -50,14 +50,3 @@ def test_the_last_rows_of_floor_are_not_remembered(taught):
     mask = filled(taught, np.full(SHAPE, NO_EVIDENCE, np.uint8))
     last = row_of(WALL_M)
     assert not (mask[last : last + 2] == FLOOR).any()
-
-
-def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it(taught):
-    strip = 20
-    mask = np.full(SHAPE, NO_EVIDENCE, np.uint8)
-    mask[:, strip:] = FLOOR
-    box = slice(row_of(1.6), row_of(1.2))
-    mask[box, strip : strip + 10] = NOT_FLOOR
-    mask = filled(taught, mask)
-    assert not (mask[box, :strip] == FLOOR).any()
-    assert (mask[row_of(1.1) : row_of(0.9), :strip] == FLOOR).mean() > 0.9

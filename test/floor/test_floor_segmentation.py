@@ -169,6 +169,20 @@ def test_unequal_exposure_does_no_harm():
     assert recall > 0.95
 
 
+@pytest.mark.parametrize(('pitch_deg', 'roll_deg'), [(2.5, 0.0), (0.0, -4.0)])
+def test_a_robot_that_tilts_on_its_wheels_still_sees_its_floor(pitch_deg, roll_deg):
+    """The pose in the map tells that the camera is not as it is mounted."""
+    pitch_rad = MOUNT.pitch_rad + np.radians(pitch_deg)
+    tilted = dataclasses.replace(MOUNT, pitch_rad=pitch_rad, roll_rad=np.radians(roll_deg))
+    scene = Scene([floor_patch(), wall(2.0)], mount=tilted)
+    left, right, floor, depth = scene.render()
+    T_map_base = tilted.T_base_left @ np.linalg.inv(MOUNT.T_base_left)
+    observation = FloorSegmentation(CAMERA, SETTINGS).process(left, right, MOUNT, T_map_base)
+    precision, recall = shares(observation, floor, depth)
+    assert precision > 0.99
+    assert recall > 0.97
+
+
 def test_same_input_same_output():
     scene = Scene([floor_patch(), wall(), *box(1.5, 0.3, 0.3, 0.2)])
     first, _, _ = segment(scene, (np.eye(4), np.eye(4)))

@@ -238,3 +238,28 @@ def test_what_seemed_wider_from_afar_hides_nothing_from_near(make_drive: MakeDri
     drive.look(true, (0.0, 0.3, 0.0))
     assert (cells_at(drive.grid(), behind) == 0).all()
     assert (cells_at(drive.grid(), centres((1.0, 1.05), (-0.5, -0.1))) == 100).all()
+
+
+def test_cells_that_the_edge_of_the_view_crosses_are_free(make_drive: MakeDrive) -> None:
+    # The wall ends between the bearings of 5 and 5.5 degrees, so the view past it begins at 5.5.
+    wall = World(walls=((1.0, -3.0, 1.0, math.tan(math.radians(5.25))),))
+    drive = make_drive(OccupancyGridSettings(footprint_radius_m=0.0), error_per_m=0.0)
+    drive.look(wall, (0.0, 0.0, 0.0))
+    distance = np.linspace(1.3, 2.8, 60)
+    edge = math.radians(5.5)
+    crossed = np.stack([distance * math.cos(edge), distance * math.sin(edge)], axis=1)
+    assert (cells_at(drive.grid(), crossed) == 0).all()
+    hidden = np.stack([distance, distance * math.tan(math.radians(2.0))], axis=1)
+    assert (cells_at(drive.grid(), hidden) == -1).all()
+
+
+def test_a_wall_that_turns_out_a_cell_farther_hides_nothing(make_drive: MakeDrive) -> None:
+    # Along a wall seen askew, its old cells stand in front of the floor before its new ones.
+    old, new = (World(walls=((0.3, y, 4.0, y),)) for y in (0.262, 0.312))
+    drive = make_drive(OccupancyGridSettings(footprint_radius_m=0.0), error_per_m=0.0)
+    for _ in range(10):
+        drive.look(old, (0.0, 0.0, 0.0))
+    for _ in range(11):
+        drive.look(new, (0.0, 0.0, 0.0))
+    before_it = centres((0.6, 1.6), (0.25, 0.3))
+    assert (cells_at(drive.grid(), before_it) == 0).all()
