@@ -55,8 +55,12 @@ class Graph:
 
     def collect(self, name: str) -> list[Any]:
         """Subscribe to a topic; the list grows with its messages."""
+        return self.collect_at(name, name)
+
+    def collect_at(self, full_name: str, name: str) -> list[Any]:
+        """Subscribe to a topic of `TOPICS` under another name; the list grows with its messages."""
         topic, received = TOPICS[name], []
-        self.tester.create_subscription(topic.type, name, received.append, topic.profile)
+        self.tester.create_subscription(topic.type, full_name, received.append, topic.profile)
         return received
 
     def publisher(self, name: str) -> Any:

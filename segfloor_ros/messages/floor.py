@@ -9,6 +9,7 @@ from sensor_msgs.msg import LaserScan
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.floor.free_ranges import free_ranges
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
@@ -50,6 +51,16 @@ def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
         ranges=array.array('f', ranges.tobytes()),
         intensities=array.array('f', np.ascontiguousarray(obstacles, np.float32).tobytes()),
     )
+
+
+def free_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
+    """Return how far the floor is free per bearing, in the base's plane, for a costmap to clear:
+    see `free_ranges`.
+    """
+    message = scan_message(stamp_ns, frame_id, scan)
+    message.ranges = array.array('f', free_ranges(scan).tobytes())
+    message.intensities = array.array('f')
+    return message
 
 
 def scan_arrays(message: LaserScan, topic: str) -> FloorScan:

@@ -29,6 +29,9 @@ IMAGES_BEST_EFFORT = QoSProfile(
 )
 """Camera images of drivers that publish best effort; frames may be lost."""
 
+FRAMES = _reliable(5)
+"""Small images of every frame, of which only the latest count."""
+
 KEYFRAMES = _reliable(KEYFRAME_DEPTH)
 """Everything about a keyframe; deep enough for a burst after the camera's mount was measured."""
 

@@ -44,7 +44,8 @@ PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 class Topic:
     """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
     it replaces by parameter, where it does. is_optional: its subscribers do without it where nobody
-    publishes it. also_by: further publishers.
+    publishes it. on_demand: they subscribe only while somebody needs what they make of it. also_by:
+    further publishers.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Topic:
     about: str
     instead_of: str = ''
     is_optional: bool = False
+    on_demand: bool = False
     also_by: tuple[str, ...] = ()
 
     @property
@@ -93,6 +95,30 @@ def _compressed(image: str, publisher: str, what: str) -> Topic:
     return Topic(name, CompressedImage, qos.IMAGES, publisher, (SLAM,), about, instead_of=image)
 
 
+FRAME_PARTS = tuple(
+    f'frame/{side}/{what}' for side in ('left', 'right') for what in ('image_rect', 'camera_info')
+)
+
+
+def _frame_images() -> list[Topic]:
+    about = 'Every tracked frame, rectified, some 320 pixels wide; published while someone listens'
+    return [
+        Topic(
+            name,
+            CameraInfo if name.endswith('camera_info') else Image,
+            qos.FRAMES,
+            SLAM,
+            (FLOOR,),
+            f'Calibration for {name.replace("camera_info", "image_rect")}.'
+            if name.endswith('camera_info')
+            else f'{about}.',
+            is_optional=True,
+            on_demand=True,
+        )
+        for name in FRAME_PARTS
+    ]
+
+
 def _keyframe_images() -> list[Topic]:
     topics = []
     for side in ('left', 'right'):
@@ -112,9 +138,11 @@ _ALL = [
         Odometry,
         qos.ODOMETRY,
         SLAM,
-        (),
+        (CLOUD,),
         'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
         'lost.',
+        is_optional=True,
+        on_demand=True,
     ),
     Topic(
         FRAME_DONE,
@@ -150,6 +178,7 @@ _ALL = [
         is_optional=True,
     ),
     *_keyframe_images(),
+    *_frame_images(),
     Topic(
         'keyframe/features',
         PointCloud2,
@@ -218,6 +247,16 @@ _ALL = [
         'front, NaN: not seen. Intensities: distance of the nearest upright thing (m) or NaN.',
     ),
     Topic(
+        'scan',
+        LaserScan,
+        qos.KEYFRAMES,
+        FLOOR,
+        (),
+        "How far the floor is free per bearing at every tracked frame, in the base's plane (m), "
+        'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
+        'not seen. Published while someone listens.',
+    ),
+    Topic(
         'labelled_points',
         PointCloud2,
         qos.KEYFRAMES,
@@ -240,7 +279,8 @@ _ALL = [
         qos.KEYFRAMES,
         CLOUD,
         (),
-        'The obstacle points alone: x y z id. Published while someone listens.',
+        'The obstacle points alone: x y z id. Published while someone listens: at every keyframe, '
+        'and twice a second while the camera is tracked but makes none.',
     ),
     Topic(
         KEYFRAME_DONE,
@@ -285,7 +325,7 @@ def published_by(node: str, alternatives: bool = False) -> list[Topic]:
 
 def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     """Return the topics a node subscribes to, without diagnostics; alternatives: also those that
-    replace others by parameter.
+    replace others by parameter, and those on demand.
     """
     mine = [topic for topic in TOPICS.values() if node in topic.subscribers]
-    return [topic for topic in mine if alternatives or not topic.instead_of]
+    return [topic for topic in mine if alternatives or not (topic.instead_of or topic.on_demand)]

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import PointCloud2
+
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE
 from segfloor_ros.cloud.settings import CloudLabellingSettings
@@ -14,6 +17,7 @@ from segfloor_ros.messages.clouds import (
     points_of_label,
     sparse_cloud_arrays,
 )
+from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
@@ -24,6 +28,7 @@ from segfloor_ros.nodes.stage_node import StageNode
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
 POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
+KEEP_ALIVE_S = 0.5
 
 
 class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
@@ -43,10 +48,13 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
             OBSTACLE: self.output('obstacle_points'),
         }
         self._keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
+        self.inputs.subscribe('odometry', self._keep_alive, is_wanted=self._obstacles_are_wanted)
+        self.inputs.every(KEEP_ALIVE_S, self.inputs.update)
 
     def reset_stage(self) -> None:
         """Begin without points."""
         self._stage = CloudLabelling(self.parameters.stage)
+        self._obstacles: PointCloud2 | None = None
 
     def restore(self, state: tuple[int | None, CloudLabelling]) -> None:
         """Resume with the labels of a killed node."""
@@ -72,11 +80,29 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
         self._labelled.publish(labelled_message(stamp_ns, frame_id, labelled))
-        for label, output in self._by_label.items():
-            if output.get_subscription_count():
-                output.publish(points_of_label(stamp_ns, frame_id, labelled, label))
+        if self._by_label[FLOOR].get_subscription_count():
+            floor = points_of_label(stamp_ns, frame_id, labelled, FLOOR)
+            self._by_label[FLOOR].publish(floor)
+        if self._obstacles_are_wanted():
+            self._obstacles = points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
+            self._by_label[OBSTACLE].publish(self._obstacles)
         self.kept_state.save((self._keyframes.map_start_ns, self._stage))
         return {'points': len(labelled.point_id)}
+
+    def _obstacles_are_wanted(self) -> bool:
+        return self._by_label[OBSTACLE].get_subscription_count() > 0
+
+    def _keep_alive(self, message: Odometry) -> None:
+        """Publish the obstacles again at the time of a tracked frame when they have become old. A
+        robot that stands makes no keyframes, and who depends on the points, e.g. Nav2's collision
+        monitor, must know that somebody still looks.
+        """
+        obstacles, stamp_ns = self._obstacles, to_ns(message.header.stamp)
+        if obstacles is not None:
+            age_s = 1e-9 * (stamp_ns - to_ns(obstacles.header.stamp))
+            if not 0 <= age_s < KEEP_ALIVE_S:
+                obstacles.header.stamp = message.header.stamp
+                self._by_label[OBSTACLE].publish(obstacles)
 
 
 def main() -> None:

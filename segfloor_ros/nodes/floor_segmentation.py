@@ -19,6 +19,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.free_scan import FreeScan
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
@@ -46,18 +47,21 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._v_disparity = self.output('keyframe/v_disparity')
         self._mask = self.output('keyframe/floor_mask')
         self._scan = self.output('keyframe/floor_scan')
+        self._free_scan = FreeScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE)
         self._keyframes = KeyframeJoin(self, parts, self._segment, may_process=self._has_mount)
 
     def reset_stage(self) -> None:
         """Begin without memory of the floor."""
+        self._free_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
         self._mount_check: MountCheck | None = None
 
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings, and with what is remembered."""
+        self._free_scan.reset()
         if self._stage is not None:
             self._stage.change_settings(self.parameters.stage)
 
@@ -66,6 +70,11 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._mount_stamp_ns = to_ns(message.header.stamp)
         self._base_frame = message.header.frame_id
         self._keyframes.process_waiting()
+
+    def _known_mount(self) -> tuple[str, Mount] | None:
+        if self._mount is None or not self._has_mount():
+            return None
+        return self._base_frame, self._mount
 
     def _has_mount(self) -> bool:
         """Whether the mount is known, of the map that the keyframes belong to: it travels on a

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.messages.camera_info import camera_info_message
+from segfloor_ros.camera.shrinking import shrink_factor, shrunk, shrunk_camera
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.clouds import features_message, sparse_cloud_message
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.messages.poses import (
@@ -23,8 +27,11 @@ from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult, Keyframe
 
+SIDES = ('left', 'right')
 LEAST_VARIANCE = 1e-6
 """Of a millimetre and a milliradian, in m² and rad²: the first pose is the origin by definition."""
+
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -43,8 +50,10 @@ class SlamOutputs:
         self._odometry = node.output('odometry')
         self._mount = node.output('camera_mount')
         self._pose = node.output('keyframe/odometry')
-        self._images = {s: node.output(f'keyframe/{s}/image_rect') for s in ('left', 'right')}
-        self._infos = {s: node.output(f'keyframe/{s}/camera_info') for s in ('left', 'right')}
+        self._images = {s: node.output(f'keyframe/{s}/image_rect') for s in SIDES}
+        self._infos = {s: node.output(f'keyframe/{s}/camera_info') for s in SIDES}
+        self._frame_images = {s: node.output(f'frame/{s}/image_rect') for s in SIDES}
+        self._frame_infos = {s: node.output(f'frame/{s}/camera_info') for s in SIDES}
         self._features = node.output('keyframe/features')
         self._path = node.output('keyframe/path')
         self._map_points = node.output('map_points')
@@ -76,6 +85,20 @@ class SlamOutputs:
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe, calibration, frames)
         self._last = result
+
+    def publish_frame(
+        self, stamp_ns: int, pair: Pair, calibration: StereoCalibration, frames: CameraFrames
+    ) -> None:
+        """Publish the rectified images (H, W) of a tracked frame, shrunk, while someone listens."""
+        if not any(output.get_subscription_count() for output in self._frame_images.values()):
+            return
+        factor = shrink_factor(calibration.camera)
+        small = rectified_calibration(shrunk_camera(calibration.camera, factor))
+        for side, image, eye in zip(SIDES, pair, (small.left, small.right), strict=True):
+            frame_id = getattr(frames, side)
+            self._frame_infos[side].publish(camera_info_message(stamp_ns, frame_id, eye))
+            message = image_message(stamp_ns, frame_id, shrunk(image, factor))
+            self._frame_images[side].publish(message)
 
     def _publish_odometry(self, result: FrameResult) -> None:
         last, twist, of_twist = self._last, None, None

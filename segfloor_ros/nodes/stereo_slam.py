@@ -145,7 +145,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         start = time.perf_counter()
         try:
             slam = self._slam or self._start(stamp_ns, pair)
-            frame = StereoFrame(self._frame_count, stamp_ns, *self._camera.images(pair))
+            images = self._camera.images(pair)
+            frame = StereoFrame(self._frame_count, stamp_ns, *images)
             self._frame_count += 1
             results = self._resumption.join(slam.process(frame))
         except Exception as error:
@@ -154,6 +155,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         milliseconds = 1e3 * (time.perf_counter() - start)
         for result in results:
             self._publish(result, slam, milliseconds / len(results))
+            if result.stamp_ns == stamp_ns and result.tracked:
+                self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
         if self._resumption.is_hopeless(stamp_ns):
             self.reset('the place where the last SLAM was killed is not found')
         if not results:

@@ -28,6 +28,11 @@ ALTERNATIVES = (
     ('-p', 'image_kind:=rect'),
     ('-p', 'image_kind:=rect', '-p', 'image_transport:=compressed'),
 )
+ON_DEMAND = {
+    'floor_segmentation': {'scan': 'frame/left/image_rect'},
+    'cloud_labelling': {'obstacle_points': 'odometry'},
+}
+"""By node: what must be listened to for what to be received."""
 OF_ROS = ('/parameter_events', '/rosout', '/clock', '/transition_event', '/tf', '/tf_static')
 SERVICES_OF_ROS = re.compile(
     r'/(describe|get|list|set)_parameter(s|_types|s_atomically)$|/get_type_description$'
@@ -63,6 +68,9 @@ def test_what_is_documented_exists_and_what_exists_is_documented(tmp_path, node,
         with fresh_graph('-r', '__ns:=/robot', *source, *alternative) as graph:
             made = graph.add(make())
             graph.until(partial(graph.reports_any, node), 'a sign of life')
+            for demanded, on_demand in ON_DEMAND.get(node, {}).items():
+                graph.collect_at(f'/robot/{demanded}', demanded)
+                graph.until(partial(made.count_subscribers, on_demand), 'the demand')
             published |= {p.topic_name: [ros_name(p.msg_type)] for p in made.publishers}
             subscribed |= {s.topic_name: [ros_name(s.msg_type)] for s in made.subscriptions}
             services |= {s.service_name: [ros_name(s.srv_type)] for s in made.services}
