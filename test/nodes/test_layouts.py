@@ -13,6 +13,7 @@ import yaml
 from rclpy.node import Node
 
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.nodes.cloud_labelling import KEEP_ALIVE_S
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAV2 = REPOSITORY / 'params' / 'nav2.yaml'
@@ -40,8 +41,15 @@ NAV2_PLUGINS = {
 MANAGED_BY_NAV2 = {
     'controller_server', 'smoother_server', 'planner_server', 'behavior_server', 'bt_navigator',
     'waypoint_follower', 'velocity_smoother', 'collision_monitor', 'docking_server',
+    'route_server',
 }  # fmt: skip
 """What navigation_launch.py of Jazzy starts."""
+OBSERVATION_KEYS = {
+    'topic', 'sensor_frame', 'observation_persistence', 'expected_update_rate', 'data_type',
+    'min_obstacle_height', 'max_obstacle_height', 'inf_is_valid', 'marking', 'clearing',
+    'obstacle_max_range', 'obstacle_min_range', 'raytrace_max_range', 'raytrace_min_range',
+}  # fmt: skip
+"""What ObstacleLayer reads of an observation source."""
 
 
 def strings(tree: Any) -> Iterator[str]:
@@ -118,6 +126,17 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert parameters['static_layer.map_subscribe_transient_local'] is True
         assert parameters['obstacle_layer.obstacles.topic'] == '/obstacle_points'
         assert parameters['obstacle_layer.obstacles.data_type'] == 'PointCloud2'
+        assert parameters['obstacle_layer.observation_sources'] == 'obstacles floor'
+        floor = {
+            name.removeprefix('obstacle_layer.floor.'): value
+            for name, value in parameters.items()
+            if name.startswith('obstacle_layer.floor.')
+        }
+        assert floor.keys() <= OBSERVATION_KEYS
+        assert TOPICS[floor['topic'].removeprefix('/')].type_name.endswith(floor['data_type'])
+        assert (floor['clearing'], floor['marking'], floor['inf_is_valid']) == (True, False, True)
+    monitor = nav2_node('collision_monitor')
+    assert monitor['source_timeout'] > 2 * KEEP_ALIVE_S
     assert nav2_node('planner_server')['planner_plugins'] == ['GridBased']
 
 

@@ -45,7 +45,7 @@ from segfloor_ros.messages.clouds import (
     labelled_arrays,
     sparse_cloud_arrays,
 )
-from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
@@ -346,7 +346,12 @@ def test_a_missing_partner_is_named_and_the_next_keyframe_goes_through(make_grap
     publish(graph, cloud_messages(STAMP_NS + 1), publishers)
     graph.until(lambda: labelled, 'the second keyframe')
     assert to_ns(labelled[0].header.stamp) == STAMP_NS + 1
-    (error,) = (s for s in graph.reports('cloud_labelling') if s.level is Level.ERROR)
+
+    def errors() -> list[Status]:
+        return [s for s in graph.reports('cloud_labelling') if s.level is Level.ERROR]
+
+    graph.until(errors, 'the status')
+    (error,) = errors()
     assert error.stamp_ns == STAMP_NS
     assert 'keyframe/floor_mask' in error.message
 
