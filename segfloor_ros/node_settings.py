@@ -86,7 +86,8 @@ class StereoSlamNodeSettings(NodeSettings):
     )
     tf_wait_s: float = setting(
         5.0,
-        'How long after the start to wait for the mount of the camera on tf before measuring it.',
+        'How long after the start to wait for the mount of the camera on tf before measuring it, '
+        'where another node publishes tf.',
         unit='s',
         minimum=0.0,
         maximum=60.0,

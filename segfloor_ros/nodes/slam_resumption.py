@@ -23,6 +23,11 @@ class SlamResumption:
         self._first_ns: int | None = None
         self._found = False
 
+    @property
+    def has_mount(self) -> bool:
+        """Whether there is a map to resume, whose mount is known."""
+        return self._last is not None
+
     def mount_for(self, camera: StereoCamera, stamp_ns: int) -> Mount | None:
         """Return the mount of the map to go on with; None where there is none, or it was made
         with another camera or later than this stamp.

@@ -66,6 +66,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         """Resume with the map of a killed node once the images come."""
         self._outputs.map_start_ns, last = state
         self._resumption = SlamResumption(self._keep, last)
+        count = len(last.keyframe.path.stamp_ns)
+        self.get_logger().warning(
+            f'resumed with the map of a node that was killed: {count} keyframes'
+        )
 
     def is_needed_otherwise(self) -> bool:
         """Whether anybody listens to tf."""
@@ -118,9 +122,9 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             return True
         if self._camera.missing_calibrations:
             return False
-        return self._mount_is_given() or self._transforms.mount_is_settled(
-            self._camera.frame_ids(pair)[0]
-        )
+        if self._mount_is_given() or self._resumption.has_mount:
+            return True
+        return self._transforms.mount_is_settled(self._camera.frame_ids(pair)[0])
 
     def _mount_is_given(self) -> bool:
         settings = self.parameters.stage

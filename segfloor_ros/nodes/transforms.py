@@ -15,6 +15,8 @@ from segfloor_ros.slam.results import FrameResult
 
 MAX_UNCORRECTED = 30
 TICK_S = 0.05
+DISCOVERY_S = 1.0
+"""Who publishes tf is known so long after the start; where nobody does, tf is not waited for."""
 
 
 class Transforms:
@@ -30,7 +32,7 @@ class Transforms:
         self._node = node
         self._own = own
         self._link: TfLink | None = tf_link(node)
-        self._deadline_s = 0.0
+        self._opened_s = self._deadline_s = 0.0
         self._has_own_mount = False
         self._unsent_mount: tuple[int, str, Mount] | None = None
         self._uncorrected: deque[FrameResult] = deque(maxlen=MAX_UNCORRECTED)
@@ -52,7 +54,8 @@ class Transforms:
 
     def start_waiting(self) -> None:
         """From now on tf has some time to tell the mount."""
-        self._deadline_s = time.monotonic() + self._own.tf_wait_s
+        self._opened_s = time.monotonic()
+        self._deadline_s = self._opened_s + self._own.tf_wait_s
 
     def reset(self) -> None:
         """Drop what is known of the map's place in odom."""
@@ -66,15 +69,26 @@ class Transforms:
         """Whether tf tells the mount of the left optical frame, or had time enough to."""
         if self._link is None or self._has_own_mount or self.mount(camera_frame) is not None:
             return True
-        base = self._own.base_frame
-        if time.monotonic() < self._deadline_s:
+        base, wait_s = self._own.base_frame, self._own.tf_wait_s
+        if not self._is_published():
+            wait_s = min(wait_s, DISCOVERY_S)
+        if time.monotonic() < self._opened_s + wait_s:
             self._node.reporter.warn(f'waiting for tf from {base} to {camera_frame}')
             return False
         self._node.reporter.warn(
-            f'no tf from {base} to {camera_frame} within {self._own.tf_wait_s:g} s; the mount of '
-            'the camera is measured from the floor'
+            f'no tf from {base} to {camera_frame} within {wait_s:g} s; the mount of the camera is '
+            'measured from the floor'
         )
         return True
+
+    def _is_published(self) -> bool:
+        """Whether another node publishes tf."""
+        me = self._node.get_namespace(), self._node.get_name()
+        return any(
+            (info.node_namespace, info.node_name) != me
+            for topic in ('/tf_static', '/tf')
+            for info in self._node.get_publishers_info_by_topic(topic)
+        )
 
     def mount(self, camera_frame: str) -> Mount | None:
         """Return where tf has the left optical frame on the base, or None."""

@@ -22,7 +22,7 @@ from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.poses import path_arrays, pose_array
-from segfloor_ros.messages.topics import CAMERA, GRID, SLAM
+from segfloor_ros.messages.topics import CAMERA, CLOUD, GRID, SLAM
 from segfloor_ros.nodes.kept_state import KeptState
 
 PLACES = 80
@@ -145,6 +145,12 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     rows = np.searchsorted(ids, both)
     assert (cloud_after.label[rows] != UNKNOWN).mean() > 0.95
     assert 'Traceback' not in chain.log(node)
+    words = {
+        SLAM: 'resumed with the map',
+        CLOUD: 'resumed with the labels',
+        GRID: 'resumed with the map',
+    }
+    assert words.get(node, '') in chain.log(node)
 
 
 def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
