@@ -101,10 +101,14 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
     passed over. Raises SettingsError when the file is missing or not of that form.
     """
     try:
-        document = yaml.safe_load(path.read_text())
+        document = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise SettingsError(f'{path}: cannot read the parameter file ({error.strerror})') from None
-    except yaml.YAMLError as error:
+    except UnicodeDecodeError as error:
+        raise SettingsError(
+            f'{path}, byte {error.start}: the parameter file is not UTF-8; save it as that'
+        ) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         line = getattr(getattr(error, 'problem_mark', None), 'line', 0) + 1
         raise SettingsError(f'{path}, line {line}: not valid YAML') from None
     if not isinstance(document, dict):
@@ -149,7 +153,10 @@ def _parse_assignment(assignment: str) -> list[tuple[str, str, Any]]:
     stage, dot, name = key.strip().partition('.')
     if not separator or not (dot or stage in ROBOT_PARAMETERS):
         raise SettingsError(f'--set {assignment}: expected stage.parameter=value')
-    value = yaml.safe_load(text)
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError):
+        raise SettingsError(f'--set {assignment}: {text} is no value in YAML') from None
     if not dot:
         return [(owner, stage, value) for owner in ROBOT_STAGES]
     if stage not in STAGE_SETTINGS:

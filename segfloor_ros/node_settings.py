@@ -64,6 +64,11 @@ class StereoCameraNodeSettings(NodeSettings):
         minimum=1,
         maximum=100,
     )
+    publish_clock: bool = setting(
+        False,
+        'Publish the stamps of a recording as /clock, for nodes with use_sim_time; no other node '
+        'may do so.',
+    )
     start_paused: bool = setting(False, 'Wait for the service ~/pause before the first frame.')
     left_frame: str = setting('left_camera_optical_frame', 'Optical frame of the left camera.')
     right_frame: str = setting('right_camera_optical_frame', 'Optical frame of the right camera.')
@@ -162,7 +167,10 @@ class OccupancyGridNodeSettings(NodeSettings):
         live=True,
     )
     map_file: str = setting(
-        'map.yaml', 'File that the service save_map writes, with the image beside it.', live=True
+        'map.yaml',
+        'File that the service save_map writes, with the image beside it; .yaml is appended where '
+        'it lacks.',
+        live=True,
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from segfloor_ros.cloud.labels import LabelledPoints
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import InputError
 
 VERTEX = np.dtype(
     [
@@ -43,15 +43,15 @@ def write_ply(path: Path, points: LabelledPoints) -> None:
 
 
 def read_ply(path: Path) -> LabelledPoints:
-    """Read a file of `write_ply`. Raises MapError naming the file when it is not one."""
+    """Read a file of `write_ply`. Raises InputError naming the file when it is not one."""
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise MapError(f'{path}: cannot read the cloud ({error.strerror})') from None
+        raise InputError(f'{path}: cannot read the cloud ({error.strerror})') from None
     head, mark, body = content.partition(b'end_header\n')
     count = len(body) // VERTEX.itemsize
     if not mark or head + mark != _header(count) or len(body) != count * VERTEX.itemsize:
-        raise MapError(f'{path}: not a whole labelled cloud')
+        raise InputError(f'{path}: not a whole labelled cloud')
     vertices = np.frombuffer(body, VERTEX)
     return LabelledPoints(
         point_id=vertices['id'].astype(np.int32),

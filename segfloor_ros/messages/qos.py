@@ -41,6 +41,9 @@ ODOMETRY = _reliable(KEYFRAME_DEPTH)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 """The last value also for those who come later: the map, the camera's mount (REP-2003)."""
 
+CLOCK = _reliable(10)
+"""The time of a recording."""
+
 TF = _reliable(100)
 """Moving frames, as tf2 does."""
 

@@ -44,7 +44,8 @@ PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 class Topic:
     """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
     it replaces by parameter, where it does. is_optional: its subscribers do without it where nobody
-    publishes it. on_demand: they subscribe only while somebody needs what they make of it. also_by:
+    publishes it. on_demand_by:
+    who subscribes only while somebody needs what it makes of it. also_by:
     further publishers.
     """
 
@@ -56,7 +57,7 @@ class Topic:
     about: str
     instead_of: str = ''
     is_optional: bool = False
-    on_demand: bool = False
+    on_demand_by: tuple[str, ...] = ()
     also_by: tuple[str, ...] = ()
 
     @property
@@ -108,12 +109,12 @@ def _frame_images() -> list[Topic]:
             CameraInfo if name.endswith('camera_info') else Image,
             qos.FRAMES,
             SLAM,
-            (FLOOR,),
+            (),
             f'Calibration for {name.replace("camera_info", "image_rect")}.'
             if name.endswith('camera_info')
             else f'{about}.',
             is_optional=True,
-            on_demand=True,
+            on_demand_by=(FLOOR,),
         )
         for name in FRAME_PARTS
     ]
@@ -138,11 +139,11 @@ _ALL = [
         Odometry,
         qos.ODOMETRY,
         SLAM,
-        (CLOUD,),
+        (),
         'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
         'lost.',
         is_optional=True,
-        on_demand=True,
+        on_demand_by=(CLOUD,),
     ),
     Topic(
         FRAME_DONE,
@@ -327,5 +328,10 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     """Return the topics a node subscribes to, without diagnostics; alternatives: also those that
     replace others by parameter, and those on demand.
     """
-    mine = [topic for topic in TOPICS.values() if node in topic.subscribers]
-    return [topic for topic in mine if alternatives or not (topic.instead_of or topic.on_demand)]
+    found = []
+    for topic in TOPICS.values():
+        if (alternatives and node in (*topic.subscribers, *topic.on_demand_by)) or (
+            node in topic.subscribers and not topic.instead_of
+        ):
+            found.append(topic)
+    return found

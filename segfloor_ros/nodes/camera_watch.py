@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from statistics import median
 
@@ -46,9 +45,9 @@ class CameraWatch:
     def saw_image(self, topic: str, stamp_ns: int) -> None:
         """Note an image."""
         self._stamps[topic].append(stamp_ns)
-        self._last_image_s[topic] = time.monotonic()
-        age_ns = self._node.get_clock().now().nanoseconds - stamp_ns
-        self._is_live = abs(age_ns) < LIVE_NS
+        now_ns = self._node.get_clock().now().nanoseconds
+        self._last_image_s[topic] = 1e-9 * now_ns
+        self._is_live = abs(now_ns - stamp_ns) < LIVE_NS
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
         """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
@@ -117,9 +116,10 @@ class CameraWatch:
             )
 
     def _find_silence(self) -> None:
-        now_s = time.monotonic()
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
         for topic, last_s in self._last_image_s.items():
-            # A recording may end or wait for the nodes; a camera may not.
+            # A recording may end or wait for the nodes; a camera may not. The time of one that has
+            # ended stands still.
             if self._is_live and now_s - last_s > SILENT_S:
                 self._node.reporter.diagnose(
                     f'silence of {topic}',
@@ -130,7 +130,7 @@ class CameraWatch:
 
     def _find_different_stamps(self) -> None:
         left, right = self._stamps.values()
-        now_s = time.monotonic()
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
         both_come = all(now_s - last_s < 1.0 for last_s in self._last_image_s.values())
         if not both_come or len(left) < RECENT or len(right) < RECENT:
             return

@@ -23,6 +23,7 @@ from segfloor_ros.nodes.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
 
+YAML_SUFFIXES = ('.yaml', '.yml')
 POINTS, FEATURES = 'labelled_points', 'keyframe/features'
 PATH, POSE, SCAN = 'keyframe/path', 'keyframe/odometry', 'keyframe/floor_scan'
 
@@ -94,10 +95,17 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         self._map.publish(grid_message(self._stamp_ns, self._frame_id, self._stage.grid()))
 
     def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        path = FilePath(self.parameters.own.map_file).expanduser().absolute()
-        if not self._frame_id:
-            response.message = 'there is no map yet: no keyframe has arrived'
+        name = self.parameters.own.map_file
+        if not self._frame_id or not name:
+            response.message = (
+                'there is no map yet: no keyframe has arrived'
+                if name
+                else 'map_file is empty; set it to the name of a file, e.g. map.yaml'
+            )
             return response
+        path = FilePath(name).expanduser().absolute()
+        if path.suffix not in YAML_SUFFIXES:
+            path = path.with_name(f'{path.name}.yaml')
         try:
             save_map(self._stage.grid(), path)
         except (SegfloorError, OSError) as error:

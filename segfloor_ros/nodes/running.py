@@ -6,15 +6,20 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
 
-from segfloor_ros.errors import SegfloorError
+from segfloor_ros.configuration import STAGE_SETTINGS
+from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.node_settings import NODE_SETTINGS
 from segfloor_ros.nodes.middleware import prepare_middleware
 
 INTERRUPT_HEARD_S = 0.2
+HELP = ('-h', '--help')
 
 
 def run_node(make_node: Callable[[], Node]) -> None:
@@ -24,6 +29,46 @@ def run_node(make_node: Callable[[], Node]) -> None:
     run_nodes(lambda: [make_node()])
 
 
+def check_arguments(arguments: Sequence[str]) -> None:
+    """End the process on arguments that are not of ROS: with help on --help and -h, with one line
+    and status 2 on others.
+    """
+    program, *others = remove_ros_args(list(arguments))
+    if any(word in HELP for word in others):
+        print(help_text(Path(program).stem))
+        sys.exit(0)
+    if others:
+        print(
+            f'segfloor: unknown argument {others[0]}; parameters are given as --ros-args -p '
+            'NAME:=VALUE, and --help lists them',
+            file=sys.stderr,
+        )
+        sys.exit(2)
+
+
+def help_text(program: str) -> str:
+    """Return what a node's program takes, with the parameters of the node."""
+    lines = [
+        f'usage: {program} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO]]',
+        '',
+    ]
+    for node in [program] if program in STAGE_SETTINGS else STAGE_SETTINGS:
+        lines.append(f'parameters of {node}:')
+        for spec in (*STAGE_SETTINGS[node].specs(), *NODE_SETTINGS[node].specs()):
+            unit = f' {spec.unit}' if spec.unit else ''
+            lines.append(f'  {spec.name} (default {spec.default!r}{unit}): {spec.description}')
+    return '\n'.join(lines)
+
+
+def _begin_ros(arguments: Sequence[str]) -> None:
+    try:
+        check_arguments(arguments)
+        rclpy.init()
+    except Exception as error:  # of several kinds, for arguments and files that rcl cannot read
+        text = ' '.join(str(error).split()).partition(', at ')[0]
+        raise SettingsError(f'ROS does not take the arguments: {text}') from None
+
+
 def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     """Run nodes in one executor, like `run_node`."""
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
@@ -31,7 +76,7 @@ def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     nodes: Sequence[Node] = ()
     try:
         prepare_middleware()
-        rclpy.init()
+        _begin_ros(sys.argv)
         executor = SingleThreadedExecutor()
         nodes = make_nodes()
         for node in nodes:

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from segfloor_ros.camera.images import Grey
@@ -13,9 +15,10 @@ from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.headers import to_ns, to_time
 from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
@@ -46,6 +49,10 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
         self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
+        self._clock_output: Publisher | None = None
+        if own.publish_clock:
+            clock = self._clock_output = self.create_publisher(Clock, '/clock', qos.CLOCK)
+            self.at_clean_up(lambda: self.destroy_publisher(clock))
         if own.lossless or not own.rate:
             self._follow_chain()
         self.inputs.repeat(self._advance)
@@ -153,6 +160,8 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             if pace is not None:
                 pace.sent(pair.stamp_ns)
         self._logged_waiting_s = time.monotonic()
+        if self._clock_output is not None:
+            self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))

@@ -5,7 +5,7 @@ import pytest
 
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.cloud.ply import read_ply, write_ply
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import InputError
 
 POINTS = LabelledPoints(
     point_id=np.array([3, 70000], np.int32),
@@ -41,7 +41,7 @@ def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
     write_ply(tmp_path / 'c.ply', POINTS)
     whole = (tmp_path / 'c.ply').read_bytes()
     (tmp_path / 'c.ply').write_bytes(whole[:-1])
-    with pytest.raises(MapError, match=r'c\.ply'):
+    with pytest.raises(InputError, match=r'c\.ply'):
         read_ply(tmp_path / 'c.ply')
-    with pytest.raises(MapError, match=r'gone\.ply: cannot read'):
+    with pytest.raises(InputError, match=r'gone\.ply: cannot read'):
         read_ply(tmp_path / 'gone.ply')
