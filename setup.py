@@ -84,7 +84,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'segfloor = segfloor_ros.cli.main:main',
+            'segfloor = segfloor_ros.cli.start:main',
             *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, 'segfloor_pipeline')),
         ],
     },

@@ -19,9 +19,10 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[1]
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
 IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
-                 'python3-yaml': 'yaml'}  # fmt: skip
-OF_EXTRAS = {'typer', 'rich', 'rosbags', 'evo', 'matplotlib', 'mujoco', 'junitparser', 'fsspec',
-             'distributed'}  # fmt: skip
+                 'python3-yaml': 'yaml', 'python3-typer': 'typer', 'python3-rich': 'rich',
+                 'python3-matplotlib': 'matplotlib', 'python3-rosbags-pip': 'rosbags'}  # fmt: skip
+OF_EXTRAS = {'evo', 'mujoco', 'junitparser', 'fsspec', 'distributed'}
+"""What has no key of rosdep: commands that need one of them say so in one line."""
 START_S = 60.0
 
 
@@ -122,6 +123,49 @@ def test_everything_imported_is_declared() -> None:
                 used.add(node.module.split('.')[0])
     foreign = used - set(sys.stdlib_module_names) - {'segfloor_ros'}
     assert foreign - declared - OF_EXTRAS == set()
+
+
+def requirements_of_setup() -> dict[str, list[str]]:
+    """Return `install_requires` and the extras of setup.py by name."""
+    given = {
+        keyword.arg: ast.literal_eval(keyword.value)
+        for node in ast.walk(ast.parse((REPOSITORY / 'setup.py').read_text()))
+        if isinstance(node, ast.Call)
+        for keyword in node.keywords
+        if keyword.arg in ('install_requires', 'extras_require')
+    }
+    return {'': given['install_requires'], **given['extras_require']}
+
+
+def test_what_pip_installs_is_what_rosdep_installs() -> None:
+    """Both lists are held against each other: what one brings for the nodes and the command, the
+    other brings, too.
+    """
+    keys = {element.text for element in manifest() if element.tag == 'exec_depend'}
+    by_rosdep = {IMPORT_OF_KEY[key] for key in keys if key in IMPORT_OF_KEY}
+    module = {'pyyaml': 'yaml', 'opencv-python-headless': 'cv2'}
+    found = requirements_of_setup()
+    words = [re.split(r'[\[<>=; ]', word)[0].lower() for word in [*found[''], *found['cli']]]
+    by_pip = {module.get(word, word) for word in words}
+    assert by_rosdep == by_pip - OF_EXTRAS
+    assert {'rviz2', 'ros2launch', 'rosbag2_storage_mcap', 'launch_ros', 'tf2_ros'} <= keys
+
+
+def test_without_its_libraries_the_command_ends_with_one_line(tmp_path) -> None:
+    (tmp_path / 'typer.py').write_text("raise ModuleNotFoundError('No typer', name='typer')\n")
+    command = [sys.executable, '-c', 'from segfloor_ros.cli.start import main; main()', '--help']
+    found = subprocess.run(
+        command,
+        cwd=REPOSITORY,
+        env={**os.environ, 'PYTHONPATH': str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=START_S,
+    )
+    assert found.returncode == 2
+    assert found.stderr.startswith('segfloor: the command needs the Python package typer')
+    assert 'apt install python3-typer' in found.stderr
+    assert found.stderr.count('\n') == 1
 
 
 def test_constraints_pin_every_requirement_exactly() -> None:

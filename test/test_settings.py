@@ -2,13 +2,17 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from segfloor_ros.configuration import STAGE_SETTINGS, resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.settings import StageSettings, setting
+
+REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -181,3 +185,37 @@ def test_two_robots_in_one_place_are_refused(tmp_path):
     both = ['floor_segmentation.step_height_m=0.02', 'cloud_labelling.step_height_m=0.05']
     with pytest.raises(SettingsError, match=r'--set: .*step_height_m = 0\.02.*= 0\.05'):
         resolve(None, both)
+
+
+DAMAGED = [b'', b'\xff\xfe\x00', b'# caf\xe9\n/**:\n', b'\x00' * 40, b'{' * 3000, b'- 1\n- 2\n',
+           b'/**: {ros__parameters: 3}', b'? [a]\n: b', b'2001-99-99', b'!!python/object:os.x {}',
+           b'a: &a [*a]', b'/**:\n  ros__parameters:\n    \t1']  # fmt: skip
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_damaged_parameter_files_end_in_one_line(tmp_path, seed) -> None:
+    """Whatever a file holds, it is read or refused with one line."""
+    rng = np.random.default_rng(seed)
+    whole = (REPOSITORY / 'params' / 'kitti.yaml').read_bytes()
+    damaged = bytearray(DAMAGED[seed] if seed < len(DAMAGED) else whole)
+    for _ in range(3 if seed >= len(DAMAGED) else 0):
+        damaged[rng.integers(len(damaged))] = rng.integers(256)
+    file = tmp_path / 'params.yaml'
+    file.write_bytes(damaged)
+    try:
+        resolve(file)
+    except SettingsError as error:
+        assert '\n' not in str(error)
+        assert str(error).strip()
+
+
+def test_a_parameter_file_in_another_encoding_is_named_with_the_byte(tmp_path) -> None:
+    file = tmp_path / 'latin1.yaml'
+    file.write_bytes('# café'.encode('latin-1'))
+    with pytest.raises(SettingsError, match=r'latin1.yaml, byte 5: .* not UTF-8'):
+        resolve(file)
+
+
+def test_an_assignment_that_is_no_yaml_is_refused() -> None:
+    with pytest.raises(SettingsError, match='no value in YAML'):
+        resolve(assignments=['stereo_slam.num_features=[1'])

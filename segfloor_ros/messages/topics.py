@@ -44,9 +44,8 @@ PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 class Topic:
     """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
     it replaces by parameter, where it does. is_optional: its subscribers do without it where nobody
-    publishes it. on_demand_by:
-    who subscribes only while somebody needs what it makes of it. also_by:
-    further publishers.
+    publishes it. on_demand_by: who subscribes only while somebody needs what it makes of it.
+    also_by: further publishers.
     """
 
     name: str
@@ -328,10 +327,7 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     """Return the topics a node subscribes to, without diagnostics; alternatives: also those that
     replace others by parameter, and those on demand.
     """
-    found = []
-    for topic in TOPICS.values():
-        if (alternatives and node in (*topic.subscribers, *topic.on_demand_by)) or (
-            node in topic.subscribers and not topic.instead_of
-        ):
-            found.append(topic)
-    return found
+    mine = [topic for topic in TOPICS.values() if node in topic.subscribers]
+    if not alternatives:
+        return [topic for topic in mine if not topic.instead_of]
+    return [t for t in TOPICS.values() if t in mine or node in t.on_demand_by]

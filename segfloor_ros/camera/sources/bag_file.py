@@ -13,8 +13,9 @@ BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
 TF_DEFINITION = 'geometry_msgs/TransformStamped[] transforms'
 MISSING_LIBRARY = (
-    'bags are read and written by the package rosbags; install it with pip install '
-    "'segfloor_ros[cli]'"
+    'bags are read and written by the Python package rosbags: pip install rosbags, on Ubuntu 24.04 '
+    'with --break-system-packages or in a virtual environment; or let ROS play the bag: '
+    'ros2 launch segfloor_ros bag.launch.py bag:=BAG'
 )
 
 

@@ -1,0 +1,23 @@
+"""The start of the `segfloor` command, also where what it needs is not installed."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command line; without its libraries, end with one line and status 2."""
+    try:
+        from segfloor_ros.cli.main import main as run
+    except ModuleNotFoundError as error:
+        if (error.name or '').startswith('segfloor_ros'):
+            raise
+        name = (error.name or '').partition('.')[0]
+        print(
+            f'segfloor: the command needs the Python package {name}, which is not installed: '
+            f'apt install python3-{name}, or pip install {name} in a virtual environment; the ROS '
+            'nodes do without it',
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    run()
