@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from typing import Any
 
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.suite.job import Job, Outcome, do_job
 
-CONNECT_S = 30
+CONNECT_S = 10
 
 
 def outcomes(jobs: list[Job], processes: int = 1, scheduler: str = '') -> Iterator[Outcome]:
@@ -46,6 +47,8 @@ def _distributed(client: Any, jobs: list[Job]) -> Iterator[Outcome]:
 
 @contextlib.contextmanager
 def _client(processes: int, scheduler: str) -> Iterator[Any]:
+    # Read when Dask is imported, here and in the workers: what matters is in the outcomes.
+    os.environ.setdefault('DASK_LOGGING__DISTRIBUTED', 'critical')
     try:
         import distributed
     except ImportError:
@@ -60,8 +63,7 @@ def _client(processes: int, scheduler: str) -> Iterator[Any]:
                     n_workers=processes,
                     threads_per_worker=1,
                     memory_limit=0,
-                    dashboard_address=None,
-                    silence_logs='CRITICAL',
+                    dashboard_address='127.0.0.1:0',
                 )
             )
         try:

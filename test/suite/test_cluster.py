@@ -1,4 +1,4 @@
-"""A suite on two worker processes of Dask, one of which is killed in the middle."""
+"""A suite on worker processes of Dask."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ SUITE = 'recordings:\n' + ''.join(
     f'  - {{{{input: {{room}}, name: {name}, set: [stereo_slam.num_features={600 + 50 * i}]}}}}\n'
     for i, name in enumerate(NAMES)
 )
-pytestmark = pytest.mark.slow
 
 
 def start_check(room: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
@@ -37,6 +36,7 @@ def mapping(process: psutil.Process) -> bool:
     return any('segfloor_ros.cli.main' in ' '.join(c.cmdline()) for c in process.children())
 
 
+@pytest.mark.slow
 def test_a_killed_worker_changes_nothing(room, tmp_path):
     alone = start_check(room, tmp_path, '--out', str(tmp_path / 'alone'))
     _, errors = alone.communicate(timeout=240)
@@ -73,3 +73,11 @@ def test_a_killed_worker_changes_nothing(room, tmp_path):
         for file in SAME:
             here, there = (tmp_path / where / name / file for where in ('alone', 'two'))
             assert digest_of(here) == digest_of(there), (name, file)
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(room, tmp_path):
+    check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--scheduler', 'nowhere')
+    _, errors = check.communicate(timeout=120)
+    assert check.returncode == 2
+    assert errors.startswith('segfloor: --scheduler nowhere: cannot be reached')
+    assert errors.count('\n') == 1
