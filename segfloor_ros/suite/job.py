@@ -90,6 +90,9 @@ def do_job(job: Job) -> Outcome:
         problem = ''
     except SegfloorError as error:
         measured, archive, reused, problem = {}, b'', False, str(error)
+    except Exception as error:
+        # Whatever it is, the other recordings go on.
+        measured, archive, reused, problem = {}, b'', False, f'{type(error).__name__}: {error}'
     return Outcome(
         job.entry.name,
         measured,

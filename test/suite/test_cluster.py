@@ -36,15 +36,36 @@ def mapping(process: psutil.Process) -> bool:
     return any('segfloor_ros.cli.main' in ' '.join(c.cmdline()) for c in process.children())
 
 
-@pytest.mark.slow
-def test_a_killed_worker_changes_nothing(room, tmp_path):
-    alone = start_check(room, tmp_path, '--out', str(tmp_path / 'alone'))
-    _, errors = alone.communicate(timeout=240)
-    assert alone.returncode == 0, errors
+@pytest.fixture(scope='module')
+def alone(room, tmp_path_factory) -> Path:
+    """The suite's results by one process."""
+    folder = tmp_path_factory.mktemp('alone')
+    finish(start_check(room, folder, '--out', str(folder)))
+    return folder
 
+
+def finish(check: subprocess.Popen[str]) -> None:
+    _, errors = check.communicate(timeout=240)
+    assert check.returncode == 0, errors
+
+
+def assert_same_maps(one: Path, other: Path) -> None:
+    for name in NAMES:
+        for file in SAME:
+            assert digest_of(one / name / file) == digest_of(other / name / file), (name, file)
+
+
+@pytest.mark.slow
+def test_two_processes_make_the_maps_of_one(room, alone, tmp_path):
+    finish(start_check(room, tmp_path, '--out', str(tmp_path / 'two'), '--jobs', '2'))
+    assert_same_maps(alone, tmp_path / 'two')
+
+
+@pytest.mark.slow
+def test_a_killed_worker_changes_nothing(room, alone, tmp_path):
     # Without nannies nobody starts the killed worker again: the other one must do its recording.
     with distributed.LocalCluster(
-        n_workers=0, dashboard_address=None, silence_logs='CRITICAL'
+        n_workers=0, dashboard_address='127.0.0.1:0', silence_logs='CRITICAL'
     ) as cluster:
         worker = [sys.executable, '-m', 'distributed.cli.dask_worker', cluster.scheduler_address,
                   '--nthreads', '1', '--no-nanny', '--no-dashboard']  # fmt: skip
@@ -63,16 +84,12 @@ def test_a_killed_worker_changes_nothing(room, tmp_path):
                 time.sleep(0.05)
             assert checked.poll() is None
             workers[0].kill()
-            _, errors = checked.communicate(timeout=240)
+            finish(checked)
         finally:
             for process in workers:
                 process.kill()
                 process.wait()
-    assert checked.returncode == 0, errors
-    for name in NAMES:
-        for file in SAME:
-            here, there = (tmp_path / where / name / file for where in ('alone', 'two'))
-            assert digest_of(here) == digest_of(there), (name, file)
+    assert_same_maps(alone, tmp_path / 'two')
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(room, tmp_path):
