@@ -152,6 +152,15 @@ class LockstepRun:
             )
         return f'{name}: none of {self._frames} frames could be tracked, so there is no map'
 
+    def _sensors_used(self) -> dict[str, int]:
+        """Return the messages used of each sensor besides the stereo images."""
+        told = self._pipeline.slam.sensors.messages
+        return {
+            sensor.name: told.get(sensor.name, self._frames)
+            for sensor in self._source.sensors
+            if sensor.used
+        }
+
     def _summary(self, wall_s: float) -> RunSummary:
         tracked = np.array([result.tracked for result in self._results], bool)
         mount = self._pipeline.mount
@@ -169,7 +178,7 @@ class LockstepRun:
             camera_height_m=round(mount.height_m, 4),
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
-            sensors={name: n for name, n in self._pipeline.slam.sensors.messages.items() if n},
+            sensors=self._sensors_used(),
             stages=self._pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )

@@ -34,21 +34,26 @@ def read_kitti_calibration(
 
     The file does not tell the image size. Geiger et al., Vision meets Robotics, IJRR 2013.
     """
+    return StereoCalibration(*(read_kitti_eye(path, width, height, camera) for camera in cameras))
+
+
+def read_kitti_eye(path: Path, width: int, height: int, camera: int) -> EyeCalibration:
+    """Read the projection of one camera of a KITTI odometry `calib.txt`."""
     rows = {}
     for line in _read_text(path).splitlines():
         name, colon, numbers = line.partition(':')
         if colon:
             rows[name.strip()] = numbers.split()
-    eyes = []
-    for camera in cameras:
-        name = f'P{camera}'
-        if name not in rows:
-            raise CalibrationError(
-                f'{path}: no line {name}: with the projection of camera {camera}'
-            )
-        P = _numbers(rows[name], 12, f'{path}, {name}').reshape(3, 4)
-        eyes.append(EyeCalibration.of_rectified(width, height, P, f'{path}, {name}'))
-    return StereoCalibration(*eyes)
+    name = f'P{camera}'
+    if name not in rows:
+        raise CalibrationError(f'{path}: no line {name}: with the projection of camera {camera}')
+    P = _numbers(rows[name], 12, f'{path}, {name}').reshape(3, 4)
+    return EyeCalibration.of_rectified(width, height, P, f'{path}, {name}')
+
+
+def read_eye_calibration(path: Path) -> EyeCalibration:
+    """Read one ROS camera calibration file. Raises CalibrationError."""
+    return _ros_eye(_read_yaml(path), str(path))
 
 
 def read_body_pose(path: Path) -> Array:

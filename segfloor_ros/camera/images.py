@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +32,9 @@ CHANNELS = {
     **{f'bayer_{pattern}{bits}': 1 for pattern in BAYER_CODES for bits in (8, 16)},
 }  # fmt: skip
 """Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
+
+
+DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
 
 class CorruptImageError(InputError):
@@ -74,6 +78,40 @@ def decode_raw(
     if channels is None:
         raise InputError(f'image encoding {encoding} is not supported; known are mono8, rgb8, …')
     dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
+    pixels = _unpacked(data, (width, height, channels), dtype, encoding, step, is_bigendian)
+    return _grey_of(pixels, encoding)
+
+
+def decode_depth(
+    data: bytes | NDArray[np.uint8],
+    *,
+    width: int,
+    height: int,
+    encoding: str,
+    step: int,
+    is_bigendian: bool = False,
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return the depth image (H, W) of the raw pixels of a ROS `Image` (REP-118): uint16 in mm or
+    float32 in metres. Raises as `decode_raw`.
+    """
+    if encoding not in DEPTH_TYPES:
+        raise InputError(
+            f'encoding {encoding} is no depth; depth images are 16UC1 (mm) or 32FC1 (m)'
+        )
+    dtype = np.dtype(DEPTH_TYPES[encoding])
+    return _unpacked(data, (width, height, 1), dtype, encoding, step, is_bigendian)[:, :, 0]
+
+
+def _unpacked(
+    data: bytes | NDArray[np.uint8],
+    size: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    encoding: str,
+    step: int,
+    is_bigendian: bool,
+) -> NDArray[Any]:
+    """Return the pixels (H, W, channels) of a message. size: width, height, channels."""
+    width, height, channels = size
     row_bytes = width * channels * dtype.itemsize
     buffer = np.frombuffer(data, np.uint8)
     if width <= 0 or height <= 0 or step < row_bytes or buffer.size != step * height:
@@ -83,7 +121,7 @@ def decode_raw(
         )
     rows = np.ascontiguousarray(buffer.reshape(height, step)[:, :row_bytes])
     pixels = rows.view(dtype.newbyteorder('>' if is_bigendian else '<')).astype(dtype, copy=False)
-    return _grey_of(pixels.reshape(height, width, channels), encoding)
+    return np.asarray(pixels.reshape(height, width, channels))
 
 
 def to_grey(image: Grey) -> Grey:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,12 +125,13 @@ class Mount:
 @dataclass(frozen=True)
 class StereoFrame:
     """One rectified grey stereo pair: images (H, W) uint8, the frame's number in its recording,
-    its stamp in ns. excluded: mask (H, W) uint8 of the left image, 255 where something moves, as
+    its stamp in ns. right: of a depth camera, in its place, the disparity (H, W) float32 (see
+    `depth`). excluded: mask (H, W) uint8 of the left image, 255 where something moves, as
     far as a segmentation network told.
     """
 
     index: int
     stamp_ns: int
     left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    right: NDArray[Any]
     excluded: NDArray[np.uint8] | None = None

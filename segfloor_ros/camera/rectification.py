@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.deblocking import deblocked
+from segfloor_ros.camera.depth import is_disparity
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
@@ -25,16 +28,25 @@ class StereoRectifier:
             self._maps = rectification_maps(calibration.left), rectification_maps(calibration.right)
 
     def rectify(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return the rectified grey images (H, W) of a raw grey pair (H, W), uint8.
+        self, left: NDArray[np.uint8], right: NDArray[Any]
+    ) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+        """Return the rectified grey images (H, W) of a raw grey pair (H, W), uint8. A disparity in
+        place of the right image is aligned with the left one.
 
         The block grid of compressed images is smoothed. Pixels that lie outside of the raw image
         are 0. Raises CalibrationError when the size is not the calibration's.
         """
         for side, image in (('the left image', left), ('the right image', right)):
             self.calibration.check_size(image.shape[1], image.shape[0], side)
-        left, right = deblocked(left), deblocked(right)
+        left = deblocked(left)
+        if is_disparity(right):
+            if self._maps is None:
+                return left, right
+            nearest = cv2.remap(
+                right, *self._maps[0], cv2.INTER_NEAREST, borderValue=(float('nan'),)
+            )
+            return cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR), nearest
+        right = deblocked(right)
         if self._maps is None:
             return left, right
         return (

@@ -48,6 +48,11 @@ class StereoCameraSettings(StageSettings):
     wheel_odometry_topic: str = setting(
         '', 'Wheel odometry topic in a bag; empty: found by its type.'
     )
+    depth: bool = setting(
+        False,
+        'Take depth images in place of the right ones; without right images it is done anyway.',
+    )
+    depth_topic: str = setting('', 'Depth image topic in a bag; empty: found by its name.')
     imu_topic: str = setting('', 'IMU topic in a bag; empty: found by its type.')
     ignore: str = setting(
         '', 'Sensors of the recording to leave out, with commas: wheel_odometry, imu.'

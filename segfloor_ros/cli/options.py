@@ -31,6 +31,9 @@ IgnoreOption = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option('--ignore', help='Sensors to leave out, with commas: wheel_odometry, imu.'),
 ]
+DepthOption = Annotated[
+    bool, typer.Option('--depth', help='Take depth images in place of the right ones.')
+]
 ReportOption = Annotated[
     bool,
     typer.Option('--report', help='Write report.html: everything about the run on one page.'),
@@ -38,8 +41,8 @@ ReportOption = Annotated[
 
 
 def recording_settings(
-    input: str, masks: Path | None = None, ignore: str | None = None
+    input: str, masks: Path | None = None, ignore: str | None = None, depth: bool = False
 ) -> dict[str, Any]:
     """Return the settings of `stereo_camera` that options of a command stand for."""
-    given = {'masks': masks and str(masks), 'ignore': ignore}
+    given = {'masks': masks and str(masks), 'ignore': ignore, 'depth': depth or None}
     return {'input': input} | {name: value for name, value in given.items() if value is not None}

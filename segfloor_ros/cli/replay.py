@@ -10,6 +10,7 @@ from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
+    DepthOption,
     IgnoreOption,
     InputArgument,
     MasksOption,
@@ -46,6 +47,7 @@ def replay(
     params: ParamsOption = None,
     assignments: SetOption = None,
     ignore: IgnoreOption = None,
+    depth: DepthOption = False,
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
@@ -66,7 +68,7 @@ def replay(
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
     configuration = resolve(
-        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore)
+        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore, depth)
     )
     # The camera node reads the recording; here it is opened so that bad input ends at once.
     source = open_source(configuration.stereo_camera)

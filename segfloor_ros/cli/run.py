@@ -9,6 +9,7 @@ from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.options import (
+    DepthOption,
     IgnoreOption,
     InputArgument,
     MasksOption,
@@ -30,6 +31,7 @@ def run(
     params: ParamsOption = None,
     assignments: SetOption = None,
     ignore: IgnoreOption = None,
+    depth: DepthOption = False,
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save.')
     ] = SaveMasks.keyframes,
@@ -45,7 +47,7 @@ def run(
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
     configuration = resolve(
-        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore)
+        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore, depth)
     )
     source = open_source(configuration.stereo_camera)
     print_sensors(source.sensors)

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import is_disparity, seen_from_right
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 
@@ -58,6 +60,17 @@ def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray
         return right
     adapted = right.astype(np.float32) * np.float32(gain) + np.float32(offset)
     return np.clip(np.rint(adapted), 0, 255).astype(np.uint8)
+
+
+def stereo_view(
+    left: NDArray[np.uint8], right: NDArray[Any]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
+    """Return the right image (H, W), as bright as the left one, and None; of a depth camera, which
+    has a disparity in its place, what a right camera would see, and the disparity, 0 for holes.
+    """
+    if not is_disparity(right):
+        return equal_exposure(left, right), None
+    return seen_from_right(left, right), np.nan_to_num(right, nan=0.0)
 
 
 class DisparityMatcher:

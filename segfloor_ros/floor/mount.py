@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, equal_exposure
+from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, stereo_view
 from segfloor_ros.floor.mirror import (
     MIRRORED_SHARE,
     MirrorView,
@@ -192,7 +192,8 @@ class MountEstimator:
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
     ) -> MirrorView:
         camera = self._camera
-        disparity = self._matcher.compute(left, equal_exposure(left, right))
+        right, measured = stereo_view(left, right)
+        disparity = self._matcher.compute(left, right) if measured is None else measured
         smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
         gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
         texture = cv2.blur(gradient, (9, 9))
@@ -201,11 +202,15 @@ class MountEstimator:
         rows, columns = (step // 2 + step * index for index in np.nonzero(grid >= 1))
         rays = camera.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
         grey = texture[rows, columns].astype(np.float64)
+        weight = grey**4 / (grey**4 + _TEXTURE_GREY**4)
+        if measured is not None:
+            # A depth camera needs no texture.
+            weight = np.ones(len(rows))
         samples = Samples(
             rays=rays @ T_world_left[:3, :3].T,
             position_m=T_world_left[:3, 3].astype(np.float64),
             disparity_px=disparity[rows, columns].astype(np.float64),
-            weight=grey**4 / (grey**4 + _TEXTURE_GREY**4),
+            weight=weight,
             disparity_m=camera.disparity_times_depth,
         )
         return MirrorView.of(camera, left, disparity, samples, T_world_left)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import DisparityMatcher
 from segfloor_ros.floor.settings import FloorSegmentationSettings
@@ -54,12 +55,14 @@ class OverheadMatcher:
         horizon_row: int,
         min_texture_grey: float,
         moving: NDArray[np.uint8] | None = None,
+        measured: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         """Return where in the base's x-y plane something is in the way, (2, N), by the rows above
         `horizon_row` of a rectified pair (H, W); every fourth pixel at most tells.
 
         mount: of this frame. min_texture_grey: what a disparity needs to mean something. moving:
-        mask (H, W), 255 where what stands there moves and does not count.
+        mask (H, W), 255 where what stands there moves and does not count. measured: disparity
+        (H, W) of a depth camera.
         """
         camera = self._camera
         reach = (self._settings.robot_height_m - mount.height_m) / _NEAREST_M * camera.fy
@@ -72,10 +75,14 @@ class OverheadMatcher:
             cv2.resize(image[first:last], size, interpolation=cv2.INTER_AREA)
             for image in (left, right)
         ]
-        disparity = self._matcher.compute(halves[0], halves[1])
-        # A slope along the row gets steeper as the image gets smaller.
-        textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
-        telling = (disparity > 0) & textured & ~_fringes(disparity)
+        if measured is None:
+            disparity = self._matcher.compute(halves[0], halves[1])
+            # A slope along the row gets steeper as the image gets smaller.
+            textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
+            telling = (disparity > 0) & textured & ~_fringes(disparity)
+        else:
+            disparity = shrunk(measured[first:last], size)
+            telling = disparity > 0
         if moving is not None:
             telling &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
         rows, columns = np.nonzero(telling)

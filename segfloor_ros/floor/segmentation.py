@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, equal_exposure
+from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, stereo_view
 from segfloor_ros.floor.filling import (
     beside_something,
     beyond_texture,
@@ -45,6 +46,7 @@ DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _ROWS_ABOVE_HORIZON = 16
 """The matcher's paths get a run-up, and the horizon some play."""
 _TEXTURE_WINDOW_PX = 11
+_PLAIN_TO_SEE = 100.0
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
 _PLANE_SAMPLES = 4000
@@ -86,12 +88,13 @@ class FloorSegmentation:
     def process(
         self,
         left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        right: NDArray[Any],
         mount: Mount,
         T_map_base: Array | None = None,
         moving: NDArray[np.uint8] | None = None,
     ) -> FloorObservation:
-        """Return the floor of a rectified grey pair (H, W) uint8.
+        """Return the floor of a rectified grey pair (H, W) uint8; of a depth camera, right is its
+        disparity (H, W) float32.
 
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
         the map, where known; with it the floor found by earlier keyframes helps. moving: mask
@@ -104,13 +107,18 @@ class FloorSegmentation:
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
-            right = equal_exposure(left, right)
+            right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
             enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
             texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
+            if measured is not None:
+                # Depth is measured on plain surfaces, too.
+                texture = np.full_like(texture, _PLAIN_TO_SEE * enough)
         with measure(DISPARITY):
-            disparity = self._disparity(first_row, left, right)
+            disparity = measured
+            if disparity is None:
+                disparity = self._disparity(first_row, left, right)
             if moving is not None:
                 disparity[moving > 0] = 0
         below, textured = disparity[columns], texture > enough
@@ -135,7 +143,7 @@ class FloorSegmentation:
                 mask[moving[columns] > 0] = NO_EVIDENCE
         with measure(DISPARITY_ABOVE):
             overhead_xy = self._overhead.positions(
-                left, right, view.mount, first_row, enough, moving
+                left, right, view.mount, first_row, enough, moving, measured
             )
         with measure('scan'):
             scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)

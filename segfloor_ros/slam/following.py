@@ -78,9 +78,7 @@ class Follower:
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, sparse_map, seen.ids, pose)]
-        measure_disparity(
-            images.left, images.right, observations, rows, seen.uvd_px[rows, 2] + offset_px
-        )
+        measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
         if len(rows) < MIN_TRACKED:
             return None
         ids = seen.ids[rows]

@@ -72,11 +72,13 @@ class LocalMapper:
         right image.
         """
         missing = np.flatnonzero(np.isnan(observations.uvd_px[:, 2]))
-        guess = guess_disparity(frame.left, frame.right, observations.uvd_px[missing, :2])
+        uv_px = observations.uvd_px[missing, :2]
+        guess: Array = np.zeros(len(missing))
+        if not images.depth_scale:
+            guess = guess_disparity(frame.left, frame.right, uv_px)
         found = np.isfinite(guess)
         measure_disparity(
-            images.left,
-            images.right,
+            images,
             observations,
             missing[found],
             guess[found],

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.excluded import Region
@@ -86,8 +88,10 @@ class MovingRegions:
         )  # fmt: skip
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
 
-    def measure(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Disparity:
+    def measure(self, left: NDArray[np.uint8], right: NDArray[Any]) -> Disparity:
         """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
+        if is_disparity(right):
+            return shrunk(right.astype(np.float32, copy=False), self._size)
         small = (cv2.resize(i, self._size, interpolation=cv2.INTER_AREA) for i in (left, right))
         # Without a margin the matcher leaves the leftmost columns empty.
         wide = (cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for i in small)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import disparity_at
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.disparity_refinement import refine_disparity
+from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.patch_alignment import align_patches
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -39,18 +41,19 @@ def align_pixels(
 
 
 def measure_disparity(
-    left: NDArray[np.float32],
-    right: NDArray[np.float32],
+    images: Images,
     observations: Observations,
     rows: NDArray[np.intp],
     guess_px: Array,
     reach_px: int = 0,
 ) -> None:
     """Set, in place, the disparities of observations `rows` (N,) near a guess (N,); NaN where
-    there is none within the reach.
+    there is none within the reach. A depth camera needs no guess.
     """
-    disparity, sigma = refine_disparity(
-        left, right, observations.uvd_px[rows, :2], guess_px, reach_px
-    )
+    uv_px = observations.uvd_px[rows, :2]
+    if images.depth_scale:
+        disparity, sigma = disparity_at(images.right, images.depth_scale, uv_px)
+    else:
+        disparity, sigma = refine_disparity(images.left, images.right, uv_px, guess_px, reach_px)
     observations.uvd_px[rows, 2] = disparity
     observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)

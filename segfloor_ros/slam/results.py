@@ -5,6 +5,7 @@ keyframe.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ class Keyframe:
     frame_index: int
     T_map_base: Array
     left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    right: NDArray[Any]
     features: KeyframeFeatures
     path: KeyframePath
     cloud: SparseCloud

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.measurements import Measurement
@@ -114,7 +115,7 @@ class StereoSlam:
             self._take_adjustment(wait=False)
             self._body.T_base_left = self.mount.T_base_left if self.mount else None
             fault = self._fault(frame)
-            images = Images.of(frame, self._settings.mask_dilation_px)
+            images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = self._track(frame, images) if self.map.keyframes and not fault else None
             if track is None and self.map.keyframes:
                 self._bridge(frame, fault)
@@ -131,7 +132,7 @@ class StereoSlam:
     def _fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
         frozen = self._frozen.frozen(frame.left, lambda: self._expected_shift(frame.stamp_ns))
-        fault = image_fault(frame.left, frame.right)
+        fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
             return 'the image is the one before although the camera was moving'
         return fault

@@ -110,7 +110,7 @@ class Tracker:
         ids = seen.ids[points]
         align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
         guess_px = seen.uvd_px[points, 2] + offset_px
-        measure_disparity(images.left, images.right, observations, rows, guess_px)
+        measure_disparity(images, observations, rows, guess_px)
         estimate = refine_pose(
             self._camera,
             T_camera_world,

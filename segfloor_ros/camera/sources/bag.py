@@ -7,14 +7,30 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed, decode_raw
+from segfloor_ros.camera.calibration_files import read_eye_calibration
+from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
+from segfloor_ros.camera.images import (
+    CorruptImageError,
+    Grey,
+    decode_compressed,
+    decode_depth,
+    decode_raw,
+)
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
 from segfloor_ros.camera.sources.bag_sensors import bag_sensors, stamp_ns
-from segfloor_ros.camera.sources.bag_topics import StereoTopics, find_topics
+from segfloor_ros.camera.sources.bag_topics import (
+    StereoTopics,
+    find_depth_topics,
+    find_topics,
+    has_pair,
+)
 from segfloor_ros.camera.sources.found_calibration import given_calibration
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
+from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
 from segfloor_ros.camera.sources.stamps import rate_of
 from segfloor_ros.errors import CalibrationError, InputError
@@ -31,16 +47,24 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> BagSource:
         types = {name: topic.msgtype for name, topic in bag.topics.items() if topic.num_messages}
         if not types:
             raise InputError(f'{path}: the bag is empty; record the image topics again')
-        topics = find_topics(
-            str(path), types, settings.left_image_topic, settings.right_image_topic
-        )
+        depth = find_depth_topics(str(path), types, settings)
+        if depth is not None and (settings.depth or not has_pair(types, settings)):
+            topics = depth
+            calibration = depth_calibration(_left_eye(path, bag, topics, settings))
+        else:
+            topics = find_topics(
+                str(path), types, settings.left_image_topic, settings.right_image_topic
+            )
+            calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
-        calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
         first = islice(bag.messages([topics.left]), STAMPS_FOR_RATE)
         rate_hz = rate_of(sorted(stamp_ns(message) for _, message in first))
         if topics.is_rectified:
             calibration = calibration.rectified()
         sensors = bag_sensors(path, bag, topics.left, calibration.left.R, settings)
+        if depth is not None:
+            messages = bag.topics[depth.right].num_messages
+            sensors.append(RecordedSensor(DEPTH, depth.right, messages, topics is depth))
     return BagSource(path, topics, calibration, count, rate_hz, settings, sensors)
 
 
@@ -76,7 +100,7 @@ class BagSource(StereoSource):
         )
         with open_bag_file(self._path) as bag:
             for index, (left, right) in enumerate(self._pairs(bag, pairing)):
-                yield PairEntry(index, left.stamp_ns, _loader(self._topics, left, right))
+                yield PairEntry(index, left.stamp_ns, self._loader(left.item, right.item))
         self.skipped_frames += max(pairing.duplicates)
         pairing.report()
 
@@ -88,17 +112,22 @@ class BagSource(StereoSource):
             yield from pairing.add(sides[topic], stamp_ns(message), message)
         yield from pairing.finish()
 
+    def _loader(self, left: Any, right: Any) -> Callable[[], tuple[Grey, NDArray[Any]]]:
+        topics = self._topics
+        if topics.right_is_depth:
+            return lambda: (
+                _decode(topics.left, left),
+                disparity_of_depth(_decode(topics.right, right, decode_depth), self.camera),
+            )
+        return lambda: (_decode(topics.left, left), _decode(topics.right, right))
 
-def _loader(
-    topics: StereoTopics, left: Stamped[Any], right: Stamped[Any]
-) -> Callable[[], tuple[Grey, Grey]]:
-    return lambda: (_decode(topics.left, left.item), _decode(topics.right, right.item))
 
-
-def _decode(topic: str, message: Any) -> Grey:
+def _decode(
+    topic: str, message: Any, decode: Callable[..., NDArray[Any]] = decode_raw
+) -> NDArray[Any]:
     try:
         if hasattr(message, 'encoding'):
-            return decode_raw(
+            return decode(
                 message.data,
                 width=message.width,
                 height=message.height,
@@ -122,6 +151,19 @@ def _read_calibration(path: Path, bag: BagFile, topics: StereoTopics) -> StereoC
             )
     eyes = [_eye(path, bag, topic) for topic in (topics.left_info, topics.right_info)]
     return StereoCalibration(*eyes)
+
+
+def _left_eye(
+    path: Path, bag: BagFile, topics: StereoTopics, settings: StereoCameraSettings
+) -> EyeCalibration:
+    if settings.left_calibration:
+        return read_eye_calibration(Path(settings.left_calibration))
+    if not topics.left_info:
+        raise CalibrationError(
+            f'{path}: no CameraInfo beside {topics.left}; record it too, or give '
+            'stereo_camera.left_calibration'
+        )
+    return _eye(path, bag, topics.left_info)
 
 
 def _eye(path: Path, bag: BagFile, topic: str) -> EyeCalibration:

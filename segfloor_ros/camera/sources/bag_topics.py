@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os.path import commonpath
 
-from segfloor_ros.camera.sources.sides import SIDES, side_pairs
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.sides import SIDES, is_side, side_pairs
 from segfloor_ros.errors import InputError
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -24,23 +25,31 @@ IMAGE_NAMES = (
 )
 """Usual last words of an image topic, the best first: rectified before raw, grey before colour."""
 
+COLOUR = ('color', 'colour', 'rgb')
+REGISTERED = ('color', 'registered', 'rgb')
+"""Words in the names of depth topics that are aligned with the colour images."""
+
 NO_PICTURES = ('depth', 'disparity', 'mask', 'keyframe', 'theora')
 """Words in the names of image topics that are no pictures, or not all of them."""
 
 
 @dataclass(frozen=True)
 class StereoTopics:
-    """The image topics of both sides, and their CameraInfo topics, '' where there is none."""
+    """The image topics of both sides, and their CameraInfo topics, '' where there is none. The
+    right one may be that of the depth images that belong to the left.
+    """
 
     left: str
     right: str
     left_info: str
     right_info: str
+    right_is_depth: bool = False
 
     @property
     def is_rectified(self) -> bool:
         """Whether the names say that the images are rectified."""
-        return all('image_rect' in topic for topic in (self.left, self.right))
+        images = (self.left,) if self.right_is_depth else (self.left, self.right)
+        return all('image_rect' in topic for topic in images)
 
 
 def find_topics(name: str, types: Mapping[str, str], left: str, right: str) -> StereoTopics:
@@ -64,11 +73,53 @@ def find_topics(name: str, types: Mapping[str, str], left: str, right: str) -> S
         if not pictures:
             raise InputError(
                 f'{name}: no pair of left and right image topics (its image topics: {listed}); '
-                'set stereo_camera.left_image_topic and right_image_topic'
+                'set stereo_camera.left_image_topic and right_image_topic; one camera alone does '
+                'not tell how far away anything is'
             )
         left, right = min(pictures, key=_preference)
     infos = sorted(topic for topic, kind in types.items() if kind == CAMERA_INFO)
     return StereoTopics(left, right, _info_topic(left, infos, 0), _info_topic(right, infos, 1))
+
+
+def has_pair(types: Mapping[str, str], settings: StereoCameraSettings) -> bool:
+    """Whether a bag holds a pair of left and right images."""
+    try:
+        find_topics('', types, settings.left_image_topic, settings.right_image_topic)
+    except InputError:
+        return False
+    return True
+
+
+def find_depth_topics(
+    name: str, types: Mapping[str, str], settings: StereoCameraSettings
+) -> StereoTopics | None:
+    """Return the depth topic of a bag with that of the images it is aligned with: the colour
+    camera's where its name says so or there is no left one. None where there is none.
+    """
+    images = sorted(t for t, kind in types.items() if kind in (IMAGE, COMPRESSED))
+    depth = [t for t in images if types[t] == IMAGE and 'depth' in t.lower()]
+    if settings.depth_topic:
+        if settings.depth_topic not in depth:
+            listed = ', '.join(depth) or 'none'
+            raise InputError(
+                f'{name}: no depth images on {settings.depth_topic}; set '
+                f'stereo_camera.depth_topic to one of these: {listed}'
+            )
+        depth = [settings.depth_topic]
+    pictures = [t for t in images if not any(word in t.lower() for word in NO_PICTURES)]
+    if not depth or not pictures:
+        return None
+    best = min(depth, key=lambda t: (not any(w in t for w in REGISTERED), len(t), t))
+    colour = [t for t in pictures if any(word in t.lower() for word in COLOUR)]
+    left = [t for t in pictures if is_side(t, 0) or 'infra1' in t]
+    wanted = colour if any(word in best.lower() for word in REGISTERED) else left or colour
+    picture = settings.left_image_topic or min(wanted or pictures, key=lambda t: _rank(t))
+    infos = sorted(topic for topic, kind in types.items() if kind == CAMERA_INFO)
+    return StereoTopics(picture, best, _info_topic(picture, infos, 0), '', right_is_depth=True)
+
+
+def _rank(topic: str) -> tuple[int, int, int, str]:
+    return _preference((topic, topic))
 
 
 def _preference(pair: tuple[str, str]) -> tuple[int, int, int, str]:

@@ -6,6 +6,9 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed
@@ -58,7 +61,10 @@ class FilePairSource(StereoSource):
                 self._skip(pair.index, f'its stamp {last_ns} ns was there before')
                 continue
             last_ns = pair.stamp_ns
-            yield PairEntry(pair.index, pair.stamp_ns, _loader(pair))
+            yield PairEntry(pair.index, pair.stamp_ns, self._loader(pair))
+
+    def _loader(self, pair: FilePair) -> Callable[[], tuple[Grey, NDArray[Any]]]:
+        return lambda: (read_grey(pair.left), read_grey(pair.right))
 
 
 def read_grey(path: Path) -> Grey:
@@ -107,7 +113,3 @@ def check_equal_numbers(name: str, left: Sequence[Path], right: Sequence[Path]) 
             f'{name}: {len(left)} left and {len(right)} right images; every left image needs its '
             'right one: complete the copy, or remove the images without partner'
         )
-
-
-def _loader(pair: FilePair) -> Callable[[], tuple[Grey, Grey]]:
-    return lambda: (read_grey(pair.left), read_grey(pair.right))

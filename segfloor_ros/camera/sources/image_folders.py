@@ -6,7 +6,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from segfloor_ros.camera.calibration_files import read_eye_calibration
 from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
 from segfloor_ros.camera.sources.files import (
     FilePair,
     FilePairSource,
@@ -31,6 +33,9 @@ def has_image_sides(folder: Path) -> bool:
 
 def open_image_folders(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
     """Open two image folders with their calibration. Raises InputError or CalibrationError."""
+    sides = _side_images(folder)
+    if settings.depth or (sides and not sides[1] and (folder / DEPTH).is_dir()):
+        return _open_depth(folder, sides[0] if sides else [], settings)
     left, right = find_image_pairs(folder)
     stamps = _stamps(folder, left, settings.rate_hz)
     pairs = [FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))]
@@ -38,6 +43,21 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> FilePair
     calibration = find_calibration(str(folder), places, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
     return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
+
+
+def _open_depth(
+    folder: Path, left: Sequence[Path], settings: StereoCameraSettings
+) -> FilePairSource:
+    if not left:
+        raise InputError(f'{folder}: expected an image folder left beside depth')
+    stamps = _stamps(folder, left, settings.rate_hz)
+    pairs = [
+        FilePair(i, stamp, path, path)
+        for i, (stamp, path) in enumerate(zip(stamps, left, strict=True))
+    ]
+    given = settings.left_calibration
+    eye = read_eye_calibration(Path(given) if given else folder / 'left.yaml')
+    return with_depth(folder, pairs, eye, settings)
 
 
 def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -52,6 +72,8 @@ def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:
             f'{folder}: expected image folders left and right, or images left01… and right01…'
         )
     left, right = sides
+    if not (left and right) and (left or right):
+        raise InputError(f'{folder}: {len(left)} left and {len(right)} right images; {MONO}')
     check_equal_numbers(str(folder), left, right)
     for one, other in zip(left, right, strict=True):
         if _numbers(one) and _numbers(other) and _numbers(one)[-1:] != _numbers(other)[-1:]:

@@ -8,8 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.calibration_files import read_kitti_calibration
+from segfloor_ros.camera.calibration_files import (
+    read_eye_calibration,
+    read_kitti_calibration,
+    read_kitti_eye,
+)
 from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
 from segfloor_ros.camera.sources.files import (
     FilePair,
     FilePairSource,
@@ -34,22 +39,42 @@ def is_kitti(folder: Path) -> bool:
 def open_kitti(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
     """Open a KITTI odometry folder. Raises InputError or CalibrationError."""
     cameras = _cameras(folder)
+    if settings.depth or cameras[1] is None:
+        return _open_depth(folder, cameras[0], settings)
     left, right = (images_in(folder / f'image_{camera}') for camera in cameras)
     check_equal_numbers(str(folder), left, right)
     indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
     pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
-    calibration = _calibration(folder, settings, left, cameras)
+    calibration = _calibration(folder, settings, left, (cameras[0], cameras[1]))
     sensors = folder_sensors(folder, settings.ignored_sensors)
     return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
-def _cameras(folder: Path) -> tuple[int, int]:
+def _open_depth(folder: Path, camera: int, settings: StereoCameraSettings) -> FilePairSource:
+    left = images_in(folder / f'image_{camera}')
+    indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
+    pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, left, strict=True)]
+    if settings.left_calibration:
+        eye = read_eye_calibration(Path(settings.left_calibration))
+    else:
+        eye = read_kitti_eye(folder / 'calib.txt', *first_image_size(left, str(folder)), camera)
+    return with_depth(folder, pairs, eye, settings)
+
+
+def _cameras(folder: Path) -> tuple[int, int | None]:
+    """Return the numbers of the left and the right camera; None for the latter where there are
+    depth images.
+    """
     for cameras in CAMERAS:
         if all((folder / f'image_{camera}').is_dir() for camera in cameras):
             return cameras
+    for camera, _ in CAMERAS:
+        if (folder / f'image_{camera}').is_dir() and (folder / DEPTH).is_dir():
+            return camera, None
     found = ', '.join(path.name for path in sorted(folder.glob('image_*')))
     raise InputError(
-        f'{folder}: has {found}, but a stereo pair is image_0 with image_1, or image_2 with image_3'
+        f'{folder}: has {found}, but a stereo pair is image_0 with image_1, or image_2 with '
+        f'image_3; {MONO}'
     )
 
 
@@ -75,7 +100,10 @@ def _indices_and_stamps(
 
 
 def _calibration(
-    folder: Path, settings: StereoCameraSettings, left: Sequence[Path], cameras: tuple[int, int]
+    folder: Path,
+    settings: StereoCameraSettings,
+    left: Sequence[Path],
+    cameras: tuple[int, int],
 ) -> StereoCalibration:
     given = given_calibration(settings)
     if given is not None:

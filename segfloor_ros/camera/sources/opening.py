@@ -7,6 +7,7 @@ from pathlib import Path
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag import open_bag
 from segfloor_ros.camera.sources.bag_file import is_bag
+from segfloor_ros.camera.sources.depth_images import DEPTH, is_tum_rgbd, open_tum_rgbd
 from segfloor_ros.camera.sources.euroc import is_euroc, open_euroc
 from segfloor_ros.camera.sources.image_folders import has_image_sides, open_image_folders
 from segfloor_ros.camera.sources.kitti import is_kitti, open_kitti
@@ -17,7 +18,8 @@ from segfloor_ros.errors import InputError
 
 KINDS = (
     'a KITTI odometry folder, an EuRoC folder, image folders left and right with left.yaml and '
-    'right.yaml, a ROS bag (.mcap, .db3, .bag), or a video or device with a calibration'
+    'right.yaml, a TUM RGB-D folder, a ROS bag (.mcap, .db3, .bag), or a video or device with a '
+    'calibration'
 )
 
 
@@ -41,6 +43,13 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
 
 
 def _open(settings: StereoCameraSettings) -> StereoSource:
+    source = _open_any(settings)
+    if settings.depth and not any(s.name == DEPTH and s.used for s in source.sensors):
+        raise InputError(f'{source.name}: no depth images can be read from it; leave out --depth')
+    return source
+
+
+def _open_any(settings: StereoCameraSettings) -> StereoSource:
     path = Path(settings.input).expanduser()
     if is_device(settings.input) and not path.is_dir():
         return open_device(settings.input, settings)
@@ -56,6 +65,8 @@ def _open(settings: StereoCameraSettings) -> StereoSource:
 
 
 def _open_folder(folder: Path, settings: StereoCameraSettings) -> StereoSource:
+    if is_tum_rgbd(folder):
+        return open_tum_rgbd(folder, settings)
     if is_kitti(folder):
         return open_kitti(folder, settings)
     if is_euroc(folder):

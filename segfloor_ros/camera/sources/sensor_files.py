@@ -13,7 +13,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import ImuSample, Measurement, RecordedSensor, WheelPose
 
-WHEEL_ODOMETRY, IMU = 'wheel_odometry', 'imu'
+WHEEL_ODOMETRY, IMU, DEPTH = 'wheel_odometry', 'imu', 'depth'
 WHEEL_FILE, IMU_FILE = 'wheel_odometry.txt', 'imu.csv'
 TUM_COLUMNS = 't x y z qx qy qz qw'
 IMU_COLUMNS = 'stamp in ns, angular velocity x y z in rad/s, acceleration x y z in m/s²'
@@ -24,18 +24,24 @@ ACCEL_RANGE_M_S2 = (7.0, 13.0)
 def folder_sensors(
     folder: Path, ignored: Collection[str], R_left_imu: Array | None = None, imu: Path | None = None
 ) -> list[RecordedSensor]:
-    """Return the sensors whose files lie in a folder. R_left_imu: (3, 3) turns what the file `imu`
-    holds into the rectified left optical frame. Raises InputError when a file that is used is bad.
+    """Return the sensors whose files lie in a folder; depth images count as not used.
+
+    R_left_imu: (3, 3) turns what the file `imu` holds into the rectified left optical frame. Raises
+    InputError when a file that is used is bad.
     """
     files: list[tuple[str, Path, Callable[[Path], Sequence[Measurement]]]] = [
         (WHEEL_ODOMETRY, folder / WHEEL_FILE, read_wheel_odometry),
         (IMU, imu or folder / IMU_FILE, lambda path: read_imu(path, R_left_imu)),
     ]
-    return [
+    found = [
         _sensor(name, path, read, name not in ignored)
         for name, path, read in files
         if path.exists()
     ]
+    depth = [*(folder / DEPTH).glob('*.png')]
+    if depth:
+        found.append(RecordedSensor(DEPTH, str(folder / DEPTH), len(depth), False))
+    return found
 
 
 def _sensor(

@@ -6,11 +6,13 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.rectification import StereoRectifier
@@ -34,18 +36,19 @@ class RawPair:
     index: int
     stamp_ns: int
     left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    right: NDArray[Any]
 
 
 @dataclass(frozen=True)
 class PairEntry:
     """A pair that has not been decoded yet. `load` returns both grey images; it raises
-    CorruptImageError where one of them is damaged.
+    CorruptImageError where one of them is damaged. A depth camera has a disparity for the right
+    one.
     """
 
     index: int
     stamp_ns: int
-    load: Callable[[], tuple[Grey, Grey]]
+    load: Callable[[], tuple[Grey, NDArray[Any]]]
 
 
 class StereoSource(ABC):
@@ -124,7 +127,11 @@ class StereoSource(ABC):
             for image in (left, right):
                 what = f'{self.name}: frame {entry.index}'
                 self.calibration.check_size(image.shape[1], image.shape[0], what)
-            yield RawPair(entry.index, entry.stamp_ns, *self._eight_bit(left, right))
+            if is_disparity(right):
+                left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
+            else:
+                left, right = self._eight_bit(left, right)
+            yield RawPair(entry.index, entry.stamp_ns, left, right)
 
     def _skip(self, index: int, reason: str) -> None:
         self.skipped_frames += 1

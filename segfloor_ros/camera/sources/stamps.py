@@ -12,14 +12,15 @@ from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ
 from segfloor_ros.errors import InputError
 
 
-def read_times(path: Path) -> list[int]:
-    """Return the stamps in ns of a file with one time in seconds per line.
+def read_times(path: Path, comments: str = '') -> list[int]:
+    """Return the stamps in ns of a file with one time in seconds per line; lines that begin with
+    `comments`, if given, are passed over.
 
     Raises InputError naming the line where one is no number or earlier than the one before.
     """
     stamps: list[int] = []
     for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
-        if not line.strip():
+        if not line.strip() or (comments and line.lstrip().startswith(comments)):
             continue
         try:
             stamp_ns = int(Decimal(line.split()[0]).scaleb(9).to_integral_value())
