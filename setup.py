@@ -45,6 +45,7 @@ setup(
     package_data={
         f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
+        f'{PACKAGE}.slam': ['vocabulary.npy'],
     },
     data_files=data_files,
     python_requires='>=3.10',

@@ -90,14 +90,27 @@ def se3_log(T: Array) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """Return the matrix (6, 6) that carries twists (rho, phi): T exp(twist) = exp(adjoint twist) T
-    (Barfoot 2017, eq. 7.49).
+    """Return the matrices (..., 6, 6) that carry twists (rho, phi) through transforms (..., 4, 4):
+    T exp(twist) = exp(adjoint twist) T (Barfoot 2017, eq. 7.49).
     """
-    R, t = T[:3, :3], T[:3, 3]
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = matrix[3:, 3:] = R
-    matrix[:3, 3:] = skew(t) @ R
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    matrix = np.zeros((*T.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = R
+    matrix[..., :3, 3:] = skew(t) @ R
     return matrix
+
+
+def se3_logs(T: Array) -> Array:
+    """Return the twists (N, 6) of transforms (N, 4, 4), as `se3_log` of each."""
+    phi = Rotation.from_matrix(T[:, :3, :3].copy()).as_rotvec()
+    theta = np.linalg.norm(phi, axis=1)
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
+    factor = np.where(small, 1 / 12, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
+    K = skew(phi)
+    inverse_left_jacobian = np.eye(3) - 0.5 * K + factor[:, None, None] * (K @ K)
+    rho = np.einsum('nij,nj->ni', inverse_left_jacobian, T[:, :3, 3])
+    return np.concatenate([rho, phi], axis=1)
 
 
 def quaternion_xyzw(R: Array) -> Array:

@@ -19,7 +19,13 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.resident_memory import MemoryLog
-from segfloor_ros.results_folder import OutputFolder, RunResult, RunSummary, lost_intervals
+from segfloor_ros.results_folder import (
+    OutputFolder,
+    RunResult,
+    RunSummary,
+    lost_intervals,
+    relocalisations,
+)
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
 
@@ -171,7 +177,8 @@ class LockstepRun:
             skipped_frames=self._source.skipped_frames,
             lost_intervals=lost_intervals([r.index for r in self._results], tracked),
             keyframes=len(self._pipeline.slam.map.keyframes),
-            loops=0,
+            loops=self._pipeline.slam.loop_count,
+            relocalisations=relocalisations([r.stamp_ns for r in self._results], tracked),
             map_updates=self._pipeline.keyframe_stages.map_updates,
             wall_s=round(wall_s, 3),
             frames_per_s=round(self._frames / wall_s, 2),

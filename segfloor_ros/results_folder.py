@@ -48,9 +48,10 @@ OUTPUT_NAMES = (
 class RunSummary:
     """The figures of a run, as written to summary.json.
 
-    lost_intervals: first and last frame number of every stretch without a pose. sensors: messages
-    used, by name. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and
-    slope_per_update in MB, and samples over the updates.
+    lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
+    the times in seconds at which tracking was lost and found again, lost_s and found_s. sensors:
+    messages used, by name. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
+    peak and slope_per_update in MB, and samples over the updates.
     """
 
     frames: int
@@ -59,6 +60,7 @@ class RunSummary:
     lost_intervals: list[tuple[int, int]]
     keyframes: int
     loops: int
+    relocalisations: list[dict[str, float]]
     map_updates: int
     wall_s: float
     frames_per_s: float
@@ -95,6 +97,18 @@ def lost_intervals(
         (int(frame_indices[start]), int(frame_indices[end - 1]))
         for start, end in zip(edges[::2], edges[1::2], strict=True)
     ]
+
+
+def relocalisations(stamp_ns: Sequence[int], tracked: NDArray[np.bool_]) -> list[dict[str, float]]:
+    """Return when tracking was lost (the first stamp without a pose) and found again, for every
+    stretch without a pose that ended; both inputs are (N,).
+    """
+    times = []
+    for start, end in lost_intervals(range(len(stamp_ns)), tracked):
+        if start > 0 and end + 1 < len(stamp_ns):
+            lost_s, found_s = (round(1e-9 * stamp_ns[at], 6) for at in (start, end + 1))
+            times.append({'lost_s': lost_s, 'found_s': found_s})
+    return times
 
 
 class OutputFolder:

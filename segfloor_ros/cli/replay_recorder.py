@@ -71,6 +71,12 @@ class ReplayRecorder(Node):
         """Stamps of the keyframes that SLAM has published."""
         return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get('keyframe') == '1'}
 
+    @property
+    def loops(self) -> int:
+        """How many loops SLAM has closed."""
+        last = self.answers.get(max(self.answers, default=0))
+        return int(last.values.get('loops', 0)) if last is not None else 0
+
     def unanswered(self) -> set[int]:
         """Return the stamps of frames that SLAM has not answered."""
         return self.frame_index.keys() - self.answers.keys()

@@ -27,7 +27,7 @@ from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
-from segfloor_ros.results_folder import RunResult, RunSummary, lost_intervals
+from segfloor_ros.results_folder import RunResult, RunSummary, lost_intervals, relocalisations
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 
 DISCOVERY_S = 30.0
@@ -175,7 +175,8 @@ class ReplaySession:
             skipped_frames=int(finished.values['skipped']) if finished is not None else 0,
             lost_intervals=lost_intervals([recorder.frame_index[s] for s in stamps], tracked),
             keyframes=len(path.stamp_ns),
-            loops=0,
+            loops=recorder.loops,
+            relocalisations=relocalisations(stamps, tracked),
             map_updates=len(recorder.updated),
             wall_s=round(wall_s, 3),
             frames_per_s=round(len(stamps) / wall_s, 2),

@@ -202,6 +202,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             result.state,
             milliseconds,
             tracked=int(result.tracked),
+            loops=slam.loop_count,
             keyframe=int(result.keyframe is not None),
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,

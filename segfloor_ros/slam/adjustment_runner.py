@@ -1,11 +1,10 @@
-"""Runs local bundle adjustments: at once, or beside tracking on a thread of their own."""
+"""Runs what takes long, an adjustment or the closing of a loop, beside tracking or at once."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-
-from segfloor_ros.slam.bundle_adjustment import BundleResult
-from segfloor_ros.slam.mapping import Adjustment, LocalMapper
+from typing import Any
 
 
 class AdjustmentRunner:
@@ -15,33 +14,37 @@ class AdjustmentRunner:
     timing.
     """
 
-    def __init__(self, mapper: LocalMapper, background: bool) -> None:
-        self._mapper = mapper
+    def __init__(self, background: bool) -> None:
         self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
-        self._adjustment: Adjustment | None = None
-        self._result: Future[BundleResult] = Future()
+        self._apply: Callable[[Any], None] | None = None
+        self._result: Future[Any] = Future()
 
     @property
     def idle(self) -> bool:
         """Whether nothing is being solved now."""
-        return self._adjustment is None or self._result.done()
+        return self._apply is None or self._result.done()
 
-    def submit(self, adjustment: Adjustment) -> None:
-        """Begin an adjustment; the one before must have been collected."""
-        self._adjustment = adjustment
+    def submit(self, solve: Callable[[], Any], apply: Callable[[Any], None]) -> None:
+        """Begin an adjustment; the one before must have been collected. solve: works on a copy and
+        shares nothing with the map. apply: brings what it returns into the map.
+        """
+        self._apply = apply
         if self._worker is not None:
-            self._result = self._worker.submit(self._mapper.solve, adjustment)
+            self._result = self._worker.submit(solve)
         else:
             self._result = Future()
-            self._result.set_result(self._mapper.solve(adjustment))
+            self._result.set_result(solve())
 
-    def collect(self, wait: bool) -> tuple[Adjustment, BundleResult] | None:
-        """Return a finished adjustment, once, or None; with `wait` a running one is waited for."""
-        adjustment = self._adjustment
-        if adjustment is None or not (wait or self._result.done()):
+    def collect(self, wait: bool) -> Callable[[], None] | None:
+        """Return what applies a finished adjustment, once, or None; with `wait` a running one is
+        waited for.
+        """
+        apply = self._apply
+        if apply is None or not (wait or self._result.done()):
             return None
-        self._adjustment = None
-        return adjustment, self._result.result()
+        self._apply = None
+        result = self._result.result()
+        return lambda: apply(result)
 
     def close(self) -> None:
         """Wait for a running adjustment and end the thread."""

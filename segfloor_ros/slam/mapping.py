@@ -26,6 +26,9 @@ from segfloor_ros.slam.triangulation import triangulate_between
 DISPARITY_REACH_PX = 4
 MIN_DISPARITY_PX = 1.0
 MIN_SHARED_POINTS = 15
+MIN_LINK_SHARE = 0.1
+"""Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
+
 SETTLING_KEYFRAMES = 2
 MIN_FOUND_RATIO = 0.25
 
@@ -100,6 +103,18 @@ class LocalMapper:
                 keyframe, new.rows, other, new.other_rows, new.xyz_world, patches
             )
         fuse_duplicates(self._camera, sparse_map, keyframe)
+        keyframe.links = self._links(sparse_map, keyframe)
+
+    def _links(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> tuple[int, ...]:
+        """Return the earlier keyframes that share most points with a new one; the one before it
+        where none does.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        enough = max(MIN_SHARED_POINTS, MIN_LINK_SHARE * len(own))
+        near = order[(shared >= enough) & (order != keyframe.index)]
+        before = [keyframe.index - 1] if keyframe.index > 0 else []
+        return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
 
     def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
         """Return the covisible keyframes with which rays cross best: the farthest away of them, and

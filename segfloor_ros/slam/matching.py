@@ -29,8 +29,11 @@ def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return the Hamming distances (...,) of descriptors (..., 32), broadcast against each
     other.
     """
-    difference = np.bitwise_xor(a.view(np.uint16), b.view(np.uint16))
-    return _BITS16[difference].sum(axis=-1, dtype=np.int32)
+    if hasattr(np, 'bitwise_count'):  # NumPy 2
+        difference = np.bitwise_xor(a.view(np.uint64), b.view(np.uint64))
+        return np.asarray(np.bitwise_count(difference).sum(axis=-1, dtype=np.int32))
+    pairs = np.bitwise_xor(a.view(np.uint16), b.view(np.uint16))
+    return np.asarray(_BITS16[pairs].sum(axis=-1, dtype=np.int32))
 
 
 def match_predicted(

@@ -33,6 +33,15 @@ class Retirement:
     T_camera_reference: Array
 
 
+@dataclass(frozen=True)
+class LoopEdge:
+    """Where keyframe i was when it saw the place of keyframe j again: T_i_j (4, 4), of cameras."""
+
+    i: int
+    j: int
+    T_i_j: Array
+
+
 @dataclass
 class KeyframeRecord:
     """One keyframe of the map.
@@ -40,8 +49,8 @@ class KeyframeRecord:
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
-    patches: (N, SIDE_PX, SIDE_PX) grey levels around each feature. motion: since the keyframe
-    before, as the wheels tell it.
+    motion: since the keyframe before, as the wheels tell it. links: indices of earlier keyframes
+    that it shared many points with when it was made.
     """
 
     index: int
@@ -53,6 +62,7 @@ class KeyframeRecord:
     point_id: NDArray[np.int32]
     motion: RelativeMotion | None = None
     retired: Retirement | None = None
+    links: tuple[int, ...] = ()
 
     @property
     def T_world_camera(self) -> Array:
@@ -65,6 +75,7 @@ class SparseMap:
 
     def __init__(self) -> None:
         self.keyframes: list[KeyframeRecord] = []
+        self.loops: list[LoopEdge] = []
         self._retired: list[KeyframeRecord] = []
         self._xyz = GrowingArray((3,), np.float64)
         self._descriptor = GrowingArray((32,), np.uint8)
@@ -139,6 +150,14 @@ class SparseMap:
     def observer_count(self) -> NDArray[np.int32]:
         """Number of keyframes (P,) that observe each point."""
         return self._observer_count.rows
+
+    def links(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the pairs (M,), (M,) of keyframes, by index, that shared points when the later one
+        was made.
+        """
+        pairs = [(k.index, other) for k in self.keyframes for other in k.links]
+        i, j = np.array(pairs, np.intp).reshape(-1, 2).T
+        return i, j
 
     def living(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return point rows (N,) with `NO_POINT` in place of points that are gone."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
@@ -22,11 +22,15 @@ from segfloor_ros.slam.image_check import FrozenCheck, image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.local_map import LocalMap
+from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
+from segfloor_ros.slam.loops import LoopDetector
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.motion import CameraMotion
 from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.moving_regions import MovingRegions
 from segfloor_ros.slam.patch_alignment import sample_patches
+from segfloor_ros.slam.place_recognition import PlaceRecognition
+from segfloor_ros.slam.relocalisation import Relocaliser
 from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.snapshot import take_snapshot
@@ -35,7 +39,6 @@ from segfloor_ros.slam.track import ObservedFeatures, Track
 from segfloor_ros.slam.tracking import Tracker
 from segfloor_ros.timing import StageTimes
 
-RECOVERY_KEYFRAMES = 3
 RECOVERY_RATIO = 0.15
 """Share of the points expected in view that a camera which was lost must find: far points alone
 fit many places."""
@@ -89,10 +92,13 @@ class StereoSlam:
         self._follower = Follower(camera, settings.tracked_points)
         self._tracker = Tracker(camera)
         self._mapper = LocalMapper(camera, settings)
-        self._adjusting = AdjustmentRunner(self._mapper, background)
+        self._places = PlaceRecognition(camera, self._tracker, self.map)
+        self._loops = LoopDetector(self.map, self._places)
+        self._relocaliser = Relocaliser(self.map, self._places)
+        self.loop_count = 0
+        self._adjusting = AdjustmentRunner(background)
         self._held = HeldResults()
         self._moving = MovingRegions(camera) if settings.detect_moving else None
-        self._recovery_turn = 0
         self._frames_since_keyframe = 0
 
     @property
@@ -208,24 +214,16 @@ class StereoSlam:
         if not (self._motion.is_lost or self._motion.is_blind):
             return track
         if track is None or not _recognised(track, RECOVERY_RATIO):
-            track = self._recover(images, features)
+            track = self._relocalise(images, features)
         return track if track and _recognised(track, RECOVERY_RATIO) else None
 
-    def _recover(self, images: Images, features: Features) -> Track | None:
-        """Look for the view among the keyframes, a few per frame, the latest ones first."""
-        views = [k.index for k in self.map.keyframes if k.retired is None]
-        count = len(views)
-        first = self._recovery_turn * RECOVERY_KEYFRAMES % count
-        self._recovery_turn += 1
-        turn = count - 1 - (first + np.arange(min(RECOVERY_KEYFRAMES, count))) % count
-        ids = self.map.points_of(np.array(views)[turn])
-        observations = self._tracker.pixel_observations(features)
-        tree = cKDTree(features.uv_px)
-        estimate = self._tracker.locate(features, tree, observations, self.map, ids)
-        if estimate is None:
+    def _relocalise(self, images: Images, features: Features) -> Track | None:
+        """Look for the view in the whole map."""
+        found = self._relocaliser.find(images, features, self.disparity_offset_px)
+        if found is None:
             return None
-        pose = estimate.T_camera_world
-        around = self._local.points_around(ids, pose)
+        pose = found.T_camera_world
+        around = self._local.points_around(found.point_ids, pose)
         return self._tracker.track_at(
             images, features, self.map, around, pose, self.disparity_offset_px
         )
@@ -266,7 +264,9 @@ class StereoSlam:
         self._mapper.insert(self.map, keyframe, patches)
         if self._moving is not None and seen is not None:
             self._moving.remember(keyframe, seen)
+        self._places.add(keyframe)
         self._adjust(keyframe)
+        self._close_loop(keyframe, images)
         self._go_on_from(images, keyframe)
         self._measure_mount(frame, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
@@ -308,11 +308,34 @@ class StereoSlam:
 
     def _adjust(self, keyframe: KeyframeRecord) -> None:
         """Adjust the neighbourhood of a new keyframe."""
-        plan = self._mapper.plan_adjustment(self.map, keyframe) if keyframe.index > 0 else None
-        if plan is not None:
-            self._adjusting.submit(plan)
-            if not self._background:
-                self._take_adjustment(wait=True)
+        if keyframe.index == 0:
+            return
+        adjustment = self._mapper.plan_adjustment(self.map, keyframe)
+        if adjustment is None:
+            return
+        self._adjusting.submit(
+            partial(self._mapper.solve, adjustment),
+            partial(self._mapper.apply, self.map, adjustment),
+        )
+        if not self._background:
+            self._take_adjustment(wait=True)
+
+    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> None:
+        """Close a loop where a new keyframe sees a place again."""
+        matches = self._loops.detect(keyframe, images, self.disparity_offset_px, self.mount)
+        if not matches:
+            return
+        self._take_adjustment(wait=True)
+        closing = plan_closing(self.map, matches)
+        self._adjusting.submit(
+            partial(solve_closing, closing), partial(self._apply_closing, closing)
+        )
+        self._take_adjustment(wait=True)
+        self._adjust(keyframe)
+
+    def _apply_closing(self, closing: Closing, result: tuple[Array, Array]) -> None:
+        if apply_closing(self._camera, self.map, closing, result):
+            self.loop_count += 1
 
     def _go_on_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -336,7 +359,7 @@ class StereoSlam:
             return
         reference = self.map.keyframes[-1]
         before = reference.T_camera_world
-        self._mapper.apply(self.map, *finished)
+        finished()
         self._motion.move_map(before, reference.T_camera_world)
         self._local.drop_dead()
         self._follower.drop_dead(self.map)

@@ -1,0 +1,132 @@
+"""Place recognition: which keyframes look like a view, and whether it truly is the same place.
+
+Candidates come from binary words, grouped by covisibility (Mur-Artal and Tardos, Fast
+Relocalisation and Loop Closing in Keyframe-Based SLAM, ICRA 2014). Buildings repeat themselves:
+what counts is the geometry. A place is the same when most of what should be seen there is seen,
+where it should be, all over the image.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.place_index import PlaceIndex
+from segfloor_ros.slam.residuals import MIN_DEPTH_M
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.track import Track
+from segfloor_ros.slam.tracking import Tracker
+from segfloor_ros.slam.vocabulary import Vocabulary
+
+BEST_KEYFRAMES = 10
+"""Keyframes that look most like a view, around which groups are made."""
+
+GROUP_KEYFRAMES = 10
+MIN_FOUND = 25
+MIN_FOUND_SHARE = 0.10
+"""Share of the points expected in view that must be found: far points alone fit many places."""
+
+COLUMNS, ROWS = 4, 3
+MIN_EXPECTED = 8
+MIN_CELLS_SHARE = 0.6
+"""Share of the parts of the image that must show what is expected there: a poster or a shelf that
+stands elsewhere too fills only some."""
+
+
+class PlaceRecognition:
+    """The places of a map by their look."""
+
+    def __init__(self, camera: StereoCamera, tracker: Tracker, sparse_map: SparseMap) -> None:
+        self._camera = camera
+        self._tracker = tracker
+        self._map = sparse_map
+        self._vocabulary = Vocabulary.load()
+        self._index = PlaceIndex()
+
+    def add(self, keyframe: KeyframeRecord) -> None:
+        """Take in a keyframe."""
+        self._index.add(keyframe.index, self._vocabulary.words(keyframe.features.descriptor))
+
+    def score(self, features: Features) -> Array:
+        """Return how much each keyframe (K,) looks like a view, in [0, 1]; those that are retired
+        not at all.
+        """
+        keyframes = self._map.keyframes
+        score = self._index.score(self._vocabulary.words(features.descriptor), len(keyframes))
+        return score * np.array([k.retired is None for k in keyframes])
+
+    def groups(self, score: Array, count: int) -> list[NDArray[np.intp]]:
+        """Return up to `count` groups of covisible keyframes, by index, that look most like a view
+        as scored (K,); each keyframe is in one of them only.
+        """
+        best = np.argsort(-score, kind='stable')[:BEST_KEYFRAMES]
+        groups = [self._around(int(k), score) for k in best if score[k] > 0]
+        groups.sort(key=lambda group: -float(score[group].sum()))
+        chosen: list[NDArray[np.intp]] = []
+        for group in groups:
+            if not any(np.isin(group[0], other).any() for other in chosen):
+                chosen.append(group)
+        return chosen[:count]
+
+    def _around(self, index: int, score: Array) -> NDArray[np.intp]:
+        keyframe = self._map.keyframes[index]
+        order, _ = self._map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
+        others = order[(order != index) & (score[order] > 0)][: GROUP_KEYFRAMES - 1]
+        return np.append(index, others).astype(np.intp)
+
+    def locate(
+        self, images: Images, features: Features, ids: NDArray[np.int32], offset_px: float
+    ) -> Track | None:
+        """Find a camera among points `ids` (N,); None unless it sees them."""
+        observations = self._tracker.pixel_observations(features)
+        tree = cKDTree(features.uv_px)
+        estimate = self._tracker.locate(features, tree, observations, self._map, ids)
+        if estimate is None:
+            return None
+        return self.confirm(images, features, ids, estimate.T_camera_world, offset_px)
+
+    def confirm(
+        self,
+        images: Images,
+        features: Features,
+        ids: NDArray[np.int32],
+        T_camera_world: Array,
+        offset_px: float,
+    ) -> Track | None:
+        """Find a camera that should be at a pose from which points `ids` (N,) are seen; None
+        unless it sees them.
+        """
+        track = self._tracker.track_at(images, features, self._map, ids, T_camera_world, offset_px)
+        return track if track is not None and self.is_same_place(track) else None
+
+    def is_same_place(self, track: Track) -> bool:
+        """Whether a frame shows enough of what it should, all over the image."""
+        found, expected = len(track.point_ids), len(track.visible_ids)
+        if found < MIN_FOUND or found < MIN_FOUND_SHARE * expected:
+            return False
+        seen, there = (
+            self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
+            for ids in (track.point_ids, track.visible_ids)
+        )
+        full = there >= MIN_EXPECTED
+        agree = seen >= 0.5 * MIN_FOUND_SHARE * there
+        return bool(full.any() and agree[full].mean() >= MIN_CELLS_SHARE)
+
+    def project(self, points: Array) -> Array:
+        """Return the pixels (N, 2) of points (N, 3) of an optical frame; NaN behind the camera."""
+        front = points[:, 2] > MIN_DEPTH_M
+        uv = self._camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))[:, :2]
+        return np.where(front[:, None], uv, np.nan)
+
+    def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
+        """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""
+        uv = self._camera.project(transform_points(T_camera_world, xyz_world))[:, :2]
+        size = (self._camera.width / COLUMNS, self._camera.height / ROWS)
+        column, row = np.clip(uv // size, 0, (COLUMNS - 1, ROWS - 1)).astype(np.intp).T
+        return np.bincount(row * COLUMNS + column, minlength=COLUMNS * ROWS)
