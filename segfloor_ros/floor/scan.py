@@ -83,9 +83,8 @@ class FloorScanner:
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
         what is tolerated, and never beyond the last floor that both cameras saw: at the image's
-        edge, floor that only looks alike may continue a ray but not end it; nor does a ray pass
-        there beside something that may go on in it. shared: (N,) which cells both cameras can see.
-        density: the part of the image's pixels that the points are
+        edge, floor that only looks alike may continue a ray but not end it. shared: (N,) which
+        cells both cameras can see. density: the part of the image's pixels that the points are
         from.
         """
         shape = (self._count, len(self._middle))
@@ -93,7 +92,6 @@ class FloorScanner:
         upright_m = self._upright(self._polar_counts(upright_xy), density)
         middle = self._middle
         limit = np.where(np.isnan(upright_m), np.inf, upright_m)
-        limit = self._limit_unseen(limit, shared.reshape(shape))
         seen = floor & (middle < limit[:, None])
         # A dip of a few bearings in which nothing stands up is a hole in the mask, a spike is floor
         # that has crept up a blank wall.
@@ -116,19 +114,6 @@ class FloorScanner:
             upright_m.astype(np.float32),
             self._range_max_m,
         )
-
-    def _limit_unseen(self, limit: Array, shared: NDArray[np.bool_]) -> Array:
-        """Return the limits (S,) of the rays with those at the left edge that begin in floor only
-        the left camera sees no longer than their neighbour's, if that ends in there.
-
-        shared: (S, M), which cells both cameras can see.
-        """
-        shared_from = np.where(shared.any(axis=1), self._middle[shared.argmax(axis=1)], np.inf)
-        limit = limit.copy()
-        for k in np.flatnonzero(shared_from > self._nearest):
-            if k > 0 and limit[k - 1] < shared_from[k]:
-                limit[k] = min(limit[k], limit[k - 1])
-        return limit
 
     def _tolerance(self, range_m: Array) -> Array:
         """Return how long a gap in the floor may be at a range."""

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.blank_border import blank_border, matched_in
+from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, stereo_view
 from segfloor_ros.floor.filling import (
@@ -99,7 +101,7 @@ class FloorSegmentation:
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
         the map, where known; with it the floor found by earlier keyframes helps. moving: mask
         (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
-        what it hides is unknown.
+        what it hides is unknown. The black border that rectification leaves is treated alike.
         """
         settings, measure = self._settings, self._times.measure
         self._prepare(mount)
@@ -107,6 +109,8 @@ class FloorSegmentation:
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
+            moving = _joined(moving, blank_border(left))
+            right_border = None if is_disparity(right) else blank_border(right)
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
@@ -121,6 +125,8 @@ class FloorSegmentation:
                 disparity = self._disparity(first_row, left, right)
             if moving is not None:
                 disparity[moving > 0] = 0
+            if right_border is not None:
+                disparity[matched_in(right_border, disparity)] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             fit = self._plane(first_row, below, texture, enough, expected)
@@ -356,6 +362,13 @@ class FloorSegmentation:
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
+
+
+def _joined(a: NDArray[np.uint8] | None, b: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+    """Return the mask of what is in either of two masks, None for none at all."""
+    if a is None or b is None:
+        return b if a is None else a
+    return np.maximum(a, b)
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:

@@ -117,23 +117,3 @@ def test_floor_that_one_camera_sees_does_not_end_a_ray():
     result = scan((0.35, 3.0), blind_from_deg=4.0)
     assert at(result, result.ranges_m) > 2.6
     assert np.isnan(at(result, result.ranges_m, 7.0))
-
-
-def scan_at_left_edge(upright):
-    """The scan of floor up to 3 m that to the left of 4 degrees both cameras see from 2 m on."""
-    scanner = FloorScanner(CAMERA, MOUNT, SETTINGS)
-    x, y = scanner.cells_xy
-    ranges, bearings_deg = np.hypot(x, y), np.degrees(np.arctan2(y, x))
-    floor = (ranges < 3.0) & (np.abs(bearings_deg) < 10)
-    return scanner.scan(floor, (bearings_deg < 4.0) | (ranges > 2.0), upright, 0.5)
-
-
-def test_no_ray_passes_at_the_left_edge_beside_what_may_go_on_there():
-    # A box at 1.2 m that both cameras see up to 4 degrees; whether it goes on, one sees alone.
-    box = np.repeat(fan(1.2, 1.205, (-10, 4)), 60, axis=1)
-    result = scan_at_left_edge(box)
-    assert at(result, result.ranges_m, 2.0) == pytest.approx(1.2, abs=0.03)
-    assert np.isnan(at(result, result.ranges_m, 7.0))
-    # What stands where both see hides nothing there.
-    far = np.repeat(fan(2.5, 2.505, (-10, 4)), 60, axis=1)
-    assert at(scan_at_left_edge(far), scan_at_left_edge(far).ranges_m, 7.0) > 2.6

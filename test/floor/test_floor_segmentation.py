@@ -61,6 +61,18 @@ def test_scan_ends_at_the_wall_and_not_behind_it():
     assert np.median((scan.ranges_m - distance)[ahead]) > -0.12
 
 
+def test_no_ray_ends_in_what_the_right_camera_sees_at_its_border_alone():
+    observation, _, _ = segment(Scene([floor_patch(), wall(6.0)]))
+    scan = observation.scan
+    known = scan.ranges_m > 0
+    r, bearing = scan.ranges_m[known], scan.bearings_rad[known]
+    ends = np.stack([r * np.cos(bearing), r * np.sin(bearing), np.zeros(len(r))], axis=1)
+    T = np.linalg.inv(MOUNT.T_base_left)
+    u_right = CAMERA.project(ends @ T[:3, :3].T + T[:3, 3])[:, 2]
+    # A ray is cut back by 1.5 rows, that is 3 pixels of disparity at most.
+    assert u_right.min() > 10 - 3
+
+
 def test_a_blank_wall_is_not_floor():
     scene = Scene([floor_patch(), wall(contrast=0.0, grey=130.0)])
     precision, recall = shares(*segment(scene))
@@ -181,6 +193,17 @@ def test_a_robot_that_tilts_on_its_wheels_still_sees_its_floor(pitch_deg, roll_d
     precision, recall = shares(observation, floor, depth)
     assert precision > 0.99
     assert recall > 0.97
+
+
+def test_the_border_that_rectification_leaves_is_no_floor():
+    left, right, floor, _ = Scene([floor_patch(), wall(2.0)]).render()
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    outside = (v > 479 - 60 * np.abs(u / 320 - 1) ** 2) | (u < 20)
+    left, right = (np.where(outside, 0, np.maximum(image, 1)) for image in (left, right))
+    mask = FloorSegmentation(CAMERA, SETTINGS).process(left, right, MOUNT).mask
+    assert not (mask[outside] == FLOOR).any()
+    inside = floor & (v < 400) & (u > 150)
+    assert np.mean(mask[inside] == FLOOR) > 0.97
 
 
 def test_same_input_same_output():

@@ -1,0 +1,38 @@
+"""The black border of rectified images, and what is made of it."""
+
+import numpy as np
+
+from segfloor_ros.camera.blank_border import blank_border, matched_in
+
+
+def bordered(seed=0):
+    """A noisy image whose lower corners and left edge are black, and what is black."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(1, 255, (120, 160), dtype=np.uint8)
+    v, u = np.mgrid[:120, :160]
+    black = (v > 119 - (u - 80) ** 2 / 200) | (u < 6)
+    image[black] = 0
+    return image, black
+
+
+def test_the_border_and_a_margin_around_it_are_found():
+    image, black = bordered()
+    image[40:60, 70:90] = 0  # black, but part of the scene
+    border = blank_border(image) > 0
+    assert border[black].mean() > 0.99  # all but slivers one pixel high
+    assert not border[20:85, 45:115].any()
+
+
+def test_images_without_a_border_have_none():
+    image, _ = bordered()
+    assert blank_border(np.maximum(image, 1)) is None
+    image = np.maximum(image, 1)
+    image[::9, 0] = 0
+    assert blank_border(image) is None
+
+
+def test_pixels_that_are_matched_with_the_border_are_told():
+    region = np.zeros((4, 40), np.uint8)
+    region[:, 10:20] = 255
+    disparity = np.full((4, 40), 8.0, np.float32)
+    assert np.flatnonzero(matched_in(region, disparity)[2]).tolist() == list(range(18, 28))
