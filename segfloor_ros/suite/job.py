@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import fcntl
 import functools
 import hashlib
 import os
@@ -144,7 +145,11 @@ def _recording(entry: Entry, folder: Path) -> Path:
         return local_copy(entry.input, folder / 'recordings')
     scene = open_scene(entry.input, entry.scene_assignments)
     recording = folder / 'renderings' / _digest_of_text(repr((__version__, scene)))
-    render_once(scene, recording, RecordingOptions())
+    recording.parent.mkdir(parents=True, exist_ok=True)
+    with recording.with_suffix('.lock').open('w') as lock:
+        # Another worker may want the same drive.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        render_once(scene, recording, RecordingOptions())
     return recording
 
 
