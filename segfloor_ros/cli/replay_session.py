@@ -18,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
+from segfloor_ros.camera.settings import SENSORS
 from segfloor_ros.cli.interrupts import first_interrupt_noted
 from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
@@ -25,7 +26,7 @@ from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.results_folder import RunResult, RunSummary, lost_intervals, relocalisations
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
@@ -183,10 +184,16 @@ class ReplaySession:
             camera_height_m=round(mount.height_m, 4),
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
-            sensors={},
+            sensors=_sensors_sent(finished),
             stages=recorder.times.summary(),
             rss_mb=recorder.memory.summary(),
         )
+
+
+def _sensors_sent(finished: Status | None) -> dict[str, int]:
+    """Return the messages of each sensor besides the images, as the camera says at the end."""
+    values = {} if finished is None else finished.values
+    return {name: int(values[name]) for name in SENSORS if name in values}
 
 
 class ReplayGraph:

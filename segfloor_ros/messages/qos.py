@@ -29,6 +29,11 @@ IMAGES_BEST_EFFORT = QoSProfile(
 )
 """Camera images of drivers that publish best effort; frames may be lost."""
 
+SENSORS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=400, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+"""Wheel odometry and IMU of other drivers, of whatever reliability."""
+
 FRAMES = _reliable(5)
 """Small images of every frame, of which only the latest count."""
 

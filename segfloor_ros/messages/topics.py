@@ -17,6 +17,7 @@ from sensor_msgs.msg import (
     CameraInfo,
     CompressedImage,
     Image,
+    Imu,
     LaserScan,
     PointCloud2,
     TimeReference,
@@ -133,6 +134,26 @@ def _keyframe_images() -> list[Topic]:
 
 _ALL = [
     *_images(),
+    Topic(
+        'wheel_odometry',
+        Odometry,
+        qos.SENSORS,
+        OTHERS,
+        (SLAM,),
+        'Where the wheels have base_link, in any frame of their own. stereo_camera publishes that '
+        'of a recording.',
+        is_optional=True,
+    ),
+    Topic(
+        'imu',
+        Imu,
+        qos.SENSORS,
+        OTHERS,
+        (SLAM,),
+        'Angular velocity and acceleration, in a frame that tf ties to the camera. stereo_camera '
+        'publishes those of a recording.',
+        is_optional=True,
+    ),
     Topic(
         'odometry',
         Odometry,

@@ -11,15 +11,17 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
 from segfloor_ros.camera.images import Grey
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.settings import SENSORS, StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.measurements import Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.headers import to_ns, to_time
 from segfloor_ros.messages.images import compressed_message, image_message
+from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
@@ -49,6 +51,11 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
         self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
+        self._sensors = {
+            sensor.name: self.output(sensor.name)
+            for sensor in self._source.sensors
+            if sensor.used and sensor.name in SENSORS
+        }
         self._clock_output: Publisher | None = None
         if own.publish_clock:
             clock = self._clock_output = self.create_publisher(Clock, '/clock', qos.CLOCK)
@@ -63,6 +70,8 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         """Begin with the first frame."""
         own = self.parameters.own
         self._pairs = self._source.raw_pairs()
+        self._measurements = MeasurementLog(self._source.sensors)
+        self._measurements_sent = dict.fromkeys(self._sensors, 0)
         self._next: RawPair | None = None
         self._frames_sent = 0
         self._connected = self._finished = False
@@ -162,12 +171,24 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._logged_waiting_s = time.monotonic()
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
+        for measurement in self._measurements.until(pair.stamp_ns):
+            self._send_measurement(measurement)
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))
             self._images[side].publish(self._image_message(pair.stamp_ns, frame_id, image))
         self._frames_sent += 1
         self.reporter.report(pair.stamp_ns, Level.OK, 'sent', frame_index=pair.index)
+
+    def _send_measurement(self, measurement: Measurement) -> None:
+        name = 'wheel_odometry' if isinstance(measurement, WheelPose) else 'imu'
+        if isinstance(measurement, WheelPose):
+            self._sensors[name].publish(wheel_message(measurement, 'base_link'))
+        else:
+            R_left_rectified = self._source.calibration.left.R.T
+            left_frame = self._frame_ids['left']
+            self._sensors[name].publish(imu_message(measurement, left_frame, R_left_rectified))
+        self._measurements_sent[name] += 1
 
     def _image_message(self, stamp_ns: int, frame_id: str, image: Grey) -> Any:
         if not self._compressed:
@@ -180,7 +201,11 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._finished = True
         self.get_logger().info(f'{self._source.name}: {self._frames_sent} pairs sent')
         stamp_ns = self.get_clock().now().nanoseconds
-        values = {'frames': self._frames_sent, 'skipped': self._source.skipped_frames}
+        values = {
+            'frames': self._frames_sent,
+            'skipped': self._source.skipped_frames,
+            **self._measurements_sent,
+        }
         self.reporter.publish(RECORDING, stamp_ns, level, message, values)
 
     def _log_waiting_for(self, what: str) -> None:

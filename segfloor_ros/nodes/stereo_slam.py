@@ -13,6 +13,7 @@ from segfloor_ros.messages.topics import FRAME_DONE
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.pair_queue import PairQueue
 from segfloor_ros.nodes.running import run_node
+from segfloor_ros.nodes.sensor_input import SensorInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
 from segfloor_ros.nodes.slam_resumption import SlamResumption
 from segfloor_ros.nodes.stage_node import StageNode
@@ -46,6 +47,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._transforms = Transforms(self, own)
         self._work = WhenIdle(self, self._process_waiting)
         self._camera = StereoInput(self, own, self._take_pair, self._work.request)
+        self._sensors = SensorInput(self, self._transforms, self._look_at_waiting)
         self.inputs.every(LOOK_AGAIN_S, self._look_again)
         self.at_clean_up(self._end_stage)
 
@@ -56,6 +58,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._outputs.reset(self.get_clock().now().nanoseconds)
         self._transforms.reset()
         self._camera.reset()
+        self._sensors.reset()
         self._last_stamp_ns: int | None = None
         self._resumption = SlamResumption(self._keep)
         self._frames = CameraFrames('', '')
@@ -93,6 +96,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._waiting.add((stamp_ns, pair))
         self._work.request()
 
+    def _look_at_waiting(self) -> None:
+        if self._waiting:
+            self._work.request()
+
     def _look_again(self) -> None:
         self._camera.find_images()
         self._work.request()
@@ -108,7 +115,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         for stamp_ns, _ in self._waiting.skip_overdue(is_ready, least):
             self._camera.watch.report_skipped(stamp_ns, is_ready)
             self._frame_done.publish(make_header(stamp_ns, self._frames.left))
-        if not is_ready:
+        if not is_ready or self._sensors.is_behind(self._waiting.first[0]):
             return
         stamp_ns, pair = self._waiting.take()
         self._work.request()
@@ -152,6 +159,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             images = self._camera.images(pair)
             frame = StereoFrame(self._frame_count, stamp_ns, *images)
             self._frame_count += 1
+            for measurement in self._sensors.take():
+                slam.add(measurement)
             results = self._resumption.join(slam.process(frame))
         except Exception as error:
             self.reporter.report_fault(stamp_ns, error)
@@ -177,6 +186,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         stage, background = self.parameters.stage, self.parameters.own.background
         self._slam = make_slam(camera, stage, mount, background=background)
         self._resumption.begin(self._slam)
+        self._sensors.begin(self._frames.left, self._camera.rectifier.calibration.left.R)
         return self._slam
 
     def _end_stage(self) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections import deque
 
+import numpy as np
+
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.messages.poses import transform_message
@@ -96,6 +98,13 @@ class Transforms:
             return None
         T_base_camera = self._link.lookup(self._own.base_frame, camera_frame)
         return None if T_base_camera is None else Mount.from_transform(T_base_camera)
+
+    def rotation(self, target: str, source: str) -> Array | None:
+        """Return the rotation (3, 3) that tf has from one frame to another, or None."""
+        if source == target:
+            return np.eye(3)
+        T = None if self._link is None else self._link.lookup(target, source)
+        return None if T is None else T[:3, :3]
 
     def announce_mount(self, stamp_ns: int, camera_frame: str, mount: Mount) -> None:
         """Broadcast the mount in use where tf lacks it, once tf had its time to tell."""

@@ -1,0 +1,118 @@
+"""Wheel odometry and IMU as messages: for the node `stereo_slam`."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Imu
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import Measurement
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.sensors import NOT_MEASURED, imu_sample, wheel_pose
+from segfloor_ros.nodes.stage_node import AnyStageNode
+from segfloor_ros.nodes.transforms import Transforms
+
+WHEELS, IMU = 'wheel_odometry', 'imu'
+MAX_LATE_S = 0.05
+"""So long an image waits for what sensors measured up to its time."""
+
+LIVE_S = 0.5
+"""A sensor that has said nothing for so long is not waited for."""
+
+MAX_WAITING = 500
+UPRIGHT = 0.8
+"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
+
+
+class SensorInput:
+    """Receives what wheels and IMU measure, in the axes of the rectified left camera.
+
+    on_message: called after each. Samples of an IMU are turned by tf; without it, one for which up
+    is up in the image is taken to be in the frame of the left images, others are not used.
+    """
+
+    def __init__(
+        self, node: AnyStageNode, transforms: Transforms, on_message: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._transforms = transforms
+        self._on_message = on_message
+        self.reset()
+        node.inputs.subscribe(WHEELS, self._take_wheels)
+        node.inputs.subscribe(IMU, self._take_imu)
+
+    def reset(self) -> None:
+        """Know no camera and no measurement."""
+        self._camera: tuple[str, Array] | None = None
+        self._R_left_imu: Array | None = None
+        self._measured: deque[Measurement] = deque(maxlen=MAX_WAITING)
+        self._latest: dict[str, tuple[int, float]] = {}
+        self._asked: tuple[int, float] = (0, 0.0)
+
+    def begin(self, left_frame: str, R_rectified_left: Array) -> None:
+        """Take measurements from now on. R_rectified_left: (3, 3) turns the frame of the left
+        images into the rectified one.
+        """
+        self._camera = left_frame, R_rectified_left
+
+    def take(self) -> list[Measurement]:
+        """Return what has been measured since the last call."""
+        measured = [*self._measured]
+        self._measured.clear()
+        return measured
+
+    def is_behind(self, stamp_ns: int) -> bool:
+        """Whether a sensor is about to tell what it measured up to the time of an image."""
+        now_s = time.monotonic()
+        if self._asked[0] != stamp_ns:
+            self._asked = stamp_ns, now_s
+        if now_s > self._asked[1] + MAX_LATE_S:
+            return False
+        return any(
+            latest_ns < stamp_ns and now_s < heard_s + LIVE_S
+            for latest_ns, heard_s in self._latest.values()
+        )
+
+    def _take_wheels(self, message: Odometry) -> None:
+        if self._camera is not None:
+            self._measured.append(wheel_pose(message, WHEELS))
+        self._note(WHEELS, message)
+
+    def _take_imu(self, message: Imu) -> None:
+        if self._camera is not None and self._measures(message):
+            R_left_imu = self._rotation(message)
+            if R_left_imu is None:
+                self._node.reporter.diagnose(
+                    IMU,
+                    f'no tf from {self._camera[0]} to {message.header.frame_id or "its frame"}: '
+                    f'{IMU} is not used; let another node publish where the IMU is',
+                )
+                return
+            self._measured.append(imu_sample(message, R_left_imu))
+        self._note(IMU, message)
+
+    def _measures(self, message: Imu) -> bool:
+        covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
+        return all(covariance[0] != NOT_MEASURED for covariance in covariances)
+
+    def _rotation(self, message: Imu) -> Array | None:
+        assert self._camera is not None
+        if self._R_left_imu is None:
+            left_frame, R_rectified_left = self._camera
+            R = self._transforms.rotation(left_frame, message.header.frame_id)
+            if R is None:
+                felt = message.linear_acceleration
+                length = np.linalg.norm([felt.x, felt.y, felt.z])
+                R = np.eye(3) if -felt.y > UPRIGHT * length else None
+            self._R_left_imu = None if R is None else R_rectified_left @ R
+        return self._R_left_imu
+
+    def _note(self, name: str, message: Odometry | Imu) -> None:
+        latest_ns = max(to_ns(message.header.stamp), self._latest.get(name, (0, 0.0))[0])
+        self._latest[name] = latest_ns, time.monotonic()
+        self._on_message()

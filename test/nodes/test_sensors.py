@@ -1,0 +1,118 @@
+"""Wheel odometry and IMU over DDS: from a recording to poses of frames that show nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import Imu
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
+
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.geometry import invert, quaternion_xyzw
+from segfloor_ros.measurements import ImuSample, WheelPose
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.messages.sensors import imu_message, imu_sample, wheel_message, wheel_pose
+from segfloor_ros.nodes.sensor_input import MAX_LATE_S, SensorInput
+from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+
+FRAMES, BLIND = 14, range(6, 10)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """A drive whose images show nothing for a while, with what the wheels tell."""
+    frames, poses = room_drive(FRAMES)
+    grey = np.full(frames[0].left.shape, 90, np.uint8)
+    for k in BLIND:
+        frames[k] = StereoFrame(k, frames[k].stamp_ns, grey, grey)
+    folder = write_kitti(tmp_path / 'drive', frames)
+    rows = [[k * 0.1, *pose[:3, 3], *quaternion_xyzw(pose[:3, :3])] for k, pose in enumerate(poses)]
+    np.savetxt(folder / 'wheel_odometry.txt', rows, fmt='%.9f')
+    return folder, poses
+
+
+def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive) -> None:
+    folder, poses = drive
+    arguments = [
+        *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
+        *('-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}'),
+        *('-p', f'camera_roll_rad:={MOUNT.roll_rad}'),
+    ]
+    graph = make_graph(*arguments)
+    odometry = graph.collect('odometry')
+    graph.add(StereoSlamNode())
+    graph.add(StereoCameraNode())
+    graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
+    for message in odometry:
+        truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
+        error = invert(truth) @ pose_array(message.pose.pose)
+        assert np.linalg.norm(error[:3, 3]) < 0.02
+    sigma_m = [np.sqrt(message.pose.covariance[0]) for message in odometry]
+    assert min(sigma_m[k] for k in BLIND) > 2 * sigma_m[5]
+
+
+def test_wheels_and_imu_survive_the_way_through_messages() -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 1.0, 2.0, 0.0
+    told = wheel_pose(wheel_message(WheelPose(123_456_789, pose), 'base_link'), 'wheel_odometry')
+    assert told.stamp_ns == 123_456_789
+    np.testing.assert_allclose(told.T_wheels_base, pose)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    sample = ImuSample(5, np.array([0.1, 0.2, 0.3]), np.array([1.0, -9.8, 0.5]))
+    message = imu_message(sample, 'left', quarter)
+    assert message.angular_velocity.x == pytest.approx(-0.2)
+    back = imu_sample(message, quarter.T)
+    np.testing.assert_allclose(back.gyro_rad_s, sample.gyro_rad_s)
+    np.testing.assert_allclose(back.accel_m_s2, sample.accel_m_s2)
+
+
+class Tf:
+    """Transforms that know one frame."""
+
+    def rotation(self, target: str, source: str):
+        known = {('left', 'imu_link'): np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])}
+        return known.get((target, source))
+
+
+@pytest.fixture
+def sensors(make_graph):
+    graph = make_graph()
+    node = graph.add(StereoSlamNode())
+    made = SensorInput.__new__(SensorInput)
+    made._node, made._transforms, made._on_message = node, Tf(), lambda: None
+    made.reset()
+    return made
+
+
+def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
+    return imu_message(ImuSample(stamp_ns, np.zeros(3), np.array(accel)), frame, np.eye(3))
+
+
+def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
+    sensors.begin('left', np.eye(3))
+    sensors._take_imu(imu(1, 'imu_link'))
+    np.testing.assert_allclose(sensors.take()[0].accel_m_s2, [0, -9.81, 0])
+    sensors.reset()
+    sensors.begin('left', np.eye(3))
+    sensors._take_imu(imu(2, 'elsewhere'))
+    assert sensors.take() == []
+    sensors._take_imu(imu(3, '', (0.0, -9.81, 0.0)))
+    assert [m.stamp_ns for m in sensors.take()] == [3]
+
+
+def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monkeypatch) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr('segfloor_ros.nodes.sensor_input.time.monotonic', lambda: now_s[0])
+    assert not sensors.is_behind(50)  # nothing was ever heard
+    sensors._take_imu(imu(40, ''))
+    assert sensors.is_behind(60)
+    sensors._take_imu(imu(60, ''))
+    assert not sensors.is_behind(60)
+    assert sensors.is_behind(70)
+    now_s[0] += 1.1 * MAX_LATE_S
+    assert not sensors.is_behind(70)
+    now_s[0] += 1.0  # the sensor has fallen silent
+    assert not sensors.is_behind(90)
