@@ -18,6 +18,8 @@ PAGE = 'suite.html'
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent',
            'known_area_m2', 'time_ratio', 'memory_peak_mb')  # fmt: skip
 THUMBNAIL_PX = 110
+UNKNOWN_GREY = 205
+"""Of unknown cells in map files."""
 MARKS = """
 td { vertical-align: middle; } td:first-child a { font-weight: 600; }
 .ok { color: #1b7f3b; } .bad { color: #b3261e; } ul { margin: 0; padding-left: 18px; }
@@ -80,10 +82,12 @@ def _heading(name: str) -> str:
 
 
 def _thumbnail(path: Path) -> str:
-    """Return a small picture of a map, '' where there is none."""
+    """Return a small picture of what is known in a map, '' where there is none."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
         return ''
+    left, top, width, height = cv2.boundingRect((image != UNKNOWN_GREY).astype(np.uint8))
+    image = image[top : top + height, left : left + width] if width and height else image
     scale = THUMBNAIL_PX / max(image.shape)
     size = np.maximum(1, np.rint(scale * np.array(image.shape[::-1]))).astype(int)
     small = cv2.resize(image, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
