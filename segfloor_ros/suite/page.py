@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from segfloor_ros.evaluation.report import REPORT_NAME, STYLE
+from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
 from segfloor_ros.suite.bounds import number
 from segfloor_ros.suite.measures import MEASURES
 from segfloor_ros.suite.verdicts import Checked, SuiteResult
@@ -18,8 +19,6 @@ PAGE = 'suite.html'
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent',
            'known_area_m2', 'time_ratio', 'memory_peak_mb')  # fmt: skip
 THUMBNAIL_PX = 110
-UNKNOWN_GREY = 205
-"""Of unknown cells in map files."""
 MARKS = """
 td { vertical-align: middle; } td:first-child a { font-weight: 600; }
 .ok { color: #1b7f3b; } .bad { color: #b3261e; } ul { margin: 0; padding-left: 18px; }
@@ -86,7 +85,7 @@ def _thumbnail(path: Path) -> str:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
         return ''
-    left, top, width, height = cv2.boundingRect((image != UNKNOWN_GREY).astype(np.uint8))
+    left, top, width, height = cv2.boundingRect((image != UNKNOWN_PIXEL).astype(np.uint8))
     image = image[top : top + height, left : left + width] if width and height else image
     scale = THUMBNAIL_PX / max(image.shape)
     size = np.maximum(1, np.rint(scale * np.array(image.shape[::-1]))).astype(int)
