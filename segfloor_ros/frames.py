@@ -6,7 +6,6 @@ from bisect import bisect_left
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, invert, make_transform
 
@@ -105,6 +104,8 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the pose (4, 4) at a share of the way from one pose to another: the position on the
     straight line, the rotation on the shortest turn.
     """
+    from scipy.spatial.transform import Rotation  # see geometry.py
+
     turn = Rotation.from_matrix(T_a[:3, :3].T @ T_b[:3, :3]).as_rotvec()
     rotation = T_a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
     return make_transform(rotation, (1 - share) * T_a[:3, 3] + share * T_b[:3, 3])

@@ -2,6 +2,8 @@
 
 `T_a_b` is a (4, 4) float64 matrix that maps points of frame b into frame a. Optical frames have
 x right, y down, z forward; ROS frames have x forward, y left, z up (REP-103).
+
+SciPy is imported where it is used: it takes 20 MB of every process, and not all need it.
 """
 
 from __future__ import annotations
@@ -10,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.floating[Any]]
 
@@ -77,6 +78,8 @@ def se3_log(T: Array) -> Array:
     """Return the twist (6,) = (rho, phi) of one (4, 4) transform; the inverse of `se3_exp` for
     |phi| < pi.
     """
+    from scipy.spatial.transform import Rotation
+
     phi = Rotation.from_matrix(T[:3, :3].copy()).as_rotvec()
     theta = float(np.linalg.norm(phi))
     K = skew(phi)
@@ -116,6 +119,8 @@ def se3_logs(T: Array) -> Array:
 def quaternion_xyzw(R: Array) -> Array:
     """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
     # SciPy 1.11 takes no array that is read-only.
+    from scipy.spatial.transform import Rotation
+
     quaternion = Rotation.from_matrix(R.copy()).as_quat()
     return -quaternion if quaternion[3] < 0 else quaternion
 
@@ -124,6 +129,8 @@ def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
     """Return the (4, 4) transform of a translation (3,) and a quaternion (4,) in the order x, y,
     z, w.
     """
+    from scipy.spatial.transform import Rotation
+
     return make_transform(Rotation.from_quat(quat_xyzw.copy()).as_matrix(), translation)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.geometry import R_ROS_OPTICAL, Array, make_transform
@@ -98,6 +97,8 @@ class Mount:
     def T_base_left(self) -> Array:
         """The pose (4, 4) of the left optical frame in the base frame; not to be written to."""
         angles = [self.yaw_rad, self.pitch_rad, self.roll_rad]
+        from scipy.spatial.transform import Rotation  # see geometry.py
+
         R_base_camera = Rotation.from_euler('ZYX', angles).as_matrix()
         translation = np.array([self.forward_m, self.left_m, self.height_m])
         T_base_left = make_transform(R_base_camera @ R_ROS_OPTICAL, translation)
@@ -108,6 +109,8 @@ class Mount:
     def from_transform(cls, T_base_left: Array) -> Mount:
         """Return the mount of a (4, 4) pose of the left optical frame in the base frame."""
         R_base_camera = T_base_left[:3, :3] @ R_ROS_OPTICAL.T
+        from scipy.spatial.transform import Rotation
+
         yaw, pitch, roll = (float(a) for a in Rotation.from_matrix(R_base_camera).as_euler('ZYX'))
         x, y, z = (float(value) for value in T_base_left[:3, 3])
         return cls(z, pitch, roll, x, y, yaw)

@@ -17,9 +17,8 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import Array, invert, se3_log, transform_from_quaternion
+from segfloor_ros.geometry import Array, invert, make_transform, se3_log
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
@@ -38,7 +37,7 @@ def pose_array(pose: Pose) -> Array:
     values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
     if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 0.5:
         raise MessageError(f'a pose of {values.tolist()} is impossible (x y z qx qy qz qw)')
-    return transform_from_quaternion(values[:3], values[3:])
+    return make_transform(rotations_of(values[None, 3:])[0], values[:3])
 
 
 def odometry_message(
@@ -144,7 +143,7 @@ def path_of_numbers(stamp_ns: NDArray[np.int64], numbers: Array) -> KeyframePath
         raise MessageError('a path holds poses that are impossible')
     T_map_base = np.zeros((len(numbers), 4, 4))
     if len(numbers):
-        T_map_base[:, :3, :3] = Rotation.from_quat(numbers[:, 3:].copy()).as_matrix()
+        T_map_base[:, :3, :3] = rotations_of(numbers[:, 3:])
     T_map_base[:, :3, 3] = numbers[:, :3]
     T_map_base[:, 3, 3] = 1.0
     return KeyframePath(stamp_ns, T_map_base)
@@ -173,9 +172,44 @@ def pose_numbers(T_a_b: Array) -> Array:
     """Return transforms (N, 4, 4) as numbers (N, 7): x y z qx qy qz qw, with qw >= 0."""
     if len(T_a_b) == 0:
         return np.zeros((0, 7))
-    quaternions = Rotation.from_matrix(T_a_b[:, :3, :3].copy()).as_quat()
-    quaternions *= np.where(quaternions[:, 3:] < 0, -1.0, 1.0)
+    quaternions = quaternions_of(T_a_b[:, :3, :3])
     return np.concatenate([T_a_b[:, :3, 3], quaternions], axis=1)
+
+
+def rotations_of(quat_xyzw: Array) -> Array:
+    """Return rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
+    x, y, z, w = (quat_xyzw / np.linalg.norm(quat_xyzw, axis=1, keepdims=True)).T
+    rotations = np.empty((len(quat_xyzw), 3, 3))
+    rotations[:, 0] = np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1
+    )
+    rotations[:, 1] = np.stack(
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1
+    )
+    rotations[:, 2] = np.stack(
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1
+    )
+    return rotations
+
+
+def quaternions_of(rotations: Array) -> Array:
+    """Return quaternions (N, 4), x y z w with w >= 0, of rotations (N, 3, 3).
+
+    4 q qᵀ has the trace and the differences and sums of the entries for its own; its longest row is
+    the best conditioned (Shepperd, 1978).
+    """
+    R = rotations
+    squares = np.empty((len(R), 4, 4))
+    trace = np.trace(R, axis1=1, axis2=2)
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        squares[:, i, i] = 1 + 2 * R[:, i, i] - trace
+        squares[:, j, k] = squares[:, k, j] = R[:, j, k] + R[:, k, j]
+        squares[:, i, 3] = squares[:, 3, i] = R[:, k, j] - R[:, j, k]
+    squares[:, 3, 3] = 1 + trace
+    longest = np.argmax(np.diagonal(squares, axis1=1, axis2=2), axis=1)
+    found = squares[np.arange(len(R)), longest]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found * np.where(found[:, 3:] < 0, -1.0, 1.0)
 
 
 def _pose_messages(T_a_b: Array) -> list[Pose]:

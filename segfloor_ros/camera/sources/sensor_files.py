@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
@@ -65,6 +64,8 @@ def read_wheel_odometry(path: Path) -> list[WheelPose]:
             f'{path}, pose {bad[0] + 1}: the quaternion has length {norms[bad[0]]:.3g}, not 1; '
             f'expected {TUM_COLUMNS}'
         )
+    from scipy.spatial.transform import Rotation  # see geometry.py
+
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(table[:, 3:7]).as_matrix()
     poses[:, :3, 3] = table[:, :3]
