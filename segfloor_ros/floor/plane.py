@@ -134,7 +134,9 @@ def plane_disparity(samples: Samples, planes: Array) -> Array:
     """Return the disparity (N, M) of planes m (M, 3) at the samples, in pixels."""
     along = 1 + planes @ samples.position_m
     scale = -samples.disparity_m / np.where(np.abs(along) < 1e-6, 1e-6, along)
-    return (samples.rays @ planes.T) * scale
+    found = samples.rays @ planes.T
+    found *= scale
+    return found
 
 
 def scores(samples: Samples, angles_height: Array) -> Array:
@@ -145,7 +147,8 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     """
     planes = plane_of(angles_height)
     on, below, _ = on_and_below(samples, planes)
-    value = samples.weight @ (on - _VIOLATION_WEIGHT * below)
+    on -= _VIOLATION_WEIGHT * below
+    value = samples.weight @ on
     above_camera = 1 + planes @ samples.position_m < 0.2
     return np.where(above_camera, -np.inf, value)
 
@@ -157,11 +160,19 @@ def on_and_below(
     it lies clearly below, and whether the plane is visible there at all, each (N, M).
     """
     expected = plane_disparity(samples, planes)
-    error = samples.disparity_px[:, None] - expected
     visible = expected > _MIN_PLANE_PX
-    on = np.where(visible, np.maximum(1 - (error / INLIER_PX) ** 2, 0), 0)
-    # Matching errs in proportion to nothing, planes in proportion to their disparity.
-    below = visible & (error < -(2 * INLIER_PX + 0.05 * expected))
+    error = samples.disparity_px[:, None] - expected
+    # Matching errs in proportion to nothing, planes in proportion to their disparity. In place:
+    # thousands of samples times hundreds of planes are what a process needs most memory for.
+    expected *= 0.05
+    expected += 2 * INLIER_PX
+    np.negative(expected, out=expected)
+    below = visible & (error < expected)
+    on = np.divide(error, INLIER_PX, out=error)
+    np.multiply(on, on, out=on)
+    np.subtract(1, on, out=on)
+    np.maximum(on, 0, out=on)
+    on[~visible] = 0
     return on, below, visible
 
 
