@@ -105,6 +105,8 @@ def adjoint(T: Array) -> Array:
 
 def se3_logs(T: Array) -> Array:
     """Return the twists (N, 6) of transforms (N, 4, 4), as `se3_log` of each."""
+    from scipy.spatial.transform import Rotation
+
     phi = Rotation.from_matrix(T[:, :3, :3].copy()).as_rotvec()
     theta = np.linalg.norm(phi, axis=1)
     small = theta < 1e-4
