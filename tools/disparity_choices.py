@@ -61,7 +61,7 @@ def choices(settings: FloorSegmentationSettings) -> dict[str, Match]:
     """Return ways to match by name: the one in use, and what one choice at a time changes."""
 
     def matcher(mode: int = cv2.STEREO_SGBM_MODE_SGBM_3WAY, check: bool = True) -> Match:
-        return DisparityMatcher(NUM_DISPARITIES, settings, mode, check).compute
+        return DisparityMatcher(NUM_DISPARITIES, mode=mode, left_right_check=check).compute
 
     usual = matcher()
     return {
@@ -72,7 +72,7 @@ def choices(settings: FloorSegmentationSettings) -> dict[str, Match]:
         'without left-right check': matcher(check=False),
         'without sub-pixel steps': lambda left, right: np.rint(usual(left, right)),
         'left border left out': lambda left, right: _without_border(usual(left, right)),
-        'images enlarged twice': _enlarged(settings),
+        'images enlarged twice': _enlarged(),
         'half the resolution': lambda left, right: _halved(settings, left, right),
     }
 
@@ -142,8 +142,8 @@ def _without_border(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
     return disparity
 
 
-def _enlarged(settings: FloorSegmentationSettings) -> Match:
-    matcher = DisparityMatcher(2 * NUM_DISPARITIES, settings)
+def _enlarged() -> Match:
+    matcher = DisparityMatcher(2 * NUM_DISPARITIES)
 
     def match(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         size = (2 * left.shape[1], 2 * left.shape[0])

@@ -16,6 +16,13 @@ from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
 
+_HEIGHT_SIGMA_PER_M = 0.01
+"""Growth of the error of a height with the distance, one sigma."""
+_MASK_LOG_ODDS = 0.6
+"""Evidence of one look at the floor mask."""
+_LABEL_LOG_ODDS = 0.8
+"""A label is given, or changed, when the evidence exceeds this."""
+
 
 class CloudLabelling:
     """Labels the points of the sparse cloud by id, keyframe after keyframe."""
@@ -42,7 +49,7 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
-        looks = mask_evidence(mask, features.uv_px[seen]) * settings.mask_log_odds
+        looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, looks < 0, T_map_base)
         table.look(row, looks, settings.max_mask_log_odds, floor_z, distance_m)
@@ -68,13 +75,13 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         looked = table['looks'][row] > 0
         height_m = z_m[row] - table['floor_z_m'][row]
-        sigma_m = settings.height_sigma_m + settings.height_sigma_per_m * table['distance_m'][row]
+        sigma_m = settings.height_sigma_m + _HEIGHT_SIGMA_PER_M * table['distance_m'][row]
         by_height = height_evidence(height_m, sigma_m, settings) * looked
         log_odds = table['mask_log_odds'][row] + by_height
         belief = table['belief'][row]
         # Between the thresholds it stays as it is.
-        belief[log_odds >= settings.label_log_odds] = OBSTACLE
-        belief[log_odds <= -settings.label_log_odds] = FLOOR
+        belief[log_odds >= _LABEL_LOG_ODDS] = OBSTACLE
+        belief[log_odds <= -_LABEL_LOG_ODDS] = FLOOR
         belief[~looked] = UNKNOWN
         concerned = height_m <= settings.robot_height_m
         concerned &= height_m >= -(settings.drop_height_m + 2 * sigma_m)

@@ -20,20 +20,6 @@ class CloudLabellingSettings(RobotSettings):
         maximum=0.5,
         live=True,
     )
-    height_sigma_per_m: float = setting(
-        0.01,
-        'Growth of the height error per metre of distance, one sigma.',
-        minimum=0.0,
-        maximum=0.2,
-        live=True,
-    )
-    mask_log_odds: float = setting(
-        0.6,
-        'Evidence of one look at the floor mask.',
-        minimum=0.05,
-        maximum=5.0,
-        live=True,
-    )
     max_mask_log_odds: float = setting(
         3.0,
         'Limit of the summed evidence of the mask, so that it can change its mind.',
@@ -46,12 +32,5 @@ class CloudLabellingSettings(RobotSettings):
         'Limit of the evidence of the height.',
         minimum=0.0,
         maximum=20.0,
-        live=True,
-    )
-    label_log_odds: float = setting(
-        0.8,
-        'A label is given, or changed, when the evidence exceeds this.',
-        minimum=0.0,
-        maximum=10.0,
         live=True,
     )

@@ -7,7 +7,6 @@ disparities are large, and an error of twice as many pixels is still a small sha
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -21,6 +20,18 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 SUBPIXEL = 16
 """Steps per pixel of the matcher's fixed-point disparities."""
+NOISE_PX = 0.5
+"""Error of a disparity, one sigma."""
+BLOCK_PX = 5
+"""Side of the block that is matched."""
+SPECKLE_PX = 60
+"""Islands of fewer pixels are dropped."""
+_SMALL_STEP, _LARGE_STEP = 8, 32
+"""Penalties P1 of a disparity step of one and P2 of a larger one, per pixel of the block."""
+_UNIQUENESS_PERCENT = 5
+"""How much better than the second the best match must be."""
+_LEFT_RIGHT_PX = 1
+"""Largest left-right difference of a disparity."""
 
 _STEP = 16
 _SAME_GAIN = 0.08
@@ -79,24 +90,25 @@ class DisparityMatcher:
     def __init__(
         self,
         num_disparities: int,
-        settings: FloorSegmentationSettings,
+        block_px: int = BLOCK_PX,
+        speckle_px: int = SPECKLE_PX,
         mode: int = cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         left_right_check: bool = True,
     ) -> None:
         self.num_disparities = num_disparities
-        area = settings.block_size_px**2
+        area = block_px**2
         # OpenCV takes what is not positive for 1.
-        tolerance = settings.left_right_tolerance_px if left_right_check else num_disparities
+        tolerance = _LEFT_RIGHT_PX if left_right_check else num_disparities
         self._matcher = cv2.StereoSGBM_create(
             minDisparity=0,
             numDisparities=num_disparities,
-            blockSize=settings.block_size_px | 1,
-            P1=settings.smoothness_small * area,
-            P2=max(settings.smoothness_large, settings.smoothness_small + 1) * area,
+            blockSize=block_px,
+            P1=_SMALL_STEP * area,
+            P2=_LARGE_STEP * area,
             disp12MaxDiff=tolerance,
             preFilterCap=31,
-            uniquenessRatio=settings.uniqueness_percent,
-            speckleWindowSize=settings.speckle_size_px,
+            uniquenessRatio=_UNIQUENESS_PERCENT,
+            speckleWindowSize=speckle_px,
             speckleRange=2,
             mode=mode,
         )
@@ -130,14 +142,10 @@ class TwoScaleMatcher:
         self._coarse: DisparityMatcher | None = None
         self.num_disparities = num_disparities
         if fine < num_disparities:
-            coarse = dataclasses.replace(
-                settings,
-                block_size_px=_COARSE_BLOCK_PX,
-                speckle_size_px=settings.speckle_size_px // 4,
-            )
-            self._coarse = DisparityMatcher(-(-num_disparities // (2 * _STEP)) * _STEP, coarse)
+            halved = -(-num_disparities // (2 * _STEP)) * _STEP
+            self._coarse = DisparityMatcher(halved, _COARSE_BLOCK_PX, SPECKLE_PX // 4)
             self.num_disparities = 2 * self._coarse.num_disparities
-        self._fine = DisparityMatcher(min(fine, num_disparities), settings)
+        self._fine = DisparityMatcher(min(fine, num_disparities))
 
     def compute(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], fine_rows: int

@@ -17,6 +17,8 @@ _STEP_PX = 2
 """Regions are found at this part of the resolution."""
 _MIN_REGION_PX = 15
 _THREAD_PX = 3
+_ISLAND_SHARE = 0.05
+"""Patches of floor smaller than this share of the largest are dropped."""
 _BORDER_PX = 12
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
@@ -207,7 +209,7 @@ def fill_gaps(
     return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
 
 
-def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]:
+def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the mask without patches of floor smaller than a share of the largest."""
     step = _STEP_PX
     small = (mask[::step, ::step] == FLOOR).astype(np.uint8)
@@ -215,7 +217,7 @@ def drop_islands(mask: NDArray[np.uint8], min_share: float) -> NDArray[np.uint8]
     if count < 3:
         return mask
     area = stats[:, cv2.CC_STAT_AREA]
-    is_lone = area < min_share * area[1:].max()
+    is_lone = area < _ISLAND_SHARE * area[1:].max()
     if not is_lone.any():
         return mask
     lone = _enlarged(is_lone[label], mask) & (mask == FLOOR)

@@ -28,7 +28,6 @@ from segfloor_ros.floor.plane import (
     scores,
     with_known,
 )
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
 _MAX_FRAMES = 12
@@ -88,7 +87,7 @@ class MountEstimator:
         self._offset = (forward_m, left_m)
         self._views: list[MirrorView] = []
         self._guesses = np.zeros((0, 3))
-        self._matcher = DisparityMatcher(disparity_range(camera, None), FloorSegmentationSettings())
+        self._matcher = DisparityMatcher(disparity_range(camera, None))
         self._rng, self._mirror_rng = (np.random.default_rng(seed) for seed in (0, 1))
         self._fits: list[PlaneFit] = []
         self._settled = False

@@ -7,7 +7,6 @@ that.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import cv2
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher
+from segfloor_ros.floor.disparity import SPECKLE_PX, DisparityMatcher
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.texture import texture_grey
 from segfloor_ros.geometry import Array, transform_points
@@ -40,12 +39,7 @@ class OverheadMatcher:
         self._camera, self._settings = camera, settings
         nearest_px = min(num_disparities, camera.disparity_times_depth / _NEAREST_M)
         searched = math.ceil(nearest_px / (_SCALE * _STEP)) * _STEP
-        finer = dataclasses.replace(
-            settings,
-            block_size_px=_BLOCK_PX,
-            speckle_size_px=settings.speckle_size_px // _SCALE**2,
-        )
-        self._matcher = DisparityMatcher(searched, finer)
+        self._matcher = DisparityMatcher(searched, _BLOCK_PX, SPECKLE_PX // _SCALE**2)
 
     def positions(
         self,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.floor.pixel_evidence import Comparison
 from segfloor_ros.floor.profile import FloorProfile
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
@@ -22,6 +21,10 @@ _STEP_PX = 2
 _WINDOW = 5
 _WIDE_WINDOW = 15
 """What too little texture leaves open in a small window a larger one often tells."""
+_AGAINST_GREY = 1.0
+"""By how much the images must contradict the floor to deny it, beyond their noise."""
+_LIKENESS_GREY = 3.0
+"""How much left and right may differ on the floor, beyond their noise."""
 _WIDE_RATIO = 1.15
 _WIDE_MARGIN_GREY = 0.05
 _WIDE_SHARE = 0.65
@@ -38,7 +41,6 @@ def compare(
     right: NDArray[np.uint8],
     disparity: NDArray[np.float32],
     noise_grey: float,
-    settings: FloorSegmentationSettings,
 ) -> Comparison:
     """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
 
@@ -58,15 +60,15 @@ def compare(
         return _local_difference(sampled, seen)
 
     floor, matched = difference(floor_px), difference(matched_px)
-    margin = settings.against_grey + 0.5 * noise_grey
+    margin = _AGAINST_GREY + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
-    unlike = floor > settings.likeness_grey + _NOISE_SHARE * noise_grey
+    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
     wide = (_WIDE_WINDOW, _WIDE_WINDOW)
     denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
     worse = floor > 1.1 * matched
     denied &= (matched_px > 0) & worse
     denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
-    contrary = against | (floor > 2 * settings.likeness_grey + _NOISE_SHARE * noise_grey)
+    contrary = against | (floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey)
     reached = columns >= floor_px + _MARGIN_PX
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.disparity import SUBPIXEL
+from segfloor_ros.floor.disparity import NOISE_PX, SUBPIXEL
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView
 
+_MIN_DISPARITY_PX = 2.5
+"""Farther floor is not judged."""
 _SURE_SHARE = 1.5
 """Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
@@ -64,7 +66,7 @@ class HeightTable:
         disparity[0] = np.nan
         scale = line.metres_per_row / disparity
         # One pixel of disparity is this much height: the camera's height over the disparity.
-        noise_m = settings.disparity_noise_px * line.metres_per_row / line.slope / disparity
+        noise_m = NOISE_PX * line.metres_per_row / line.slope / disparity
         row = profile.row_of_disparity(disparity)
         tables = (
             row,
@@ -105,7 +107,7 @@ def judge(
     off = above | (height < -table.down.take(index))
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
-    near = disparity >= np.float32(settings.min_disparity_px)
+    near = disparity >= np.float32(_MIN_DISPARITY_PX)
     # On a sill the images contradict the floor, and show that it is a sill.
     sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))
     sill &= up < np.float32(_SURE_SHARE * settings.step_height_m)

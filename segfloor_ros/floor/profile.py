@@ -13,14 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity import NOISE_PX
 from segfloor_ros.floor.observation import VDisparity
 from segfloor_ros.floor.runs import pixels_where
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
 SEGMENTS = 5
 _CONTROLS = SEGMENTS + 3
 BINS_PER_PX = 2
+PITCH_SIGMA_RAD = 0.006
+HEIGHT_SIGMA = 0.01
+"""How far pitch and height, as a share of it, may swing about the mount, one sigma."""
+_SCALE_PX = 0.6
+"""Scale of the M-estimator."""
+_STIFFNESS = 0.02
+"""How strongly the spline resists bending."""
 _SCHEDULE = (
     ((1.5, 1e4), (1.0, 1e4))  # a line, near the plane that is known
     + 2 * ((1.5, 1.0),)  # a spline, which grows along the floor where that bends
@@ -123,7 +130,6 @@ def fit_profile(
     v_disparity: VDisparity,
     line: FloorLine,
     camera: StereoCamera,
-    settings: FloorSegmentationSettings,
 ) -> FloorProfile:
     """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
 
@@ -139,21 +145,21 @@ def fit_profile(
     below = rows + first_row >= start
     rows, bins, disparity = rows[below], bins[below], disparity[below]
     basis = spline_basis((rows + first_row - start) * to_position)
-    weight = counts[rows, bins] / (_CORRELATED_PIXELS * settings.disparity_noise_px**2)
+    weight = counts[rows, bins] / (_CORRELATED_PIXELS * NOISE_PX**2)
     # The control points of a straight line lie on it, at their own abscissae.
     abscissae = start + (np.arange(_CONTROLS) - 1) / to_position
     prior = line.slope * (abscissae - line.horizon)
-    information = _prior_information(prior, line, camera, settings)
+    information = _prior_information(prior, line, camera)
     controls = prior.copy()
     bend = np.diff(np.eye(_CONTROLS), n=2, axis=0)
-    scale = settings.profile_scale_px
+    scale = _SCALE_PX
     support = 0.0
     for factor, stiffness in _SCHEDULE:
         residual = disparity - basis @ controls
         ratio = np.clip(residual / (3 * factor * scale), -1, 1)
         robust = weight * (1 - ratio**2) ** 2
         normal = basis.T @ (basis * robust[:, None]) + information
-        normal += settings.profile_stiffness * stiffness * bend.T @ bend
+        normal += _STIFFNESS * stiffness * bend.T @ bend
         controls = prior + np.linalg.solve(normal, basis.T @ (robust * (disparity - basis @ prior)))
         support = float(robust.sum())
     controls = np.maximum.accumulate(controls)
@@ -163,9 +169,7 @@ def fit_profile(
     return FloorProfile(line, float(grid[0]), values, support)
 
 
-def _prior_information(
-    prior: Array, line: FloorLine, camera: StereoCamera, settings: FloorSegmentationSettings
-) -> Array:
+def _prior_information(prior: Array, line: FloorLine, camera: StereoCamera) -> Array:
     """Return the information (8, 8) that the mount gives on the control points.
 
     The pitch shifts the line, the height scales it.
@@ -176,8 +180,8 @@ def _prior_information(
     jacobian[1, ends] = (-1.0, 1.0)
     sigma = np.array(
         [
-            line.slope * camera.fy * settings.pitch_sigma_rad,
-            settings.height_sigma * float(prior[-1] - prior[0]),
+            line.slope * camera.fy * PITCH_SIGMA_RAD,
+            HEIGHT_SIGMA * float(prior[-1] - prior[0]),
         ]
     )
     scaled = jacobian / sigma[:, None]

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity import NOISE_PX
 from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
 RANGE_STEP_M = 0.025
+_INCREMENT_RAD = 0.0087266
+"""Half a degree between two bearings."""
 _GAP_ROWS = 4.0
 """So many image rows of floor may be missing, however many metres they are."""
 _CONTACT_ROWS = 2.5
@@ -44,11 +47,11 @@ class FloorScanner:
         border = _floor_on_border(camera, mount)
         bearing = np.arctan2(border[:, 1], border[:, 0])
         # Whole in single precision, as a message carries it.
-        step = self._step = float(np.float32(settings.scan_increment_rad))
+        step = self._step = float(np.float32(_INCREMENT_RAD))
         first = np.floor(bearing.min() / step) if len(border) else 0.0
         self._angle_min = float(np.float32(first * step))
         self._count = int(np.ceil(bearing.max() / step) - first) + 1 if len(border) else 1
-        noise_px = _MEDIAN_NOISE * settings.disparity_noise_px
+        noise_px = _MEDIAN_NOISE * NOISE_PX
         # Depth from disparity: an error of the disparity d grows to Z^2 / (f b) times as much.
         range_max_m = math.sqrt(RANGE_MAX_ERROR_M * camera.disparity_times_depth / noise_px)
         self._range_max_m = float(np.float32(range_max_m))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.blank_border import blank_border, matched_in
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import TwoScaleMatcher, disparity_range, stereo_view
+from segfloor_ros.floor.disparity import BLOCK_PX, TwoScaleMatcher, disparity_range, stereo_view
 from segfloor_ros.floor.filling import (
     beside_something,
     beyond_texture,
@@ -34,12 +34,19 @@ from segfloor_ros.floor.overhead import OverheadMatcher
 from segfloor_ros.floor.photometric import compare
 from segfloor_ros.floor.pixel_evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.plane import PlaneFit, Samples, angles_height_of, propose, refine, scores
-from segfloor_ros.floor.profile import BINS_PER_PX, FloorLine, FloorProfile, fit_profile
+from segfloor_ros.floor.profile import (
+    BINS_PER_PX,
+    HEIGHT_SIGMA,
+    PITCH_SIGMA_RAD,
+    FloorLine,
+    FloorProfile,
+    fit_profile,
+)
 from segfloor_ros.floor.remembered_floor import FloorMemory
 from segfloor_ros.floor.runs import pixels_where
 from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.floor.texture import NOISE_TEXTURE, noise_grey, texture_grey
+from segfloor_ros.floor.texture import MIN_TEXTURE_GREY, NOISE_TEXTURE, noise_grey, texture_grey
 from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
 from segfloor_ros.timing import NoTimes, StageTimes
@@ -114,7 +121,7 @@ class FloorSegmentation:
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
-            enough = max(settings.min_texture_grey, NOISE_TEXTURE * noise)
+            enough = max(MIN_TEXTURE_GREY, NOISE_TEXTURE * noise)
             texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
             if measured is not None:
                 # Depth is measured on plain surfaces, too.
@@ -133,9 +140,9 @@ class FloorSegmentation:
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             counted = self._v_disparity(view, below, texture > 2 * enough)
-            profile = fit_profile(counted, view.line, self._camera, settings)
+            profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
-            compared = compare(view, profile, left_rows, right_rows, below, noise, settings)
+            compared = compare(view, profile, left_rows, right_rows, below, noise)
         with measure('evidence'):
             table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
             evidence = judge(view, profile, below, textured, compared, table, settings)
@@ -296,8 +303,7 @@ class FloorSegmentation:
         likelihood = likelihood * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
         likelihood[0] *= _FAITH
         start = expected[int(np.argmax(likelihood))]
-        settings = self._settings
-        sigma = np.array([*2 * [settings.pitch_sigma_rad], settings.height_sigma * start[2]])
+        sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
         if slope_start is not None:
             start, sigma = slope_start, _SLOPE_SIGMA
         unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
@@ -333,7 +339,7 @@ class FloorSegmentation:
         )
         may_be = compared.consistent & ~compared.denied & ~barred
         mask = fill_gaps(view, profile, mask, may_be, settings.fill_gap_m)
-        return drop_islands(mask, settings.island_share)
+        return drop_islands(mask)
 
     def _scan(
         self,
@@ -357,7 +363,7 @@ class FloorSegmentation:
         v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
-        border_px = np.float32(_BORDER_BLOCKS * self._settings.block_size_px)
+        border_px = np.float32(_BORDER_BLOCKS * BLOCK_PX)
         shared = u * view.step >= floor_px + border_px
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SIGMA_PX = 2.0
+MIN_TEXTURE_GREY = 0.2
+"""Below this slope of the image along a row, per pixel, a disparity says nothing."""
 NOISE_TEXTURE = 0.1
 """Texture per grey level of noise that is surely no noise: its own is 0.04."""
 _LAPLACIAN_GAIN = 6.0

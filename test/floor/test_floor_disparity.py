@@ -22,7 +22,7 @@ def shifted_pair(shift_px: int, height: int = 80, width: int = 240):
 
 def test_a_shift_is_found_up_to_the_last_column_the_right_image_reaches():
     left, right = shifted_pair(20)
-    disparity = DisparityMatcher(64, FloorSegmentationSettings()).compute(left, right)
+    disparity = DisparityMatcher(64).compute(left, right)
     assert disparity.dtype == np.float32
     # 64 columns would stay empty without the padding; the right image reaches column 20.
     inner = disparity[5:-5, 26:-6]
@@ -32,7 +32,7 @@ def test_a_shift_is_found_up_to_the_last_column_the_right_image_reaches():
 
 def test_without_texture_there_is_hardly_a_match():
     grey = np.full((80, 240), 128, np.uint8)
-    disparity = DisparityMatcher(32, FloorSegmentationSettings()).compute(grey, grey)
+    disparity = DisparityMatcher(32).compute(grey, grey)
     assert np.mean(disparity > 0) < 0.01
 
 
@@ -84,5 +84,5 @@ def test_a_short_range_takes_one_scale():
     settings = FloorSegmentationSettings()
     matcher = TwoScaleMatcher(48, settings)
     assert matcher.num_disparities == 48
-    whole = DisparityMatcher(48, settings).compute(left, right)
+    whole = DisparityMatcher(48).compute(left, right)
     assert np.array_equal(matcher.compute(left, right, fine_rows=10), whole)

@@ -14,7 +14,7 @@ def test_patches_much_smaller_than_the_floor_are_dropped():
     mask[10:40, 150:180] = FLOOR  # 900, a sixth
     mask[90:100, 180:190] = FLOOR  # 100, a sixtieth
     mask[80:110, 192:] = NOT_FLOOR
-    dropped = drop_islands(mask, 0.05)
+    dropped = drop_islands(mask)
     assert (dropped[90:100, 180:190] == NO_EVIDENCE).all()
     others = np.ones(mask.shape, bool)
     others[90:100, 180:190] = False

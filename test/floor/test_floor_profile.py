@@ -56,7 +56,7 @@ def test_fit_follows_the_floor_past_an_upright_surface():
     counts = counts_of(rows, floor, (280, 260))
     wall_rows = np.arange(0, 160)
     counts += counts_of(wall_rows, np.full(160, 25.0), counts.shape, weight=60)
-    profile = fit_profile(VDisparity(counts, first, BINS_PER_PX), line, CAMERA, SETTINGS)
+    profile = fit_profile(VDisparity(counts, first, BINS_PER_PX), line, CAMERA)
     assert np.abs(profile.at_rows(rows + first) - floor).max() < 0.3
     assert np.all(np.diff(profile.disparity_px) > 0)
 
@@ -64,7 +64,7 @@ def test_fit_follows_the_floor_past_an_upright_surface():
 def test_profile_is_inverted_and_unknown_above_the_horizon():
     line = FloorLine.of(CAMERA, Mount(0.3, np.radians(7.0)))
     counts = counts_of(np.arange(20, 280), np.zeros(260) + 1, (280, 260), weight=0)
-    profile = fit_profile(VDisparity(counts, 200, BINS_PER_PX), line, CAMERA, SETTINGS)
+    profile = fit_profile(VDisparity(counts, 200, BINS_PER_PX), line, CAMERA)
     rows = np.array([230.0, 300.5, 470.0, 500.0])
     assert np.allclose(profile.row_of_disparity(profile.at_rows(rows)), rows, atol=1e-3)
     assert np.isnan(profile.at_rows(np.array([line.horizon - 2]))).all()
