@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.geometry import Array, invert
+from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.slam.excluded import Region
+from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
 
 WIDTH_PX = 160
@@ -34,14 +35,21 @@ SPECKLE_PX = 40
 TOLERANCE_PX = 0.6
 """Disparities of the shrunk images that differ by more do not show the same thing."""
 
-MAX_PARALLAX = float(np.tan(np.radians(30.0)))
+MAX_PARALLAX_RAD = float(np.radians(30.0))
+FAR_PERCENT = 80
+"""What is farther than most of the image stands behind what moves."""
+
 COMPARED_VIEWS = 5
 KEPT_VIEWS = 30
 MIN_HEIGHT_M = 0.05
 """What is lower may be floor, whose disparities repeat and mirror."""
 
+NOISE_GREY = 1.0
+MISFIT_OF_TEXTURE = 0.7
+"""Patches that show different things differ by more than this share of their texture."""
+
 MIN_AREA_PX = 12
-SHARE_OF_REGION = 0.2
+SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
 
 Disparity = NDArray[np.float32]
@@ -90,11 +98,14 @@ class MovingRegions:
 
     def measure(self, left: NDArray[np.uint8], right: NDArray[Any]) -> Disparity:
         """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
+        small_left = cv2.resize(left, self._size, interpolation=cv2.INTER_AREA)
         if is_disparity(right):
+            self._pair = small_left, None
             return shrunk(right.astype(np.float32, copy=False), self._size)
-        small = (cv2.resize(i, self._size, interpolation=cv2.INTER_AREA) for i in (left, right))
+        small_right = cv2.resize(right, self._size, interpolation=cv2.INTER_AREA)
+        self._pair = small_left, small_right
         # Without a margin the matcher leaves the leftmost columns empty.
-        wide = (cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for i in small)
+        wide = (cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for i in self._pair)
         found = self._matcher.compute(*wide)[:, DISPARITIES:].astype(np.float32) / 16
         found[found > np.arange(self._size[0]) + 1] = 0.0
         return np.maximum(found, 0.0)
@@ -111,12 +122,15 @@ class MovingRegions:
         if len(self._views) < 2 or len(rows) == 0:
             return None
         points = self._rays[:, rows] * (self._disparity_m / disparity.ravel()[rows])
-        through, solid = self._compare(points, disparity.ravel()[rows], T_camera_world)
+        through, solid, behind = self._compare(points, disparity.ravel()[rows], T_camera_world)
         high = np.ones(len(rows), bool)
         if mount is not None:
             high = mount.heights_m(points.T) > MIN_HEIGHT_M
         seeds, doubtful = (np.zeros(disparity.size, np.uint8) for _ in range(2))
-        seeds[rows] = (through > solid) & (through > 1) & high
+        seeds[rows] = (through >= solid) & (through > 1) & high
+        background = disparity.copy()
+        background.ravel()[rows] = behind
+        seeds &= self._shown(disparity, background).ravel()
         doubtful[rows] = (solid <= through) & high
         moving = self._regions(
             seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
@@ -134,36 +148,63 @@ class MovingRegions:
 
     def _compare(
         self, points: NDArray[np.float32], disparity: Disparity, T_camera_world: Array
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return how many earlier views saw through points (3, N), and how many saw them."""
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Disparity]:
+        """Return how many earlier views saw through points (3, N), how many saw them, and the
+        disparity of what the latest of the former saw behind.
+        """
         through, solid = (np.zeros(points.shape[1], np.uint8) for _ in range(2))
+        background = disparity.copy()
         T_world_camera = invert(T_camera_world)
-        for view in self._chosen():
+        for view in self._chosen(T_world_camera, float(np.percentile(points[2], FAR_PERCENT))):
             T = (view.keyframe.T_camera_world @ T_world_camera).astype(np.float32)
             x, y, z = T[:3, :3] @ points + T[:3, 3:]
-            apart = float(np.linalg.norm(T[:3, 3]))
             depth = np.maximum(z, 0.01)
             u = np.rint(self._focal[0] * x / depth + self._centre[0])
             v = np.rint(self._focal[1] * y / depth + self._centre[1])
-            inside = (z > 0.05) & (apart < MAX_PARALLAX * z)
-            inside &= (u >= 0) & (u < self._size[0]) & (v >= 0) & (v < self._size[1])
+            inside = (z > MIN_DEPTH_M) & (u >= 0) & (u < self._size[0])
+            inside &= (v >= 0) & (v < self._size[1])
             at = np.where(inside, v * self._size[0] + u, 0).astype(np.intp)
             inside &= view.disparity.ravel()[at] > 0
             expected = self._disparity_m / depth
             tolerance = TOLERANCE_PX * np.sqrt(1 + (expected / disparity) ** 4)
-            behind = view.nearest.ravel()[at] < expected - tolerance
+            nearest = view.nearest.ravel()[at]
+            behind = nearest < expected - tolerance
             before = view.farthest.ravel()[at] > expected + tolerance
             through += inside & behind
+            # Farther along much the same ray by as much as the earlier view says.
+            seen = np.flatnonzero(inside & behind)
+            background[seen] = disparity[seen] * nearest[seen] / expected[seen]
             solid += inside & ~behind & ~before
-        return through, solid
+        return through, solid, background
 
-    def _chosen(self) -> list[DepthView]:
-        """Return a few views spread over the time that is remembered."""
-        count = len(self._views)
-        chosen = np.unique(
-            np.linspace(0, count - 1, min(count, COMPARED_VIEWS)).round().astype(int)
-        )
-        return [self._views[i] for i in chosen]
+    def _shown(self, disparity: Disparity, background: Disparity) -> NDArray[np.uint8]:
+        """Return where (h, w) the pair of images itself speaks for a disparity and against what was
+        seen behind: a pattern that repeats fits both.
+        """
+        left, right = self._pair
+        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._size))
+
+        def misfit(d: Disparity) -> Disparity:
+            moved = cv2.remap(right, u - d, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(cv2.blur(cv2.absdiff(left, moved), (5, 5)), np.float32)
+
+        rival = np.minimum.reduce([misfit(background + step) for step in (-0.5, 0.0, 0.5)])
+        texture = cv2.blur(cv2.absdiff(left, cv2.blur(left, (5, 5))), (5, 5))
+        clearly = np.maximum(1.5 * misfit(disparity), MISFIT_OF_TEXTURE * texture)
+        return (rival > clearly + NOISE_GREY).astype(np.uint8)
+
+    def _chosen(self, T_world_camera: Array, depth_m: float) -> list[DepthView]:
+        """Return a few views that look at what the camera sees from much the same side, spread over
+        the time that is remembered. depth_m: how far away that is.
+        """
+        near = []
+        for view in self._views:
+            T = view.keyframe.T_camera_world @ T_world_camera
+            apart, turned = float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])
+            if turned < MAX_PARALLAX_RAD and apart < np.tan(MAX_PARALLAX_RAD) * depth_m:
+                near.append(view)
+        spread = np.linspace(0, len(near) - 1, min(len(near), COMPARED_VIEWS))
+        return [near[i] for i in np.unique(spread.round().astype(int))]
 
     def _regions(
         self, seeds: NDArray[np.uint8], doubtful: NDArray[np.uint8], disparity: Disparity
@@ -178,4 +219,5 @@ class MovingRegions:
         whole = (seeded > SHARE_OF_REGION * area) & (seeded >= MIN_AREA_PX)
         whole[0] = False
         moving = whole[labels] | ((seeds > 0) & (seeded[labels] >= MIN_AREA_PX))
-        return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), around)
+        # As far as blocks reach beyond the edge of what moves.
+        return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), np.ones((5, 5), np.uint8))
