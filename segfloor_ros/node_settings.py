@@ -127,6 +127,14 @@ class StereoSlamNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=0.5,
     )
+    mask_timeout_s: float = setting(
+        0.2,
+        'A mask on dynamic_mask is used for later frames, too, until it is so old or a newer one '
+        'comes; 0: only for the frame of its stamp.',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
     max_waiting_frames: int = setting(
         3,
         'When more pairs than these wait, the oldest are skipped, so that poses stay fresh where '

@@ -54,6 +54,15 @@ class StereoRectifier:
             cv2.remap(right, *self._maps[1], cv2.INTER_LINEAR),
         )
 
+    def rectify_mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a mask (H, W) of the raw left image on the rectified one: 255 where it is more
+        than half, 0 elsewhere. Raises CalibrationError when the size is not the calibration's.
+        """
+        self.calibration.check_size(mask.shape[1], mask.shape[0], 'the mask of what moves')
+        if self._maps is not None:
+            mask = np.asarray(cv2.remap(mask, *self._maps[0], cv2.INTER_NEAREST), np.uint8)
+        return np.where(mask > 127, np.uint8(255), np.uint8(0))
+
 
 def rectification_maps(eye: EyeCalibration) -> Maps:
     """Return where each pixel of the rectified image is in the raw one, as fixed-point maps of

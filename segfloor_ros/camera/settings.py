@@ -60,8 +60,8 @@ class StereoCameraSettings(StageSettings):
 
     masks: str = setting(
         '',
-        'Folder of masks of what moves: %06d.png by frame index, on the rectified left image, 255 '
-        '= moving; empty: none.',
+        'Folder of masks of what moves: %06d.png by frame index, of the left image as recorded, '
+        '255 = moving; empty: none.',
     )
 
     @property

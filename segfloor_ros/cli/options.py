@@ -23,8 +23,8 @@ MasksOption = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
         '--masks',
-        help='Folder of masks of what moves: %06d.png by frame index, on the rectified left image, '
-        '255 = moving.',
+        help='Folder of masks of what moves: %06d.png by frame index, of the left image as '
+        'recorded, 255 = moving.',
     ),
 ]
 IgnoreOption = Annotated[

@@ -11,7 +11,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
-from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
+from segfloor_ros.slam.results import KeyframeFeatures, MovingPoints, SparseCloud
 
 _XYZ = [('x', '<f4'), ('y', '<f4'), ('z', '<f4')]
 FEATURE_DTYPE = np.dtype([*_XYZ, ('u', '<f4'), ('v', '<f4'), ('id', '<i4')])
@@ -19,6 +19,8 @@ MAP_POINT_DTYPE = np.dtype([*_XYZ, ('id', '<i4')])
 LABELLED_DTYPE = np.dtype(
     [*_XYZ, ('id', '<i4'), ('confidence', '<f4'), ('label', 'u1'), ('_', 'V3')]
 )
+
+MOVING_DTYPE = np.dtype([*_XYZ, ('vx', '<f4'), ('vy', '<f4'), ('vz', '<f4')])
 
 _FIELD_TYPES = {
     PointField.INT8: 'i1',
@@ -100,6 +102,15 @@ def features_arrays(message: PointCloud2, topic: str) -> KeyframeFeatures:
     points = cloud_array(message, FEATURE_DTYPE, topic)
     uv = np.stack([points['u'], points['v']], axis=1).astype(np.float32)
     return KeyframeFeatures(uv, points['id'].astype(np.int32), _xyz(points))
+
+
+def moving_points_message(stamp_ns: int, frame_id: str, moving: MovingPoints) -> PointCloud2:
+    """Return points of what moves with their velocities."""
+    points = np.zeros(len(moving.xyz_map), MOVING_DTYPE)
+    for column, (place, speed) in enumerate(zip('xyz', ('vx', 'vy', 'vz'), strict=True)):
+        points[place] = moving.xyz_map[:, column]
+        points[speed] = moving.velocity_m_s[:, column]
+    return cloud_message(stamp_ns, frame_id, points)
 
 
 def sparse_cloud_message(stamp_ns: int, frame_id: str, cloud: SparseCloud) -> PointCloud2:

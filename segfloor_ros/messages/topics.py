@@ -35,6 +35,7 @@ NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
 OTHERS = ''
 """In place of a publisher: nodes outside of this package."""
 
+MOVING_MASK = 'keyframe/moving_mask'
 MAP_START = 'keyframe/map_start'
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
 PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
@@ -164,6 +165,35 @@ _ALL = [
         'lost.',
         is_optional=True,
         on_demand_by=(CLOUD,),
+    ),
+    Topic(
+        'dynamic_mask',
+        Image,
+        qos.IMAGES_BEST_EFFORT,
+        OTHERS,
+        (SLAM,),
+        'mono8, 255 where something moves, of the left image that stereo_slam receives, with its '
+        'stamp; from a segmentation network. Used when there, never waited for.',
+        is_optional=True,
+        also_by=(CAMERA,),
+    ),
+    Topic(
+        'moving_points',
+        PointCloud2,
+        qos.ODOMETRY,
+        SLAM,
+        (),
+        'What moves, every few frames: x y z in map (m), vx vy vz (m/s, NaN where not known). '
+        'Empty where nothing does.',
+    ),
+    Topic(
+        MOVING_MASK,
+        Image,
+        qos.KEYFRAMES,
+        SLAM,
+        (FLOOR,),
+        'mono8 on the rectified left image of the keyframe: 255 where something moves.',
+        is_optional=True,
     ),
     Topic(
         FRAME_DONE,

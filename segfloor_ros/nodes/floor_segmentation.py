@@ -18,6 +18,7 @@ from segfloor_ros.messages.floor import disparity_message, scan_message
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import pose_array, transform_array
+from segfloor_ros.messages.topics import MOVING_MASK
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
 from segfloor_ros.nodes.free_scan import FreeScan
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
@@ -50,7 +51,9 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._free_scan = FreeScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE)
-        self._keyframes = KeyframeJoin(self, parts, self._segment, may_process=self._has_mount)
+        self._keyframes = KeyframeJoin(
+            self, parts, self._segment, may_process=self._has_mount, optional=(MOVING_MASK,)
+        )
 
     def reset_stage(self) -> None:
         """Begin without memory of the floor."""
@@ -89,7 +92,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         frame_id = parts[LEFT].header.frame_id
         left, right = grey8_image(parts[LEFT], LEFT), grey8_image(parts[RIGHT], RIGHT)
         T_map_base = pose_array(parts[POSE].pose.pose)
-        floor = stage.process(left, right, self._mount, T_map_base)
+        moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
+        floor = stage.process(left, right, self._mount, T_map_base, moving)
         self._mask.publish(image_message(stamp_ns, frame_id, floor.mask))
         self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
         if self._disparity.get_subscription_count():

@@ -24,7 +24,8 @@ class KeyframeJoin:
     keyframe belongs to, the node is reset before the first one of another map.
 
     may_process: keyframes are kept while it says no, until `process_waiting`. is_last: the
-    keyframe goes no further when the node has processed it.
+    keyframe goes no further when the node has processed it. optional: parts that are waited for
+    only where somebody publishes them.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class KeyframeJoin:
         process: Process,
         may_process: Callable[[], bool] = lambda: True,
         is_last: bool = False,
+        optional: Sequence[str] = (),
     ) -> None:
         self._node = node
         self._process = process
@@ -44,10 +46,11 @@ class KeyframeJoin:
         self.map_start_ns: int | None = None
         """When the map was begun; None where nobody has told."""
 
-        def is_told() -> bool:
-            return node.inputs.publisher_count(MAP_START) > 0
+        def is_told(topic: str) -> bool:
+            return node.inputs.publisher_count(topic) > 0
 
-        node.inputs.join(parts, self._take, optional={MAP_START: is_told})
+        told = {topic: partial(is_told, topic) for topic in (MAP_START, *optional)}
+        node.inputs.join(parts, self._take, optional=told)
 
     @property
     def waiting_count(self) -> int:

@@ -11,7 +11,11 @@ from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.shrinking import shrink_factor, shrunk, shrunk_camera
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
-from segfloor_ros.messages.clouds import features_message, sparse_cloud_message
+from segfloor_ros.messages.clouds import (
+    features_message,
+    moving_points_message,
+    sparse_cloud_message,
+)
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.messages.poses import (
     PathMessages,
@@ -22,7 +26,7 @@ from segfloor_ros.messages.poses import (
     twist_covariance,
 )
 from segfloor_ros.messages.progress import map_start_message
-from segfloor_ros.messages.topics import MAP_START
+from segfloor_ros.messages.topics import MAP_START, MOVING_MASK
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult, Keyframe
@@ -57,6 +61,8 @@ class SlamOutputs:
         self._features = node.output('keyframe/features')
         self._path = node.output('keyframe/path')
         self._map_points = node.output('map_points')
+        self._moving_points = node.output('moving_points')
+        self._moving_mask = node.output(MOVING_MASK)
         self._map_start = node.output(MAP_START)
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
@@ -82,6 +88,10 @@ class SlamOutputs:
         """
         if result.tracked:
             self._publish_odometry(result)
+        if result.moving is not None:
+            frame_id = self._own.map_frame
+            message = moving_points_message(result.stamp_ns, frame_id, result.moving)
+            self._moving_points.publish(message)
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe, calibration, frames)
         self._last = result
@@ -136,6 +146,7 @@ class SlamOutputs:
         for side, (frame_id, image, eye) in eyes.items():
             self._infos[side].publish(camera_info_message(stamp_ns, frame_id, eye))
             self._images[side].publish(image_message(stamp_ns, frame_id, image))
+        self._moving_mask.publish(image_message(stamp_ns, frames.left, _mask(keyframe)))
         self._pose.publish(
             odometry_message(
                 stamp_ns,
@@ -150,3 +161,8 @@ class SlamOutputs:
         self._path.publish(self._path_messages.next(stamp_ns, keyframe.path))
         self._map_start.publish(map_start_message(stamp_ns, own.map_frame, self.map_start_ns))
         self._map_points.publish(sparse_cloud_message(stamp_ns, own.map_frame, keyframe.cloud))
+
+
+def _mask(keyframe: Keyframe) -> NDArray[np.uint8]:
+    """Return what moves in a keyframe, (H, W), also where it is nothing."""
+    return np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving

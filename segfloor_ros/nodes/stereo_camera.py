@@ -50,6 +50,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._compressed = own.image_transport == 'compressed'
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
         self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
+        self._mask = self.output('dynamic_mask')
         self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
         self._sensors = {
             sensor.name: self.output(sensor.name)
@@ -173,6 +174,9 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
         for measurement in self._measurements.until(pair.stamp_ns):
             self._send_measurement(measurement)
+        mask = self._source.masks.read(pair.index) if self._source.masks is not None else None
+        if mask is not None:
+            self._mask.publish(image_message(pair.stamp_ns, self._frame_ids['left'], mask))
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))

@@ -11,6 +11,7 @@ from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.messages.topics import FRAME_DONE
 from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.mask_input import MaskInput
 from segfloor_ros.nodes.pair_queue import PairQueue
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.sensor_input import SensorInput
@@ -45,6 +46,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._outputs = SlamOutputs(self, own)
         self._frame_done = self.output(FRAME_DONE)
         self._transforms = Transforms(self, own)
+        self._masks = MaskInput(self, own.mask_timeout_s)
         self._work = WhenIdle(self, self._process_waiting)
         self._camera = StereoInput(self, own, self._take_pair, self._work.request)
         self._sensors = SensorInput(self, self._transforms, self._look_at_waiting)
@@ -59,6 +61,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._transforms.reset()
         self._camera.reset()
         self._sensors.reset()
+        self._masks.reset()
         self._last_stamp_ns: int | None = None
         self._resumption = SlamResumption(self._keep)
         self._frames = CameraFrames('', '')
@@ -157,7 +160,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         try:
             slam = self._slam or self._start(stamp_ns, pair)
             images = self._camera.images(pair)
-            frame = StereoFrame(self._frame_count, stamp_ns, *images)
+            mask = self._masks.mask_for(stamp_ns, self._camera.rectifier)
+            frame = StereoFrame(self._frame_count, stamp_ns, *images, mask)
             self._frame_count += 1
             for measurement in self._sensors.take():
                 slam.add(measurement)
@@ -216,6 +220,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             keyframe=int(result.keyframe is not None),
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,
+            moving=len(result.moving.xyz_map) if result.moving is not None else 0,
         )
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:

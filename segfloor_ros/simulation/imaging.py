@@ -68,17 +68,23 @@ def undistort(x: Array, y: Array, distortion: Array) -> tuple[Array, Array]:
     return ideal_x, ideal_y
 
 
+def ideal_image(ideal: Picture, plan: ImagingPlan, side: int) -> Picture:
+    """Return the image (H, W) of camera `side`, without noise, of an ideal picture."""
+    picture = ideal
+    if picture.shape != (plan.height, plan.width):
+        picture = cv2.resize(picture, (plan.width, plan.height), interpolation=cv2.INTER_AREA)
+    if plan.lookup is not None:
+        picture = cv2.remap(picture, plan.lookup[side], None, cv2.INTER_CUBIC)
+    return picture
+
+
 def develop(
     ideal: Picture, plan: ImagingPlan, scene: Scene, side: int, frame: int, time_s: float
 ) -> NDArray[np.uint8]:
     """Return the image (H, W) uint8 that camera `side` (0 left, 1 right) delivers of an ideal
     picture. The noise depends on the scene's seed, the frame and the side alone.
     """
-    picture = ideal
-    if picture.shape != (plan.height, plan.width):
-        picture = cv2.resize(picture, (plan.width, plan.height), interpolation=cv2.INTER_AREA)
-    if plan.lookup is not None:
-        picture = cv2.remap(picture, plan.lookup[side], None, cv2.INTER_CUBIC)
+    picture = ideal_image(ideal, plan, side)
     gain = brightness(scene, time_s) * (scene.camera.right_gain if side == 1 else 1.0)
     rng = np.random.default_rng([scene.seed, 4, frame, side])
     noise = rng.standard_normal(picture.shape, np.float32) * np.float32(scene.camera.noise_sigma)

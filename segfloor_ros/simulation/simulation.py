@@ -13,7 +13,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.occupancy import OCCUPIED, OccupancyGrid
 from segfloor_ros.simulation.drive import Drive, plan_drive
-from segfloor_ros.simulation.imaging import Picture, develop, plan_imaging
+from segfloor_ros.simulation.imaging import Picture, develop, ideal_image, plan_imaging
 from segfloor_ros.simulation.renderer import WorldRenderer
 from segfloor_ros.simulation.rig import RigMotion, rectified_camera
 from segfloor_ros.simulation.scene import Scene
@@ -140,10 +140,12 @@ class Simulation:
         return depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
 
     def moving_mask(self, index: int) -> NDArray[np.uint8]:
-        """Render what moves in one frame's rectified left image: (H, W) uint8, 255 moving."""
+        """Render what moves in one frame's left image: (H, W) uint8, 255 moving."""
         time_s = float(self.drive.times_s[index])
         self._renderer.move(self.motion.T_world_left(time_s), time_s)
-        return self._truth.mask(CAMERAS[0], self._renderer.moving_geoms(time_s))
+        mask = self._pictures.mask(CAMERAS[0], self._renderer.moving_geoms(time_s))
+        share = ideal_image(mask.astype(np.float32), self.imaging, 0)
+        return np.where(share > 127, np.uint8(255), np.uint8(0))
 
     def _exposed(self, time_s: float) -> list[Picture]:
         """Return the ideal left and right pictures, averaged over the exposure around a time."""

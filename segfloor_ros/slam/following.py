@@ -53,6 +53,11 @@ class Follower:
         """The points (N,) of the last frame."""
         return self._ids
 
+    def drop_inside(self, region: Region) -> None:
+        """Forget the points that the last frame shows in a region."""
+        outside = ~is_inside(region, self._uv_px)
+        self._ids, self._uv_px = self._ids[outside], self._uv_px[outside]
+
     def drop_dead(self, sparse_map: SparseMap) -> None:
         """Forget points that are not part of the map any more."""
         alive = sparse_map.alive[self._ids]

@@ -12,6 +12,7 @@ import numpy as np
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
+from segfloor_ros.slam.moving_points import turned
 from segfloor_ros.slam.results import FrameResult, Keyframe
 
 MAX_HELD_KEYFRAMES = 50
@@ -53,6 +54,7 @@ def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:
         T_map_odom=T_map_world @ result.T_map_odom @ T_left_base,
         covariance=_covariance_of_base(result, T_map_world),
         keyframe=_keyframe_in_map(result.keyframe, T_map_world) if result.keyframe else None,
+        moving=turned(result.moving, T_map_world) if result.moving else None,
     )
 
 

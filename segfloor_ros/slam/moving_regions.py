@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity, shrunk
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.geometry import Array, invert, rotation_angle
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.excluded import Region
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
@@ -53,6 +53,17 @@ SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
 
 Disparity = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A frame as it is searched. left: shrunk image (h, w). disparity: (h, w) px of it, 0 where
+    none was found. moving: what moves in it, (h, w), 255.
+    """
+
+    left: NDArray[np.uint8]
+    disparity: Disparity
+    moving: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -94,7 +105,35 @@ class MovingRegions:
             0, DISPARITIES, BLOCK_PX, P1, P2, disp12MaxDiff=1, uniquenessRatio=5,
             speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_HH4,
         )  # fmt: skip
+        self._pair: tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
+
+    def search(self, frame: StereoFrame, T_camera_world: Array, mount: Mount | None) -> Scene:
+        """Find what moves in a frame whose pose is known."""
+        disparity = self.measure(frame.left, frame.right)
+        moving = self.find(disparity, T_camera_world, mount)
+        return Scene(self._pair[0], disparity, moving)
+
+    def positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
+        """Return where each pixel is, (h, w, 3) in the world, NaN where there is no disparity."""
+        depth_m = np.where(disparity > 0, self._disparity_m / np.maximum(disparity, 1e-3), np.nan)
+        points = (self._rays * depth_m.ravel()).T.astype(np.float64)
+        return transform_points(invert(T_camera_world), points).reshape(*disparity.shape, 3)
+
+    def seen_through(self, disparity: Disparity, points: Array) -> NDArray[np.bool_]:
+        """Return at which points (N, 3) of the left optical frame nothing is: the image shows what
+        lies behind them, and nothing as near around them.
+        """
+        around = cv2.dilate(disparity, np.ones((5, 5), np.uint8))
+        depth = np.maximum(points[:, 2], MIN_DEPTH_M)
+        uv = np.rint(self._focal * points[:, :2] / depth[:, None] + self._centre)
+        inside = (
+            (points[:, 2] > MIN_DEPTH_M) & (uv >= 0).all(axis=1) & (uv < self._size).all(axis=1)
+        )
+        u, v = np.where(inside[:, None], uv, 0).astype(np.intp).T
+        expected = self._disparity_m / depth
+        behind = around[v, u] < expected - 2 * TOLERANCE_PX
+        return np.asarray(inside & behind & (disparity[v, u] > 0))
 
     def measure(self, left: NDArray[np.uint8], right: NDArray[Any]) -> Disparity:
         """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
@@ -105,7 +144,10 @@ class MovingRegions:
         small_right = cv2.resize(right, self._size, interpolation=cv2.INTER_AREA)
         self._pair = small_left, small_right
         # Without a margin the matcher leaves the leftmost columns empty.
-        wide = (cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for i in self._pair)
+        wide = (
+            cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE)
+            for i in (small_left, small_right)
+        )
         found = self._matcher.compute(*wide)[:, DISPARITIES:].astype(np.float32) / 16
         found[found > np.arange(self._size[0]) + 1] = 0.0
         return np.maximum(found, 0.0)
@@ -116,11 +158,11 @@ class MovingRegions:
 
     def find(
         self, disparity: Disparity, T_camera_world: Array, mount: Mount | None
-    ) -> Region | None:
-        """Return what moves in an image with this disparity and pose, None for nothing."""
+    ) -> NDArray[np.uint8]:
+        """Return what moves (h, w), 255, in an image with this disparity and pose."""
         rows = np.flatnonzero(disparity > 0)
         if len(self._views) < 2 or len(rows) == 0:
-            return None
+            return np.zeros(disparity.shape, np.uint8)
         points = self._rays[:, rows] * (self._disparity_m / disparity.ravel()[rows])
         through, solid, behind = self._compare(points, disparity.ravel()[rows], T_camera_world)
         high = np.ones(len(rows), bool)
@@ -132,13 +174,14 @@ class MovingRegions:
         background.ravel()[rows] = behind
         seeds &= self._shown(disparity, background).ravel()
         doubtful[rows] = (solid <= through) & high
-        moving = self._regions(
+        return self._regions(
             seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
         )
-        return self._enlarged(moving) if moving.any() else None
 
-    def _enlarged(self, region: NDArray[np.uint8]) -> Region:
-        """Return a region of the shrunk image in that of the camera (H, W)."""
+    def enlarged(self, region: NDArray[np.uint8]) -> Region | None:
+        """Return a region of the shrunk image in that of the camera (H, W), None for none."""
+        if not region.any():
+            return None
         factor = self._factor
         whole = cv2.resize(region, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
         below, right = self._camera.height - whole.shape[0], self._camera.width - whole.shape[1]
@@ -179,9 +222,11 @@ class MovingRegions:
 
     def _shown(self, disparity: Disparity, background: Disparity) -> NDArray[np.uint8]:
         """Return where (h, w) the pair of images itself speaks for a disparity and against what was
-        seen behind: a pattern that repeats fits both.
+        seen behind: a pattern that repeats fits both. A depth camera has no such doubts.
         """
-        left, right = self._pair
+        if self._pair[1] is None:
+            return np.ones(disparity.shape, np.uint8)
+        left, right = (image.astype(np.float32) for image in self._pair if image is not None)
         u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._size))
 
         def misfit(d: Disparity) -> Disparity:

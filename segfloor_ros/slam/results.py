@@ -49,6 +49,16 @@ class KeyframePath:
 
 
 @dataclass(frozen=True)
+class MovingPoints:
+    """Points of what moves: positions (N, 3) in frame `map`, m, and velocities (N, 3), m/s, NaN
+    where they are not known.
+    """
+
+    xyz_map: NDArray[np.floating]
+    velocity_m_s: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
 class Keyframe:
     """Everything published about one keyframe. All parts share its stamp. moving: mask (H, W)
     uint8 of the left image, 255 where something moves.
@@ -73,7 +83,7 @@ class FrameResult:
     covariance: (6, 6) of the base pose, order x y z roll pitch yaw (m², rad²), in the odom
     frame. reference_keyframe: stamp of the keyframe the pose is expressed against, for
     correcting it later. state: words for people ('tracking', or why not). keyframe: set when
-    this frame became one.
+    this frame became one. moving: what moves, where this frame was searched for it.
     """
 
     index: int
@@ -86,3 +96,4 @@ class FrameResult:
     state: str
     reference_keyframe_ns: int
     keyframe: Keyframe | None = None
+    moving: MovingPoints | None = None

@@ -21,6 +21,9 @@ from segfloor_ros.slam.patch_alignment import SIDE_PX
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 
+GONE_AFTER = 3
+"""A point that so many keyframes have seen through since it was last found is there no more."""
+
 MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
 
@@ -90,6 +93,7 @@ class SparseMap:
         self._visible_count = GrowingArray((), np.int32)
         self._found_count = GrowingArray((), np.int32)
         self._observer_count = GrowingArray((), np.int32)
+        self._seen_through_count = GrowingArray((), np.int32)
         self._born = GrowingArray((), np.int32)
         self._seen_last = GrowingArray((), np.int32)
         self._edge_point = GrowingArray((), np.int32)
@@ -211,6 +215,7 @@ class SparseMap:
             (self._alive, True),
             (self._visible_count, 1),
             (self._found_count, 1),
+            (self._seen_through_count, 0),
             (self._observer_count, 0),
             (self._born, born),
             (self._seen_last, born),
@@ -343,17 +348,25 @@ class SparseMap:
         """Count that points should have been seen in a frame, and which of them were."""
         self._visible_count.rows[visible] += 1
         self._found_count.rows[found] += 1
+        self._seen_through_count.rows[found] = 0
+
+    def note_seen_through(self, ids: NDArray[np.integer]) -> None:
+        """Count that a keyframe saw what lies behind points, until `note_tracking` tells that they
+        are found again.
+        """
+        self._seen_through_count.rows[ids] += 1
 
     def reliability(self, ids: NDArray[np.integer]) -> Array:
         """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
         return self._found_count.rows[ids] / (self._visible_count.rows[ids] + 2.0)
 
     def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
-        """Return ids of points that tracking seldom finds, or that only one keyframe saw
-        although made before keyframe `settled_before`.
+        """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
+        saw although made before keyframe `settled_before`.
         """
         found = self._found_count.rows
         seldom = found < min_found_ratio * self._visible_count.rows
+        seldom |= self._seen_through_count.rows >= GONE_AFTER
         lonely = (self._born.rows < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 

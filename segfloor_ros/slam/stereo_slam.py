@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
@@ -14,7 +13,7 @@ from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.measurements import Measurement
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.body_motion import BodyMotion
-from segfloor_ros.slam.excluded import is_inside, join
+from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.following import Follower
 from segfloor_ros.slam.held_results import HeldResults
@@ -26,8 +25,8 @@ from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing,
 from segfloor_ros.slam.loops import LoopDetector
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.motion import CameraMotion
+from segfloor_ros.slam.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.mount_meter import MountMeter
-from segfloor_ros.slam.moving_regions import MovingRegions
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.place_recognition import PlaceRecognition
 from segfloor_ros.slam.relocalisation import Relocaliser
@@ -98,7 +97,7 @@ class StereoSlam:
         self.loop_count = 0
         self._adjusting = AdjustmentRunner(background)
         self._held = HeldResults()
-        self._moving = MovingRegions(camera) if settings.detect_moving else None
+        self._moving = MotionSearch(camera) if settings.detect_moving else None
         self._frames_since_keyframe = 0
 
     @property
@@ -125,11 +124,20 @@ class StereoSlam:
             track = self._track(frame, images) if self.map.keyframes and not fault else None
             if track is None and self.map.keyframes:
                 self._bridge(frame, fault)
+        is_wanted = not fault and self._wants_keyframe(track)
+        searched = None
+        if self._moving is not None and self._moving.is_due(is_wanted, track is not None):
+            with self._times.measure('moving'):
+                searched = self._moving.search(frame, self._motion.T_camera_world, self.mount)
+                images = self._exclude(images, searched.region)
         keyframe = None
-        if not fault and self._wants_keyframe(track):
+        if is_wanted:
             with self._times.measure('mapping'):
-                keyframe = self._add_keyframe(frame, images, track)
-        return self._held.release(self._result(frame, track, fault, keyframe), self.mount)
+                keyframe = self._add_keyframe(frame, images, track, searched)
+        result = self._result(frame, track, fault, keyframe)
+        if searched is not None:
+            result = replace(result, moving=searched.points)
+        return self._held.release(result, self.mount)
 
     def close(self) -> None:
         """End the background thread, if there is one."""
@@ -241,10 +249,9 @@ class StereoSlam:
         return self._local.is_new_view(motion.T_camera_world)
 
     def _add_keyframe(
-        self, frame: StereoFrame, images: Images, track: Track | None
+        self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
     ) -> Keyframe | None:
         """Make the frame a keyframe; None where its features do not show what was tracked."""
-        images, seen = self._exclude_moving(frame, images)
         observed = self._observe(frame, images, track)
         if observed is None:
             return None
@@ -262,8 +269,10 @@ class StereoSlam:
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
-        if self._moving is not None and seen is not None:
-            self._moving.remember(keyframe, seen)
+        if self._moving is not None and searched is not None:
+            self._moving.remember(keyframe, searched)
+            gone = self._moving.seen_through(searched, self.map, self._local.point_ids, keyframe)
+            self.map.note_seen_through(gone)
         self._places.add(keyframe)
         self._adjust(keyframe)
         self._close_loop(keyframe, images)
@@ -271,15 +280,12 @@ class StereoSlam:
         self._measure_mount(frame, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
 
-    def _exclude_moving(
-        self, frame: StereoFrame, images: Images
-    ) -> tuple[Images, NDArray[np.float32] | None]:
-        """Return the images without what moves, and the coarse disparity that showed it."""
-        if self._moving is None:
-            return images, None
-        seen = self._moving.measure(frame.left, frame.right)
-        moving = self._moving.find(seen, self._motion.T_camera_world, self.mount)
-        return replace(images, excluded=join(images.excluded, moving)), seen
+    def _exclude(self, images: Images, region: Region | None) -> Images:
+        """Return the images without a region in which something moves."""
+        if region is None:
+            return images
+        self._follower.drop_inside(region)
+        return replace(images, excluded=join(images.excluded, region))
 
     def _observe(
         self, frame: StereoFrame, images: Images, track: Track | None

@@ -92,3 +92,34 @@ def test_what_stands_is_kept(place):
     results = run(MovingDrive(place))
     shares = [0.0 if k.moving is None else (k.moving > 0).mean() for k in keyframes(results)]
     assert max(shares) < 0.01 and np.mean(shares) < 0.001
+
+
+def test_the_points_of_what_crosses_have_its_place_and_velocity():
+    drive = MovingDrive(crossing)
+    seen = [(r.index, r.moving) for r in run(drive) if r.moving is not None]
+    # A search every third frame or oftener.
+    assert len(seen) > FRAMES / 3 - 1
+    velocities, distances = [], []
+    for index, moving in seen:
+        if index < 16 or len(moving.xyz_map) < 30:
+            continue
+        x, y = crossing(index)
+        distances.append(np.median(np.abs(moving.xyz_map[:, 0] - x)))
+        assert abs(np.median(moving.xyz_map[:, 1]) - y) < 0.25
+        velocities.append(np.nanmedian(moving.velocity_m_s, axis=0))
+    assert len(velocities) >= 4 and np.median(distances) < 0.1
+    np.testing.assert_allclose(np.median(velocities, axis=0), [0.3, 0.45, 0.0], atol=0.12)
+
+
+def test_points_of_what_has_left_leave_the_map():
+    def leaves(index):
+        return (2.2, 0.0) if index < 14 else None
+
+    ahead = [[], []]
+    for detect, counts in zip((True, False), ahead, strict=True):
+        for keyframe in keyframes(run(MovingDrive(leaves), detect_moving=detect)):
+            near = keyframe.cloud.xyz_map
+            on_board = (np.abs(near[:, 0] - 2.2) < 0.15) & (np.abs(near[:, 1]) < 0.3)
+            counts.append((on_board & (near[:, 2] > 0.1)).sum())
+    assert max(ahead[0]) > 20
+    assert ahead[0][-1] < 0.1 * max(ahead[0]) and ahead[0][-1] < ahead[1][-1]

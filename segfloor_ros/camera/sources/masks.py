@@ -13,8 +13,8 @@ from segfloor_ros.errors import InputError
 
 
 class MaskFolder:
-    """Masks `%06d.png` by frame index, on the rectified left image, 255 = moving. A frame without
-    a file has nothing that moves.
+    """Masks `%06d.png` by frame index, of the left image as recorded, 255 = moving. A frame
+    without a file has nothing that moves.
     """
 
     def __init__(self, folder: Path, camera: StereoCamera) -> None:
@@ -26,7 +26,7 @@ class MaskFolder:
         self._shape = (camera.height, camera.width)
 
     def read(self, index: int) -> NDArray[np.uint8] | None:
-        """Return the mask (H, W) uint8 of a frame, 0 and 255, or None where there is none.
+        """Return the mask (H, W) uint8 of a frame, or None where there is none.
 
         Raises InputError for a file that is no such mask.
         """
@@ -38,5 +38,5 @@ class MaskFolder:
             raise InputError(f'{path}: is no image; masks are PNG files, 255 = moving')
         if mask.shape != self._shape:
             found, expected = (f'{shape[1]}x{shape[0]}' for shape in (mask.shape, self._shape))
-            raise InputError(f'{path}: is {found}, but the rectified images are {expected}')
-        return np.where(mask > 127, np.uint8(255), np.uint8(0))
+            raise InputError(f'{path}: is {found}, but the images are {expected}')
+        return np.asarray(mask, np.uint8)

@@ -114,7 +114,8 @@ class StereoSource(ABC):
         for pair in self._decoded():
             left, right = rectifier.rectify(pair.left, pair.right)
             mask = self.masks.read(pair.index) if self.masks is not None else None
-            yield StereoFrame(pair.index, pair.stamp_ns, left, right, mask)
+            excluded = rectifier.rectify_mask(mask) if mask is not None else None
+            yield StereoFrame(pair.index, pair.stamp_ns, left, right, excluded)
 
     def _decoded(self) -> Iterator[RawPair]:
         self.skipped_frames = 0

@@ -1,0 +1,141 @@
+"""What moves, over DDS: masks that come in, and what the nodes tell of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from moving_drive import MovingDrive
+from node_messages import pose_message_at, publish
+from stereo_room import CAMERA, MOUNT
+
+from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
+from segfloor_ros.messages.clouds import FEATURE_DTYPE, MOVING_DTYPE, cloud_array
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey8_image, image_message
+from segfloor_ros.messages.poses import transform_message
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.mask_input import MaskInput
+from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.slam.excluded import is_inside
+
+CALIBRATION = rectified_calibration(CAMERA)
+ARGUMENTS = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+    '-p', 'camera_roll_rad:=0.0',
+)  # fmt: skip
+
+
+def crossing(index):
+    return (0.03 * index + 1.6, -1.0 + 0.05 * index)
+
+
+def stereo_messages(frame):
+    messages = {}
+    for side in ('left', 'right'):
+        eye, image = getattr(CALIBRATION, side), getattr(frame, side)
+        messages[f'{side}/camera_info'] = camera_info_message(frame.stamp_ns, side, eye)
+        messages[f'{side}/image_raw'] = image_message(frame.stamp_ns, side, image)
+    return messages
+
+
+def test_masks_on_dynamic_mask_keep_features_out_and_come_back_with_the_keyframe(make_graph):
+    drive = MovingDrive(crossing)
+    graph = make_graph(*ARGUMENTS, '-p', 'detect_moving:=false', '-p', 'mask_timeout_s:=0.0')
+    features, masks = graph.collect('keyframe/features'), graph.collect('keyframe/moving_mask')
+    node = graph.add(StereoSlamNode())
+    inputs: dict = {}
+    for index in range(8):
+        frame = drive.frame(index)
+        mask = image_message(frame.stamp_ns, 'left', drive.mask(index))
+        inputs = publish(graph, {'dynamic_mask': mask}, inputs)
+        stamp_ns = frame.stamp_ns
+        graph.until(lambda stamp_ns=stamp_ns: stamp_ns in node._masks._masks, 'the mask')
+        publish(graph, stereo_messages(frame), inputs)
+        graph.until(
+            lambda stamp_ns=stamp_ns: (
+                stamp_ns in {s.stamp_ns for s in graph.reports('stereo_slam')}
+            ),
+            f'frame {index}',
+        )
+    graph.until(lambda: len(masks) >= 2 and len(features) == len(masks), 'keyframes')
+    for cloud, message in zip(features, masks, strict=True):
+        assert cloud.header.stamp == message.header.stamp
+        true_mask = drive.mask(round(to_ns(message.header.stamp) * 1e-8))
+        found = grey8_image(message, '')
+        assert (found[true_mask > 0] == 255).all() and 0.03 < (found > 0).mean() < 0.3
+        points = cloud_array(cloud, FEATURE_DTYPE, '')
+        uv = np.stack([points['u'], points['v']], axis=1)
+        assert len(uv) > 300 and not is_inside(true_mask, uv).any()
+
+
+def test_moving_points_tell_what_crosses_and_diagnostics_count_it(make_graph):
+    drive = MovingDrive(lambda index: crossing(index - 8) if index >= 8 else None)
+    graph = make_graph(*ARGUMENTS)
+    clouds = graph.collect('moving_points')
+    graph.add(StereoSlamNode())
+    inputs: dict = {}
+    for index in range(24):
+        frame = drive.frame(index)
+        inputs = publish(graph, stereo_messages(frame), inputs)
+        stamp_ns = frame.stamp_ns
+        graph.until(
+            lambda stamp_ns=stamp_ns: (
+                stamp_ns in {s.stamp_ns for s in graph.reports('stereo_slam')}
+            ),
+            f'frame {index}',
+        )
+    counts = {s.stamp_ns: int(s.values['moving']) for s in graph.reports('stereo_slam')}
+    graph.until(lambda: len(clouds) >= 5, 'moving points')
+    assert clouds[0].header.frame_id == 'map' and clouds[0].width == 0
+    full = [cloud for cloud in clouds if cloud.width > 30]
+    assert full and all(counts[to_ns(c.header.stamp)] == c.width for c in clouds)
+    points = cloud_array(full[-1], MOVING_DTYPE, '')
+    x, _ = crossing(round(to_ns(full[-1].header.stamp) * 1e-8) - 8)
+    assert abs(np.median(points['x']) - x - 0.24) < 0.15
+    assert np.isfinite(points['vy']).any()
+
+
+def test_the_floor_is_not_told_of_what_moves(make_graph):
+    frame = MovingDrive(lambda index: (1.5, 0.0)).frame(0)
+    mask = MovingDrive(lambda index: (1.5, 0.0)).mask(0)
+    graph = make_graph()
+    floors = graph.collect('keyframe/floor_mask')
+    publisher = graph.publisher('keyframe/moving_mask')
+    graph.add(FloorSegmentationNode())
+    graph.connected([publisher])
+    messages = {
+        'keyframe/odometry': pose_message_at(frame.stamp_ns),
+        'camera_mount': transform_message(0, 'base_link', 'left', MOUNT.T_base_left),
+    }
+    for topic, message in stereo_messages(frame).items():
+        messages[f'keyframe/{topic.replace("image_raw", "image_rect")}'] = message
+    publish(graph, messages)
+    assert not graph.comes(lambda: floors, 1.0), 'did not wait for the mask of the keyframe'
+    publisher.publish(image_message(frame.stamp_ns, 'left', mask))
+    graph.until(lambda: floors, 'the floor mask')
+    floor = grey8_image(floors[0], '')
+    assert (floor == FLOOR).mean() > 0.1
+    assert (floor[mask > 0] != FLOOR).mean() > 0.97
+
+
+def test_a_mask_serves_later_frames_until_it_is_too_old():
+    class NoInputs:
+        def subscribe(self, name, callback):
+            assert name == 'dynamic_mask'
+
+    class Node:
+        inputs = NoInputs()
+
+    masks = MaskInput(Node(), timeout_s=0.2)
+    rectifier = StereoRectifier(CALIBRATION)
+    picture = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    picture[10:20, 30:50] = 255
+    masks.take(image_message(1_000_000_000, 'left', picture))
+    assert masks.mask_for(999_999_999, rectifier) is None
+    for later_ns in (0, 200_000_000):
+        found = masks.mask_for(1_000_000_000 + later_ns, rectifier)
+        np.testing.assert_array_equal(found, picture)
+    assert masks.mask_for(1_200_000_001, rectifier) is None
+    masks.take(image_message(1_100_000_000, 'left', np.zeros_like(picture)))
+    assert not masks.mask_for(1_150_000_000, rectifier).any()
