@@ -71,9 +71,7 @@ class StereoSlamSettings(StageSettings):
         minimum=0.1,
         maximum=100.0,
     )
-    detect_moving: bool = setting(
-        False, 'Leave out what moves, as far as the stereo pairs show it.'
-    )
+    detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
     mask_dilation_px: int = setting(
         5,
         'A mask of moving things (`dynamic_mask`, `--masks`) is widened by this much.',
