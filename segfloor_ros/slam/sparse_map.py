@@ -21,8 +21,7 @@ from segfloor_ros.slam.patch_alignment import SIDE_PX
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 
-GONE_AFTER = 3
-"""A point that so many keyframes have seen through since it was last found is there no more."""
+GONE_AFTER = 3  # keyframes that have seen through a point since it was last found
 
 MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
@@ -351,9 +350,7 @@ class SparseMap:
         self._seen_through_count.rows[found] = 0
 
     def note_seen_through(self, ids: NDArray[np.integer]) -> None:
-        """Count that a keyframe saw what lies behind points, until `note_tracking` tells that they
-        are found again.
-        """
+        """Count that a keyframe saw what lies behind points."""
         self._seen_through_count.rows[ids] += 1
 
     def reliability(self, ids: NDArray[np.integer]) -> Array:
