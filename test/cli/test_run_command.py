@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ import yaml
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 
+from segfloor_ros.cli.main import main
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -32,6 +34,19 @@ def segfloor(*arguments, cwd=None):
         env=environment,
         timeout=120,
     )
+
+
+@pytest.fixture
+def segfloor_here(monkeypatch, capsys):
+    """Run the command line in this process, for what ends before any work."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['segfloor', *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return SimpleNamespace(returncode=ended.value.code, stderr=capsys.readouterr().err)
+
+    return run
 
 
 def with_mount():
@@ -235,16 +250,23 @@ def backwards_stamps(folder):
         backwards_stamps,
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
+def test_bad_input_is_one_line_and_leaves_nothing(segfloor_here, recording, tmp_path, spoil):
     folder = tmp_path / 'drive'
     shutil.copytree(recording, folder)
     given, words = spoil(folder)
-    done = segfloor('run', given, '--out', tmp_path / 'out')
+    done = segfloor_here('run', given, '--out', tmp_path / 'out')
     assert done.returncode == 2
     assert words in done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith('segfloor')]) == 1
     assert 'Traceback' not in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ['drive']
+
+
+def test_bad_input_ends_the_program_with_status_2(tmp_path):
+    done = segfloor('run', tmp_path / 'nowhere', '--out', tmp_path / 'out')
+    assert done.returncode == 2
+    assert done.stderr.startswith('segfloor: ')
+    assert done.stderr.count('\n') == 1
 
 
 @pytest.mark.parametrize(
@@ -256,8 +278,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
         (['--masks', 'nowhere'], 'nowhere: no such folder'),
     ],
 )
-def test_bad_settings_are_one_line(recording, tmp_path, arguments, words):
-    done = segfloor('run', recording, '--out', tmp_path / 'out', *arguments)
+def test_bad_settings_are_one_line(segfloor_here, recording, tmp_path, arguments, words):
+    done = segfloor_here('run', recording, '--out', tmp_path / 'out', *arguments)
     assert done.returncode == 2
     assert words in done.stderr
     assert list(tmp_path.iterdir()) == []
