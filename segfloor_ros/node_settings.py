@@ -108,6 +108,11 @@ class StereoSlamNodeSettings(NodeSettings):
         'right/image_rect); auto: what is published, raw ones first.',
         choices=('auto', 'raw', 'rect'),
     )
+    use_depth: bool = setting(
+        False,
+        'Take depth/image_raw in place of the right images; off: only where nobody publishes '
+        'those.',
+    )
     image_transport: str = setting(
         'auto',
         'Take images as they are or compressed, the latter on the topics with /compressed behind '

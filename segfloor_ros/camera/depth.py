@@ -101,6 +101,14 @@ def shrunk(disparity: Disparity, size: tuple[int, int]) -> Disparity:
     return np.nan_to_num(small * np.float32(factor), nan=0.0).astype(np.float32)
 
 
+def shrunk_disparity(disparity: Disparity, factor: int) -> Disparity:
+    """Return the disparity at (H // factor, W // factor) in the pixels of the shrunk image."""
+    height, width = disparity.shape[0] // factor, disparity.shape[1] // factor
+    half = factor // 2
+    part = disparity[half::factor, half::factor][:height, :width]
+    return np.ascontiguousarray(part / np.float32(factor))
+
+
 def seen_from_right(left: NDArray[np.uint8], disparity: Disparity) -> NDArray[np.uint8]:
     """Return the right image (H, W) as the virtual right camera would see it: what is nearer hides
     what is farther; what no depth is known of is as in the left image.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import is_disparity, shrunk_disparity
 from segfloor_ros.camera.model import StereoCamera
 
 SHRUNK_WIDTH_PX = 320
@@ -16,8 +19,12 @@ def shrink_factor(camera: StereoCamera) -> int:
     return max(1, round(camera.width / SHRUNK_WIDTH_PX))
 
 
-def shrunk(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Return an image (H, W) at (H // factor, W // factor), each pixel the mean of a square."""
+def shrunk(image: NDArray[Any], factor: int) -> NDArray[Any]:
+    """Return an image (H, W) at (H // factor, W // factor), each pixel the mean of a square; of a
+    disparity, float32, one of its pixels.
+    """
+    if is_disparity(image):
+        return shrunk_disparity(image, factor)
     height, width = image.shape[0] // factor, image.shape[1] // factor
     whole = image[: height * factor, : width * factor]
     return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import array
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CompressedImage, Image
 
-from segfloor_ros.camera.images import Grey, decode_compressed, decode_raw
+from segfloor_ros.camera.images import Grey, decode_compressed, decode_depth, decode_raw
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
@@ -18,15 +19,17 @@ MAX_PIXELS = 50_000_000
 ENCODINGS = {'mono8': np.uint8, 'mono16': np.uint16, '32FC1': np.float32, 'bgr8': np.uint8}
 """What this package publishes."""
 
+ENCODING_OF = {np.uint8: 'mono8', np.uint16: 'mono16', np.float32: '32FC1'}
+
 
 def image_message(
     stamp_ns: int, frame_id: str, image: NDArray[np.generic], encoding: str = ''
 ) -> Image:
     """Return an image (H, W), or (H, W, 3) with its encoding, as a message; grey images of 8 and 16
-    bits need none.
+    bits and disparities, float32, need none.
     """
     if not encoding:
-        encoding = 'mono16' if image.dtype == np.uint16 else 'mono8'
+        encoding = ENCODING_OF[image.dtype.type]
     assert image.dtype == ENCODINGS[encoding], (image.dtype, encoding)
     pixels = np.ascontiguousarray(image)
     height, width = pixels.shape[:2]
@@ -88,6 +91,33 @@ def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         raise MessageError(f'{topic}: {message.encoding} has 16 bits, expected mono8')
     return image.astype(np.uint8, copy=False)
+
+
+def right_image(message: Image, topic: str) -> NDArray[Any]:
+    """Return the right image (H, W) uint8 of a message; of a depth camera the disparity (H, W)
+    float32 in its place. Raises MessageError.
+    """
+    if message.encoding != '32FC1':
+        return grey8_image(message, topic)
+    return depth_image(message, topic)
+
+
+def depth_image(message: Image, topic: str) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return the depth image (H, W) of a message: uint16 in mm or float32 in metres.
+
+    Raises MessageError.
+    """
+    try:
+        return decode_depth(
+            np.frombuffer(message.data, np.uint8),
+            width=int(message.width),
+            height=int(message.height),
+            encoding=message.encoding,
+            step=int(message.step),
+            is_bigendian=bool(message.is_bigendian),
+        )
+    except InputError as error:
+        raise MessageError(f'{topic}: {error}') from None
 
 
 def _grey_of_file(message: CompressedImage, topic: str) -> Grey:

@@ -1,15 +1,12 @@
-"""Wheel odometry, IMU and depth images as messages."""
+"""Wheel odometry and IMU as messages."""
 
 from __future__ import annotations
 
 import numpy as np
 from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
-from sensor_msgs.msg import Image, Imu
+from sensor_msgs.msg import Imu
 
-from segfloor_ros.camera.images import decode_depth
-from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.errors import MessageError
@@ -57,24 +54,6 @@ def imu_sample(message: Imu, R_left_imu: Array) -> ImuSample:
         R_left_imu @ np.array([gyro.x, gyro.y, gyro.z]),
         R_left_imu @ np.array([accel.x, accel.y, accel.z]),
     )
-
-
-def depth_image(message: Image, topic: str) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Return the depth image (H, W) of a message: uint16 in mm or float32 in metres.
-
-    Raises MessageError.
-    """
-    try:
-        return decode_depth(
-            np.frombuffer(message.data, np.uint8),
-            width=int(message.width),
-            height=int(message.height),
-            encoding=message.encoding,
-            step=int(message.step),
-            is_bigendian=bool(message.is_bigendian),
-        )
-    except InputError as error:
-        raise MessageError(f'{topic}: {error}') from None
 
 
 def _vector(values: Array) -> Vector3:

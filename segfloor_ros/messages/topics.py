@@ -146,6 +146,16 @@ _ALL = [
         is_optional=True,
     ),
     Topic(
+        'depth/image_raw',
+        Image,
+        qos.IMAGES,
+        OTHERS,
+        (SLAM,),
+        'Depth aligned with the left image, 16UC1 (mm) or 32FC1 (m); taken instead of right images '
+        'by parameter, or where nobody publishes those.',
+        instead_of='right/image_raw',
+    ),
+    Topic(
         'imu',
         Imu,
         qos.SENSORS,

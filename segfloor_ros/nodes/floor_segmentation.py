@@ -16,7 +16,7 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.messages.camera_info import eye_calibration
 from segfloor_ros.messages.floor import disparity_message, scan_message
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.images import grey8_image, image_message
+from segfloor_ros.messages.images import grey8_image, image_message, right_image
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.messages.topics import MOVING_MASK
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
@@ -90,7 +90,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         assert self._mount is not None
         stage, camera = self._stage_for(parts)
         frame_id = parts[LEFT].header.frame_id
-        left, right = grey8_image(parts[LEFT], LEFT), grey8_image(parts[RIGHT], RIGHT)
+        left, right = grey8_image(parts[LEFT], LEFT), right_image(parts[RIGHT], RIGHT)
         T_map_base = pose_array(parts[POSE].pose.pose)
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
         floor = stage.process(left, right, self._mount, T_map_base, moving)

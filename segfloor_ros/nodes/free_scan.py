@@ -10,7 +10,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.messages.camera_info import eye_calibration
 from segfloor_ros.messages.floor import free_scan_message
-from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.images import grey8_image, right_image
 from segfloor_ros.messages.topics import FRAME_PARTS
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.nodes.when_idle import WhenIdle
@@ -65,6 +65,6 @@ class FreeScan:
         if self._stage is None or camera != self._camera:
             self._camera = camera
             self._stage = FloorSegmentation(camera, self._node.parameters.stage)
-        left, right = grey8_image(parts[LEFT], LEFT), grey8_image(parts[RIGHT], RIGHT)
+        left, right = grey8_image(parts[LEFT], LEFT), right_image(parts[RIGHT], RIGHT)
         floor = self._stage.process(left, right, mount)
         self._output.publish(free_scan_message(stamp_ns, base_frame, floor.scan))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ SIDES = ('left', 'right')
 LEAST_VARIANCE = 1e-6
 """Of a millimetre and a milliradian, in m² and rad²: the first pose is the origin by definition."""
 
-Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+Pair = tuple[NDArray[np.uint8], NDArray[Any]]
 
 
 @dataclass(frozen=True)

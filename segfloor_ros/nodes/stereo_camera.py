@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
@@ -13,6 +14,7 @@ from std_msgs.msg import Header
 from segfloor_ros.camera.images import Grey
 from segfloor_ros.camera.settings import SENSORS, StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.measurements import Measurement, MeasurementLog, WheelPose
@@ -49,9 +51,13 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
         self._compressed = own.image_transport == 'compressed'
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
-        self._images = {side: self.output(f'{side}/{kind}') for side in self._frame_ids}
+        self._has_depth = any(s.name == DEPTH and s.used for s in self._source.sensors)
+        sides = ('left',) if self._has_depth else ('left', 'right')
+        self._images = {side: self.output(f'{side}/{kind}') for side in sides}
+        self._infos = {side: self.output(f'{side}/camera_info') for side in sides}
+        if self._has_depth:
+            self._images['right'] = self.output('depth/image_raw')
         self._mask = self.output('dynamic_mask')
-        self._infos = {side: self.output(f'{side}/camera_info') for side in self._frame_ids}
         self._sensors = {
             sensor.name: self.output(sensor.name)
             for sensor in self._source.sensors
@@ -177,6 +183,11 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         mask = self._source.masks.read(pair.index) if self._source.masks is not None else None
         if mask is not None:
             self._mask.publish(image_message(pair.stamp_ns, self._frame_ids['left'], mask))
+        if self._has_depth:
+            eyes.pop('right')
+            depth_m = np.float32(self._source.camera.disparity_times_depth) / pair.right
+            message = image_message(pair.stamp_ns, self._frame_ids['left'], depth_m)
+            self._images['right'].publish(message)
         for side, (image, eye) in eyes.items():
             frame_id = self._frame_ids[side]
             self._infos[side].publish(camera_info_message(pair.stamp_ns, frame_id, eye))

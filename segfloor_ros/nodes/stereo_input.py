@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,11 +13,13 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.images import EightBitScale
 from segfloor_ros.camera.rectification import StereoRectifier
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import eye_calibration, same_calibration
-from segfloor_ros.messages.images import grey_image
+from segfloor_ros.messages.errors import MessageError
+from segfloor_ros.messages.images import depth_image, grey_image
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.camera_watch import CameraWatch
 from segfloor_ros.nodes.qos_check import offered_best_effort
@@ -24,15 +27,36 @@ from segfloor_ros.nodes.stage_node import AnyStageNode
 
 INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
-KINDS = {
-    'image_raw': ('raw', 'raw'),
-    'image_rect': ('rect', 'raw'),
-    'image_raw/compressed': ('raw', 'compressed'),
-    'image_rect/compressed': ('rect', 'compressed'),
-}
-"""The image topics of one side, in order of preference: as `image_kind` and `image_transport` have
-them.
-"""
+DEPTH = 'depth/image_raw'
+
+
+@dataclass(frozen=True)
+class Kind:
+    """The image topics of both sides, and what `image_kind` and `image_transport` say of them."""
+
+    left: str
+    right: str
+    image: str
+    transport: str
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether depth images stand in for the right ones."""
+        return self.right == DEPTH
+
+
+def _kinds(use_depth: bool) -> list[Kind]:
+    """Return the kinds of images in order of preference, depth images last or alone."""
+    names = [
+        (image if transport == 'raw' else f'{image}/{transport}', image[6:], transport)
+        for transport in ('raw', 'compressed')
+        for image in ('image_raw', 'image_rect')
+    ]
+    pairs = [Kind(f'left/{name}', f'right/{name}', *of) for name, *of in names]
+    depth = [Kind(f'left/{name}', DEPTH, *of) for name, *of in names]
+    return depth if use_depth else [*pairs, *depth]
+
+
 Pair = dict[str, Any]
 """A left and a right message of the same time, by topic."""
 
@@ -58,8 +82,9 @@ class StereoInput:
         self._takes_best_effort = own.image_reliability == 'best_effort'
         self._kinds = [
             kind
-            for kind, (image, transport) in KINDS.items()
-            if own.image_kind in ('auto', image) and own.image_transport in ('auto', transport)
+            for kind in _kinds(own.use_depth)
+            if own.image_kind in ('auto', kind.image)
+            and own.image_transport in ('auto', kind.transport)
         ]
         self.watch = CameraWatch(node, own)
         self.reset()
@@ -69,13 +94,13 @@ class StereoInput:
         for kind in self._kinds:
             self._join_images(kind, on_pair)
 
-    def _join_images(self, kind: str, on_pair: Callable[[int, Pair], None]) -> None:
+    def _join_images(self, kind: Kind, on_pair: Callable[[int, Pair], None]) -> None:
         def take(stamp_ns: int, pair: Pair) -> None:
             self._is_settled = True
             on_pair(stamp_ns, pair)
 
         self._node.inputs.join(
-            (f'left/{kind}', f'right/{kind}'),
+            (kind.left, kind.right),
             take,
             on_message=self.watch.saw_image,
             choose_profile=self._choose_profile,
@@ -84,10 +109,10 @@ class StereoInput:
             tolerance_ns=round(self._own.sync_tolerance_s * 1e9),
         )
 
-    def _choose(self, kind: str) -> None:
+    def _choose(self, kind: Kind) -> None:
         self._kind = kind
-        self.left, self.right = f'left/{kind}', f'right/{kind}'
-        self._is_rectified = KINDS[kind][0] == 'rect'
+        self.left, self.right = kind.left, kind.right
+        self._is_rectified = kind.image == 'rect'
         self.watch.expect(self.left, self.right, self._is_rectified)
 
     def reset(self) -> None:
@@ -99,7 +124,11 @@ class StereoInput:
     @property
     def missing_calibrations(self) -> list[str]:
         """The topics on which no calibration has come."""
-        return [topic for topic in INFOS if topic not in self._eyes]
+        return [topic for topic in self._infos_needed if topic not in self._eyes]
+
+    @property
+    def _infos_needed(self) -> tuple[str, ...]:
+        return INFOS[:1] if self._kind.is_depth else INFOS
 
     @property
     def calibration(self) -> StereoCalibration:
@@ -114,12 +143,29 @@ class StereoInput:
             self._rectifier = StereoRectifier(taken)
         return self._rectifier
 
-    def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return the rectified grey images (H, W) of a pair. Raises MessageError."""
+    def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+        """Return the rectified grey images (H, W) of a pair, or the left one and a disparity.
+
+        Raises MessageError.
+        """
+        if self._kind.is_depth:
+            return self._depth_images(pair)
         images = (grey_image(pair[topic], topic) for topic in (self.left, self.right))
         left, right = self.rectifier.rectify(*self._eight_bit(*images))
         self.watch.check_rows(left, right)
         return left, right
+
+    def _depth_images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[Any]]:
+        grey, depth = grey_image(pair[self.left], self.left), depth_image(pair[DEPTH], DEPTH)
+        if grey.shape != depth.shape:
+            (rows, columns), (grey_rows, grey_columns) = depth.shape, grey.shape
+            raise MessageError(
+                f'{DEPTH}: {columns}x{rows}, but {self.left} is {grey_columns}x{grey_rows}; take '
+                'the depth images that are aligned with them'
+            )
+        left, _ = self._eight_bit(grey, grey)
+        disparity = disparity_of_depth(depth, self.rectifier.camera)
+        return self.rectifier.rectify(left, disparity)
 
     def frame_ids(self, pair: Pair) -> tuple[str, str]:
         """Return the names of both optical frames."""
@@ -140,8 +186,8 @@ class StereoInput:
             )
             self._node.inputs.update()
 
-    def _is_published(self, kind: str) -> bool:
-        topics = (f'{side}/{kind}' for side in ('left', 'right'))
+    def _is_published(self, kind: Kind) -> bool:
+        topics = (kind.left, kind.right)
         return all(self._node.get_publishers_info_by_topic(topic) for topic in topics)
 
     def adapt_reliability(self) -> None:
@@ -150,7 +196,7 @@ class StereoInput:
         """
         if self._takes_best_effort or self._own.image_reliability != 'auto':
             return
-        lossy = offered_best_effort(self._node, (*INFOS, self.left, self.right))
+        lossy = offered_best_effort(self._node, (*self._infos_needed, self.left, self.right))
         if lossy:
             self._takes_best_effort = True
             names = ', '.join(lossy)
@@ -163,6 +209,11 @@ class StereoInput:
         return qos.IMAGES_BEST_EFFORT if self._takes_best_effort else qos.IMAGES
 
     def _raw_calibration(self) -> StereoCalibration:
+        if self._kind.is_depth:
+            eye = self._eyes[INFOS[0]]
+            if self._is_rectified:
+                eye = EyeCalibration.of_rectified(eye.width, eye.height, eye.P, eye.origin)
+            return depth_calibration(eye)
         return StereoCalibration(*(self._eyes[topic] for topic in INFOS))
 
     def _take_info(self, topic: str, message: CameraInfo) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey8_image, right_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.sensors import imu_message, imu_sample, wheel_message, wheel_pose
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.sensor_input import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -116,3 +121,58 @@ def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monk
     assert not sensors.is_behind(70)
     now_s[0] += 1.0  # the sensor has fallen silent
     assert not sensors.is_behind(90)
+
+
+@pytest.fixture
+def depth_drive(tmp_path):
+    """A drive of a depth camera: no right images."""
+    frames, poses = room_drive(8)
+    folder = write_kitti(tmp_path / 'rgbd', frames)
+    for frame, pose in zip(frames, poses, strict=True):
+        depth = depth_of_room(pose @ MOUNT.T_base_left)
+        cv2.imwrite(str(make(folder / 'depth') / f'{frame.index:06d}.png'), depth)
+    return folder, poses
+
+
+def make(folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def depth_of_room(T_world_camera: np.ndarray) -> np.ndarray:
+    """The depth (H, W) in mm of the walls, floor and ceiling of the room."""
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1
+    )
+    directions, origin = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    with np.errstate(divide='ignore'):
+        to_face = np.where(directions > 0, ROOM_MAX - origin, ROOM_MIN - origin) / directions
+    return np.rint(1000 * to_face.min(axis=-1)).astype(np.uint16)
+
+
+def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
+    make_graph, depth_drive
+) -> None:
+    folder, poses = depth_drive
+    arguments = [
+        *('-p', f'input:={folder}', '-p', 'depth:=true', '-p', 'rate:=0.0'),
+        *('-p', f'camera_height_m:={MOUNT.height_m}', '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}'),
+        *('-p', f'camera_roll_rad:={MOUNT.roll_rad}', '-p', 'background:=false'),
+    ]
+    graph = make_graph(*arguments)
+    odometry, right = graph.collect('odometry'), graph.collect('keyframe/right/image_rect')
+    masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('scan')
+    graph.add(StereoSlamNode())
+    graph.add(FloorSegmentationNode())
+    graph.add(StereoCameraNode())
+    graph.until(lambda: len(odometry) == 8 and masks and scans, 'odometry and floor')
+    for message in odometry:
+        truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
+        error = invert(truth) @ pose_array(message.pose.pose)
+        assert np.linalg.norm(error[:3, 3]) < 0.02
+    disparity = right_image(right[0], 'keyframe/right/image_rect')
+    assert disparity.dtype == np.float32
+    # The floor fills the lowest rows of the picture.
+    mask = grey8_image(masks[0], 'keyframe/floor_mask')
+    assert (mask[-40:] == 255).mean() > 0.9
