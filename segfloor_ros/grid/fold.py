@@ -16,7 +16,7 @@ from segfloor_ros.grid.blocking import nearest_cells
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
 from segfloor_ros.grid.hits import draw_hits, draw_rays
 from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
-from segfloor_ros.grid.log_odds import ZERO, steps
+from segfloor_ros.grid.log_odds import FREE, HIT, LEAST, MOST, OCCUPIED_FROM, ZERO, steps
 from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
@@ -30,11 +30,11 @@ class EvidenceFolder:
     def __init__(self, settings: OccupancyGridSettings) -> None:
         self._resolution_m = settings.resolution_m
         self._radius_m = settings.footprint_radius_m
-        self._least = ZERO - steps(-settings.min_log_odds)
-        self._occupied = ZERO + steps(settings.occupied_log_odds)
+        self._least = ZERO - steps(-LEAST)
+        self._occupied = ZERO + steps(OCCUPIED_FROM)
         value = np.arange(256)
-        hit, free = steps(settings.hit_log_odds), steps(settings.free_log_odds)
-        most = ZERO + steps(settings.max_log_odds)
+        hit, free = steps(HIT), steps(FREE)
+        most = ZERO + steps(MOST)
         self._raised = np.minimum(value + hit, most).astype(np.uint8)
         self._lowered = np.maximum(value - free, self._least).astype(np.uint8)
         # What is seen from too far to be placed within its cell, or in a part of a cell, counts as

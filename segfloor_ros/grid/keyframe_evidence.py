@@ -16,6 +16,8 @@ from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
+_LEAST_DEEP_M = 0.03
+"""What stands on the floor is at least this deep behind the face that is seen."""
 QUARTILE = 0.675
 """Quartiles of a normal distribution lie this many sigmas from its mean."""
 
@@ -176,7 +178,7 @@ def _thickness_m(
     than things that stand have.
     """
     error_m = scan.error_per_m * (faces**2).sum(axis=1)
-    return np.maximum(2 * error_m, settings.min_thickness_m).astype(np.float16)
+    return np.maximum(2 * error_m, _LEAST_DEEP_M).astype(np.float16)
 
 
 def _certain(range_m: Array, scan: FloorScan) -> Array:

@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.grid.log_odds import CHUNK, QUANTUM, ZERO, LogOddsRaster, steps
+from segfloor_ros.grid.log_odds import (
+    CHUNK,
+    FREE_FROM,
+    OCCUPIED_FROM,
+    QUANTUM,
+    ZERO,
+    LogOddsRaster,
+    steps,
+)
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
@@ -19,10 +27,9 @@ def render(
 ) -> OccupancyGrid:
     """Return the grid of a raster; path_xy_m: (K, 2), where the base has been."""
     first, cells = _touched(raster)
-    kinds = cv2.LUT(cells, _kinds(settings))
-    if settings.connected_only:
-        at = np.floor(path_xy_m / settings.resolution_m).astype(np.intp)
-        _reach(kinds, at[:, 1] - first[0], at[:, 0] - first[1])
+    kinds = cv2.LUT(cells, _kinds())
+    at = np.floor(path_xy_m / settings.resolution_m).astype(np.intp)
+    _reach(kinds, at[:, 1] - first[0], at[:, 0] - first[1])
     if settings.opening_cells > 1:
         kinds[_narrow(kinds, settings.opening_cells)] = _NOTHING
     values = np.full(256, UNKNOWN, np.int8)
@@ -62,12 +69,11 @@ def _empty_blocks(cells: NDArray[np.uint8]) -> tuple[int, int]:
     return before, height - CHUNK - last
 
 
-def _kinds(settings: OccupancyGridSettings) -> NDArray[np.uint8]:
+def _kinds() -> NDArray[np.uint8]:
     """Return what each of the 256 values of evidence makes of a cell."""
     kinds = np.full(256, _NOTHING, np.uint8)
-    free = _UNREACHED if settings.connected_only else _REACHED
-    kinds[: ZERO - steps(settings.free_log_odds_needed) + 1] = free
-    kinds[ZERO + steps(settings.occupied_log_odds) :] = _STANDING
+    kinds[: ZERO - steps(FREE_FROM) + 1] = _UNREACHED
+    kinds[ZERO + steps(OCCUPIED_FROM) :] = _STANDING
     return kinds
 
 
