@@ -52,10 +52,10 @@ def match_predicted(
     """
     if len(predicted_uv_px) == 0 or len(features) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    reach, near = tree.query(
-        predicted_uv_px, k=min(NEIGHBOURS, len(features)), distance_upper_bound=radius_px.max()
-    )
-    reach, near = np.atleast_2d(reach), np.atleast_2d(near)
+    # A list of ranks, as a single one alone would lose its axis.
+    ranks = list(range(1, min(NEIGHBOURS, len(features)) + 1))
+    found = tree.query(predicted_uv_px, k=ranks, distance_upper_bound=radius_px.max())
+    reach, near = (np.asarray(part) for part in found)
     octave = np.append(features.octave.astype(np.float64), -100.0)[near]
     valid = (reach <= radius_px[:, None]) & (np.abs(octave - predicted_octave[:, None]) <= 1.5)
     rows, columns = np.nonzero(valid)

@@ -46,6 +46,17 @@ def test_one_to_one_keeps_the_nearest_of_both_ends():
     np.testing.assert_array_equal(kept[1], [6, 5, 7])
 
 
+def test_a_single_feature_is_matched_by_the_point_it_shows():
+    seen = features([[50, 50]])
+    near = np.array([[200.0, 200.0], [52.0, 51.0], [90.0, 50.0]])
+    wanted = np.concatenate([descriptors(1, 7), seen.descriptor, descriptors(1, 8)])
+    points, rows = match_predicted(
+        seen, cKDTree(seen.uv_px), near, np.zeros(3), wanted, np.full(3, 15.0)
+    )
+    np.testing.assert_array_equal(points, [1])
+    np.testing.assert_array_equal(rows, [0])
+
+
 def test_predicted_matches_need_nearness_and_a_clear_winner():
     seen = features([[50, 50], [60, 50], [200, 200]])
     tree = cKDTree(seen.uv_px)
