@@ -48,7 +48,7 @@ NOISE_GREY = 1.0
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
 
-MIN_AREA_PX = 12
+MIN_AREA_PX = BLOCK_PX**2
 SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
 
@@ -256,7 +256,9 @@ class MovingRegions:
     ) -> NDArray[np.uint8]:
         """Return the seeds and the connected regions of one depth that consist of them."""
         around = np.ones((3, 3), np.uint8)
-        seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, around)
+        # Strips no wider than a block are fringes of what stands still.
+        block = np.ones((BLOCK_PX, BLOCK_PX), np.uint8)
+        seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, block)
         edge = cv2.dilate(disparity, around) - disparity > 2 * TOLERANCE_PX
         _, labels = cv2.connectedComponents(np.where(edge, 0, doubtful | seeds).astype(np.uint8))
         area = np.bincount(labels.ravel())
@@ -265,4 +267,4 @@ class MovingRegions:
         whole[0] = False
         moving = whole[labels] | ((seeds > 0) & (seeded[labels] >= MIN_AREA_PX))
         # As far as blocks reach beyond the edge of what moves.
-        return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), np.ones((5, 5), np.uint8))
+        return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), block)
