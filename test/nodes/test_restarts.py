@@ -123,6 +123,7 @@ def journey(tmp_path_factory, drive):
             chain.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('node', CHAIN)
 def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     chain = journey.chain
@@ -153,6 +154,7 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     assert words.get(node, '') in chain.log(node)
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
     """A driver that comes back goes on with the stamps of the clock."""
     chain = journey.chain
@@ -169,6 +171,7 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
     assert journey.odometry_error_m() < 0.03
 
 
+@pytest.mark.slow
 def test_a_slam_that_does_not_find_its_place_again_begins_a_new_map(journey) -> None:
     chain = journey.chain
     chain.kill(SLAM)
