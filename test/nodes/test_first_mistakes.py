@@ -9,12 +9,15 @@ from collections.abc import Iterator
 import pytest
 import rclpy
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, Level
+from segfloor_ros.messages.headers import to_time
 from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
@@ -152,6 +155,33 @@ def test_a_node_of_the_same_name_is_named(make_graph, console) -> None:
     graph.until(lambda: health or any(words in s.message for s in graph.statuses), 'the status')
     found = [s for s in graph.statuses if words in s.message]
     assert found[-1].level is Level.ERROR
+
+
+def test_after_a_bag_has_ended_nobody_asks_for_the_camera(make_graph, console) -> None:
+    """Its player publishes no time any more, and the images are as old as they were."""
+    (frame, *_), _ = room_drive(1)
+    graph = make_graph(*GIVEN, '-p', 'use_sim_time:=true')
+    node = graph.add(StereoSlamNode())
+    clock = graph.tester.create_publisher(Clock, '/clock', qos.CLOCK)
+    names = [
+        f'{side}/{what}' for side in ('left', 'right') for what in ('image_raw', 'camera_info')
+    ]
+    publishers = {name: graph.publisher(name) for name in names}
+    graph.connected([clock, *publishers.values()])
+    stamp_ns = 1_000_000_000_000
+
+    def told_the_time() -> bool:
+        clock.publish(Clock(clock=to_time(stamp_ns)))
+        return node.get_clock().now().nanoseconds == stamp_ns
+
+    graph.until(told_the_time, 'the time of the recording')
+    for side in ('left', 'right'):
+        info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
+        publishers[f'{side}/camera_info'].publish(info)
+        image = image_message(stamp_ns, side, getattr(frame, side))
+        publishers[f'{side}/image_raw'].publish(image)
+    graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
+    assert not graph.comes(lambda: any('connected' in text for _, text in console), 5.0)
 
 
 def test_the_side_of_a_topic_counts_more_than_its_letters() -> None:
