@@ -6,16 +6,18 @@ import dataclasses
 import time
 from collections.abc import Callable
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.map_file import read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.resident_memory import MemoryLog
@@ -41,6 +43,26 @@ class SaveMasks(str, Enum):
     all = 'all'
 
 
+@dataclasses.dataclass(frozen=True)
+class MapOptions:
+    """Maps on disk: to go on with, and to save. localize: the loaded map stays as it is."""
+
+    load: Path | None = None
+    save: Path | None = None
+    localize: bool = False
+
+    def __post_init__(self) -> None:
+        if self.localize and self.load is None:
+            raise SettingsError('--localize needs the map to localize in: --load-map FILE')
+        if self.localize and self.save is not None:
+            raise SettingsError('--localize adds nothing to the map: leave --save-map out')
+        if self.save is not None and self.save.is_dir():
+            raise SettingsError(f'--save-map {self.save}: is a folder; give the name of a file')
+
+
+NO_MAPS = MapOptions()
+
+
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs.
@@ -53,6 +75,7 @@ class LockstepRun:
         folder: OutputFolder,
         save_masks: SaveMasks = SaveMasks.keyframes,
         save_debug: bool = False,
+        map_options: MapOptions = NO_MAPS,
     ) -> None:
         self._source = source
         self._configuration = configuration
@@ -63,10 +86,14 @@ class LockstepRun:
         self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
+        self._map_options = map_options
+        if map_options.load is not None:
+            loaded = read_map_file(map_options.load)
+            self._pipeline.load(loaded, str(map_options.load), map_options.localize)
         self._unmasked: list[StereoFrame] = []
         self._results: list[FrameResult] = []
         self._frames = 0
-        self._path: KeyframePath | None = None
+        self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
     def execute(self, on_progress: ProgressListener | None = None) -> RunResult:
         """Process every frame and return the result; an interrupt (Ctrl-C) ends the run early
@@ -82,14 +109,12 @@ class LockstepRun:
             self._pipeline.close()
         wall_s = time.perf_counter() - start
         stages = self._pipeline.keyframe_stages
-        mount, labelled, path = self._pipeline.mount, stages.labelled, self._path
-        if grid is None or mount is None or labelled is None or path is None:
+        mount, labelled, poses = self._pipeline.mount, stages.labelled, self._tracked_poses()
+        if grid is None or mount is None or labelled is None or not poses:
             raise MapError(self._why_no_map())
-        poses = [
-            TrackedPose(result.stamp_ns, result.T_odom_base, result.reference_keyframe_ns)
-            for result in self._results
-            if result.tracked
-        ]
+        if self._map_options.save is not None:
+            write_map_file(self._map_options.save, self._pipeline.save())
+        path = self._path
         return RunResult(
             grid,
             corrected_trajectory(poses, path),
@@ -99,6 +124,18 @@ class LockstepRun:
             self._summary(wall_s),
             self._configuration,
         )
+
+    def _tracked_poses(self) -> list[TrackedPose]:
+        return [
+            TrackedPose(
+                result.stamp_ns,
+                result.T_odom_base,
+                result.reference_keyframe_ns,
+                result.T_map_odom @ result.T_odom_base,
+            )
+            for result in self._results
+            if result.tracked
+        ]
 
     def _process_frames(self, on_progress: ProgressListener | None) -> None:
         try:
@@ -121,7 +158,9 @@ class LockstepRun:
         if self._save_masks is SaveMasks.all:
             self._mask_frame(self._unmasked.pop(0), result)
         if result.keyframe is not None:
-            self._path = result.keyframe.path
+            path = result.keyframe.path
+            new = path.stamp_ns >= 0  # those of a map that was loaded are before this drive
+            self._path = KeyframePath(path.stamp_ns[new], path.T_map_base[new])
             result = dataclasses.replace(result, keyframe=None)
         self._results.append(result)
 
@@ -150,6 +189,11 @@ class LockstepRun:
         name = self._configuration.stereo_camera.input
         if self._frames == 0:
             return f'{name}: no frame could be read, so there is no map'
+        if self._map_options.load is not None:
+            return (
+                f'{name}: in none of {self._frames} frames was a place of {self._map_options.load} '
+                'recognised; is it a map of this building?'
+            )
         if self._pipeline.mount is None:
             return (
                 f'{name}: no floor was recognised in {self._frames} frames, so the height of the '

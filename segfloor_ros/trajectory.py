@@ -32,12 +32,13 @@ class Trajectory:
 @dataclass(frozen=True)
 class TrackedPose:
     """One tracked frame: its stamp, the base in frame `odom` (4, 4), the keyframe it was
-    tracked against.
+    tracked against, and the base in frame `map` as it was then.
     """
 
     stamp_ns: int
     T_odom_base: Array
     reference_keyframe_ns: int
+    T_map_base: Array | None = None
 
 
 def corrected_trajectory(poses: Sequence[TrackedPose], path: KeyframePath) -> Trajectory:
@@ -57,6 +58,10 @@ def corrected_trajectory(poses: Sequence[TrackedPose], path: KeyframePath) -> Tr
         if reference not in final_at or reference not in odom_at:
             earlier = anchors[anchors <= pose.stamp_ns]
             if len(earlier) == 0:
+                # No keyframe of this drive yet: the map was loaded, and stayed as it was.
+                if pose.T_map_base is not None:
+                    stamps.append(pose.stamp_ns)
+                    corrected.append(pose.T_map_base)
                 continue
             reference = int(earlier[-1])
         motion = invert(odom_at[reference]) @ pose.T_odom_base

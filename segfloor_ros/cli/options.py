@@ -34,6 +34,18 @@ IgnoreOption = Annotated[
 DepthOption = Annotated[
     bool, typer.Option('--depth', help='Take depth images in place of the right ones.')
 ]
+SaveMapOption = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
+]
+LoadMapOption = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option('--load-map', help='Saved map to go on mapping in.'),
+]
+LocalizeOption = Annotated[
+    bool,
+    typer.Option('--localize', help='Poses in the map of --load-map only; nothing is added to it.'),
+]
 ReportOption = Annotated[
     bool,
     typer.Option('--report', help='Write report.html: everything about the run on one page.'),

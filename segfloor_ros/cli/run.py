@@ -12,16 +12,19 @@ from segfloor_ros.cli.options import (
     DepthOption,
     IgnoreOption,
     InputArgument,
+    LoadMapOption,
+    LocalizeOption,
     MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
+    SaveMapOption,
     SetOption,
     recording_settings,
 )
 from segfloor_ros.cli.output import finish_run, print_sensors, print_summary, progress_bar
 from segfloor_ros.configuration import resolve
-from segfloor_ros.lockstep import LockstepRun, SaveMasks
+from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
 from segfloor_ros.results_folder import OutputFolder
 
 
@@ -43,9 +46,13 @@ def run(
         ),
     ] = False,
     masks: MasksOption = None,
+    save_map: SaveMapOption = None,
+    load_map: LoadMapOption = None,
+    localize: LocalizeOption = False,
     report: ReportOption = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
+    maps = MapOptions(load_map, save_map, localize)
     configuration = resolve(
         params, assignments or (), stereo_camera=recording_settings(input, masks, ignore, depth)
     )
@@ -53,9 +60,9 @@ def run(
     print_sensors(source.sensors)
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:
-            result = LockstepRun(source, configuration, folder, save_masks, save_debug).execute(
-                lambda done, state: progress.update(TaskID(0), completed=done, note=state)
-            )
+            result = LockstepRun(
+                source, configuration, folder, save_masks, save_debug, maps
+            ).execute(lambda done, state: progress.update(TaskID(0), completed=done, note=state))
         folder.write(result)
     print_summary(input, result.summary)
     finish_run(input, out, report)

@@ -6,6 +6,8 @@ log-odds per point, from the mask and from the height above the local floor.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,6 +68,20 @@ class CloudLabelling:
             label=table['label'].copy(),
             confidence=table['confidence'].copy(),
         )
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what is known of the points, for a file."""
+        return self._table.to_arrays()
+
+    def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Go on with what is known of the points of a map."""
+        self._table.from_arrays(arrays)
+
+    def labelled(self, cloud: SparseCloud) -> LabelledPoints:
+        """Return a cloud with the labels known of its points, which are all in the table."""
+        self._table.follow(cloud.point_id)
+        label, confidence = self._table['label'].copy(), self._table['confidence'].copy()
+        return LabelledPoints(cloud.point_id, cloud.xyz_map, label, confidence)
 
     def _judge(self, row: NDArray[np.intp], z_m: NDArray[np.float32]) -> None:
         """Label the points of rows (M,), which were looked at or moved; z_m: of all points (N,).

@@ -35,6 +35,15 @@ class PointTable:
         """Return a column (N,), to be read and written."""
         return self._columns[name][: len(self.point_id)]
 
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the ids and the columns."""
+        return {'point_id': self.point_id} | {name: self[name].copy() for name in _COLUMNS}
+
+    def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Take in what `to_arrays` returned."""
+        self.point_id = arrays['point_id']
+        self._columns = {name: arrays[name].astype(kind) for name, (kind, _) in _COLUMNS.items()}
+
     def follow(self, point_id: NDArray[np.int32]) -> None:
         """Make the rows those of the ids (N,), ascending."""
         known, count = len(self.point_id), len(point_id)

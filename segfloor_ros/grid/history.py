@@ -42,6 +42,11 @@ class EvidenceHistory:
         """The poses (K, 3) = x, y, yaw the evidence now lies at."""
         return self._poses
 
+    @property
+    def evidence(self) -> list[KeyframeEvidence]:
+        """The evidence of the keyframes, one for each pose."""
+        return self._evidence
+
     def append(self, evidence: KeyframeEvidence, pose: Pose2d) -> None:
         """Add the evidence of the next keyframe."""
         self._evidence.append(evidence)

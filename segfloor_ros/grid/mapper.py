@@ -9,12 +9,14 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array
+from segfloor_ros.grid.evidence_arrays import evidence_from_arrays, evidence_to_arrays
 from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.history import EvidenceHistory
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.map_file import Arrays
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5
@@ -64,6 +66,19 @@ class OccupancyGridMapper:
     def grid(self) -> OccupancyGrid:
         """Return the map as of the last update."""
         return render(self._history.raster(), self._history.poses[:, :2], self._settings)
+
+    def to_arrays(self) -> Arrays:
+        """Return the evidence of all keyframes, for a file."""
+        arrays = evidence_to_arrays(self._history.evidence)
+        return arrays | {'stamp_ns': self._stamp_ns, 'pose': self._history.poses}
+
+    def from_arrays(self, arrays: Arrays, stamp_ns: NDArray[np.int64]) -> None:
+        """Go on with the evidence of a map, with its keyframes at stamps (K,), ascending."""
+        for evidence, (x, y, yaw) in zip(
+            evidence_from_arrays(arrays), arrays['pose'].tolist(), strict=True
+        ):
+            self._history.append(evidence, (x, y, yaw))
+        self._stamp_ns = stamp_ns
 
     def _follow(self, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
         """Move the evidence to the keyframes' poses (K, 3), where they moved enough to matter."""

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.matching import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.visibility import predict_points
 
 NEIGHBOUR_KEYFRAMES = 20

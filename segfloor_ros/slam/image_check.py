@@ -7,6 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+
 MIN_CONTRAST = 3.0
 MIN_LIVE_ROWS = 0.7
 MIN_EXPECTED_SHIFT = 0.004
@@ -25,6 +28,16 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if live.mean() < MIN_LIVE_ROWS:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
+
+
+def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
+    """Return how far the picture of points (N, 3) should have moved between two poses
+    (T_camera_world, (4, 4)), in image widths; 0 without points.
+    """
+    if len(points) == 0:
+        return 0.0
+    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
+    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
 
 
 class FrozenCheck:

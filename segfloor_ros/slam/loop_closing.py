@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.fusion import fuse_duplicates
+from segfloor_ros.slam.keyframe_record import LoopEdge
 from segfloor_ros.slam.loops import Match
 from segfloor_ros.slam.pose_graph import PoseGraph, optimise
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import LoopEdge, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 
 FUSED_KEYFRAMES = 10
 LINK_SIGMA_M = 0.01

@@ -17,10 +17,11 @@ from scipy.sparse.csgraph import dijkstra
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.place_recognition import PlaceRecognition
 from segfloor_ros.slam.places import views_near
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import Track
 
 RECENT = 20
@@ -34,6 +35,10 @@ MAX_DRIFT = 0.04
 """Drift of a path, m per m: stereo odometry drifts by one per cent or less."""
 
 MAX_TURN_DRIFT_RADPM = 0.01
+LEAST_DRIFT_M = 0.02
+LEAST_DRIFT_RAD = 0.005
+"""Less is no drift: the local adjustments take it away."""
+
 FREE_DRIFT_M = 0.3
 FREE_DRIFT_RAD = 0.1
 
@@ -196,11 +201,18 @@ class LoopDetector:
         """Whether a match is possible, level, and holds in both directions."""
         length = path_lengths(self._map, keyframe.index)[match.place]
         moved = match.T_camera_world @ keyframe.T_world_camera
+        moved_m, turned = float(np.linalg.norm(moved[:3, 3])), rotation_angle(moved[:3, :3])
+        drifted = moved_m > LEAST_DRIFT_M or turned > LEAST_DRIFT_RAD
         possible = (
-            float(np.linalg.norm(moved[:3, 3])) <= FREE_DRIFT_M + MAX_DRIFT * length
-            and rotation_angle(moved[:3, :3]) <= FREE_DRIFT_RAD + MAX_TURN_DRIFT_RADPM * length
+            moved_m <= FREE_DRIFT_M + MAX_DRIFT * length
+            and turned <= FREE_DRIFT_RAD + MAX_TURN_DRIFT_RADPM * length
         )
-        return possible and self._is_level(match, mount) and self._holds_back(keyframe, match)
+        return (
+            drifted
+            and possible
+            and self._is_level(match, mount)
+            and self._holds_back(keyframe, match)
+        )
 
     def _is_level(self, match: Match, mount: Mount | None) -> bool:
         """Whether the robot stands on the floor of the place, as far as the mount is known."""

@@ -14,13 +14,14 @@ from segfloor_ros.slam.coarse_disparity import guess_disparity
 from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.motion_links import Link
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.triangulation import triangulate_between
 
 DISPARITY_REACH_PX = 4

@@ -20,8 +20,8 @@ from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.excluded import Region
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
-from segfloor_ros.slam.sparse_map import KeyframeRecord
 
 WIDTH_PX = 160
 """Images are shrunk to about this width: a person 4 m away is still eight pixels wide."""

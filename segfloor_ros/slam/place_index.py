@@ -32,6 +32,10 @@ class PlaceIndex:
         for word in own.tolist():
             self._keyframes[word].append(keyframe)
 
+    def words_of(self, keyframe: int) -> NDArray[np.int32]:
+        """Return the words (N,) of a keyframe, ascending."""
+        return self._words.get(keyframe, np.zeros(0, np.int32))
+
     def remove(self, keyframe: int) -> None:
         """Forget a keyframe."""
         for word in self._words.pop(keyframe, np.zeros(0, np.int32)).tolist():

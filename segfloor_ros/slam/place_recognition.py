@@ -14,12 +14,14 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.place_index import PlaceIndex
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import Track
 from segfloor_ros.slam.tracking import Tracker
 from segfloor_ros.slam.vocabulary import Vocabulary
@@ -52,6 +54,18 @@ class PlaceRecognition:
     def add(self, keyframe: KeyframeRecord) -> None:
         """Take in a keyframe."""
         self._index.add(keyframe.index, self._vocabulary.words(keyframe.features.descriptor))
+
+    def to_arrays(self) -> Arrays:
+        """Return the words of all keyframes."""
+        words, length = joined(
+            [self._index.words_of(k.index) for k in self._map.keyframes], np.zeros(0, np.int32)
+        )
+        return {'words': words.astype(np.uint16), 'word_count': length}
+
+    def from_arrays(self, arrays: Arrays) -> None:
+        """Take in the words of all keyframes."""
+        for k, words in enumerate(split(arrays['words'], arrays['word_count'])):
+            self._index.add(k, words.astype(np.int32))
 
     def score(self, features: Features) -> Array:
         """Return how much each keyframe (K,) looks like a view, in [0, 1]; those that are retired

@@ -6,6 +6,7 @@ import numpy as np
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.slam.excluded import Region
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.results import (
     NO_POINT,
     Keyframe,
@@ -13,7 +14,7 @@ from segfloor_ros.slam.results import (
     KeyframePath,
     SparseCloud,
 )
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 
 
 def take_snapshot(

@@ -7,69 +7,21 @@ optical frame of the first frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.geometry import Array, invert
-from segfloor_ros.slam.body_motion import RelativeMotion
-from segfloor_ros.slam.features import Features
+from segfloor_ros.geometry import Array
 from segfloor_ros.slam.growing_array import GrowingArray
+from segfloor_ros.slam.keyframe_record import KeyframeRecord, LoopEdge, Retirement
 from segfloor_ros.slam.patch_alignment import SIDE_PX
-from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 
 GONE_AFTER = 3  # keyframes that have seen through a point since it was last found
 
 MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
-
-
-@dataclass(frozen=True)
-class Retirement:
-    """Where a retired keyframe was seen from the keyframe (by index) that it follows."""
-
-    reference: int
-    T_camera_reference: Array
-
-
-@dataclass(frozen=True)
-class LoopEdge:
-    """Where keyframe i was when it saw the place of keyframe j again: T_i_j (4, 4), of cameras."""
-
-    i: int
-    j: int
-    T_i_j: Array
-
-
-@dataclass
-class KeyframeRecord:
-    """One keyframe of the map.
-
-    The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
-    not taken off. retired: set when the keyframe has no features any more and only follows another
-    one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
-    motion: since the keyframe before, as the wheels tell it. links: indices of earlier keyframes
-    that it shared many points with when it was made.
-    """
-
-    index: int
-    frame_index: int
-    stamp_ns: int
-    T_camera_world: Array
-    features: Features
-    observations: Observations
-    point_id: NDArray[np.int32]
-    motion: RelativeMotion | None = None
-    retired: Retirement | None = None
-    links: tuple[int, ...] = ()
-
-    @property
-    def T_world_camera(self) -> Array:
-        """The camera's pose (4, 4)."""
-        return invert(self.T_camera_world)
 
 
 class SparseMap:
@@ -153,6 +105,42 @@ class SparseMap:
     def observer_count(self) -> NDArray[np.int32]:
         """Number of keyframes (P,) that observe each point."""
         return self._observer_count.rows
+
+    @property
+    def num_ever(self) -> int:
+        """How many points there have been: the next stable id."""
+        return self._num_ever
+
+    def point_columns(self) -> dict[str, tuple[GrowingArray, type]]:
+        """Return what is known of points, by name, and the type that is exact enough for a file."""
+        return {
+            'xyz_world': (self._xyz, np.float64),
+            'stable_id': (self._stable_id, np.int32),
+            'descriptor': (self._descriptor, np.uint8),
+            'patch': (self._patch, np.uint8),
+            'patch_distance_m': (self._patch_distance, np.float32),
+            'viewing_distance_m': (self._viewing_distance, np.float32),
+            'viewing_octave': (self._viewing_octave, np.float32),
+            'viewing_direction': (self._viewing_direction, np.float32),
+            'visible_count': (self._visible_count, np.int32),
+            'found_count': (self._found_count, np.int32),
+            'seen_through_count': (self._seen_through_count, np.int32),
+            'born': (self._born, np.int32),
+            'seen_last': (self._seen_last, np.int32),
+        }
+
+    def count_points(self, num_ever: int) -> None:
+        """Take the points of the columns as they are, in a map that was empty."""
+        self._num_ever = num_ever
+        self._alive.extend(np.ones(len(self.stable_id), bool))
+        self._observer_count.lengthen(len(self.stable_id))
+
+    def restore(self, keyframe: KeyframeRecord) -> None:
+        """Add a keyframe whose points are there already."""
+        self.keyframes.append(keyframe)
+        self._add_edges(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT))
+        if keyframe.retired is not None:
+            self._retired.append(keyframe)
 
     def links(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the pairs (M,), (M,) of keyframes, by index, that shared points when the later one

@@ -9,20 +9,24 @@ import numpy as np
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.geometry import Array
+from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.body_motion import BodyMotion
+from segfloor_ros.slam.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.following import Follower
 from segfloor_ros.slam.held_results import HeldResults
-from segfloor_ros.slam.image_check import FrozenCheck, image_fault
+from segfloor_ros.slam.image_check import FrozenCheck, expected_shift, image_fault
 from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.local_map import LocalMap
 from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
 from segfloor_ros.slam.loops import LoopDetector
+from segfloor_ros.slam.map_arrays import fill_map, map_to_arrays
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.motion import CameraMotion
 from segfloor_ros.slam.motion_search import MotionSearch, Searched
@@ -33,7 +37,7 @@ from segfloor_ros.slam.relocalisation import Relocaliser
 from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.snapshot import take_snapshot
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import ObservedFeatures, Track
 from segfloor_ros.slam.tracking import Tracker
 from segfloor_ros.timing import StageTimes
@@ -99,6 +103,7 @@ class StereoSlam:
         self._held = HeldResults()
         self._moving = MotionSearch(camera) if settings.detect_moving else None
         self._frames_since_keyframe = 0
+        self._is_fixed = False
 
     @property
     def disparity_offset_px(self) -> float:
@@ -139,29 +144,43 @@ class StereoSlam:
             result = replace(result, moving=searched.points)
         return self._held.release(result, self.mount)
 
+    def to_arrays(self) -> Arrays:
+        """Return the map, for a file."""
+        self._take_adjustment(wait=True)
+        offset = self._mapper.offset.estimate
+        arrays = map_to_arrays(self.map) | self._places.to_arrays()
+        return arrays | {'disparity_offset': np.array([offset.value_px, offset.information])}
+
+    def load(self, arrays: Arrays, mount: Mount, localize: bool) -> None:
+        """Go on with a map, before the first frame; the camera must be found in it. localize: the
+        map stays as it is. Raises KeyError or ValueError for arrays that are no map.
+        """
+        fill_map(self.map, arrays)
+        self._places.from_arrays(arrays)
+        self._mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+        self.mount, self._is_fixed = mount, localize
+        self._motion.stop()
+
     def close(self) -> None:
         """End the background thread, if there is one."""
         self._adjusting.close()
 
     def _fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
-        frozen = self._frozen.frozen(frame.left, lambda: self._expected_shift(frame.stamp_ns))
+        points = self.map.xyz_world[self._follower.seen_ids]
+        motion = self._motion
+        shift = partial(
+            expected_shift,
+            self._camera,
+            points,
+            motion.T_camera_world,
+            motion.predict(frame.stamp_ns),
+        )
+        frozen = self._frozen.frozen(frame.left, shift)
         fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
             return 'the image is the one before although the camera was moving'
         return fault
-
-    def _expected_shift(self, stamp_ns: int) -> float:
-        """Return how far the picture should have moved since the last pose, in image widths."""
-        ids = self._follower.seen_ids
-        if len(ids) == 0:
-            return 0.0
-        points = self.map.xyz_world[ids]
-        now, then = (
-            self._camera.project(transform_points(T, points))[:, :2]
-            for T in (self._motion.predict(stamp_ns), self._motion.T_camera_world)
-        )
-        return float(np.median(np.linalg.norm(now - then, axis=1))) / self._camera.width
 
     def _track(self, frame: StereoFrame, images: Images) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features."""
@@ -177,7 +196,8 @@ class StereoSlam:
         self._motion.take(track.T_camera_world, track.covariance, frame.stamp_ns)
         self._follower.see(images, track.point_ids, track.uv_px)
         self._local.move_to(track.point_ids, track.T_camera_world)
-        self.map.note_tracking(track.visible_ids, track.point_ids)
+        if not self._is_fixed:
+            self.map.note_tracking(track.visible_ids, track.point_ids)
         self._frames_since_keyframe += 1
         return track
 
@@ -221,9 +241,9 @@ class StereoSlam:
         )
         if not (self._motion.is_lost or self._motion.is_blind):
             return track
-        if track is None or not _recognised(track, RECOVERY_RATIO):
-            track = self._relocalise(images, features)
-        return track if track and _recognised(track, RECOVERY_RATIO) else None
+        if track is not None and _recognised(track, RECOVERY_RATIO):
+            return track
+        return self._relocalise(images, features)
 
     def _relocalise(self, images: Images, features: Features) -> Track | None:
         """Look for the view in the whole map."""
@@ -237,6 +257,8 @@ class StereoSlam:
         )
 
     def _wants_keyframe(self, track: Track | None) -> bool:
+        if self._is_fixed:
+            return False
         if track is None:
             return not self.map.keyframes or self._wants_blind_keyframe()
         return self._local.wants_keyframe(track, self._frames_since_keyframe, self._adjusting.idle)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.features import PYRAMID_SCALE
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.matching import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord
 
 MIN_PARALLAX_RAD = 0.02
 """Angle between two rays below which their crossing says little, about 1.1 degrees."""

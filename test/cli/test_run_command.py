@@ -294,3 +294,39 @@ def test_no_floor_no_map_and_no_success(tmp_path, recording):
     assert done.returncode == 1
     assert 'no' in done.stderr and 'Traceback' not in done.stderr
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_saved_map_is_localized_in(recording, result, tmp_path):
+    saved, first = tmp_path / 'room.map', tmp_path / 'first'
+    done = segfloor('run', recording, '--out', first, '--save-map', saved, *with_mount())
+    assert done.returncode == 0, done.stderr
+    for name in ('trajectory.txt', 'map.pgm'):
+        assert (first / name).read_bytes() == (result[0] / name).read_bytes()
+    second = tmp_path / 'second'
+    done = segfloor('run', recording, '--out', second, '--load-map', saved, '--localize')
+    assert done.returncode == 0, done.stderr
+    assert (second / 'map.pgm').read_bytes() == (first / 'map.pgm').read_bytes()
+    before, after = (np.loadtxt(out / 'trajectory.txt') for out in (first, second))
+    assert len(after) >= FRAMES - 3
+    same = np.isin(before[:, 0], after[:, 0])
+    assert np.abs(before[same, 1:4] - after[:, 1:4]).max() < 0.01
+    summary = json.loads((second / 'summary.json').read_text())
+    assert summary['map_updates'] == 0
+    assert summary['relocalisations'] == []
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        (('--localize',), '--localize needs the map'),
+        (('--load-map', 'nowhere.map'), 'nowhere.map: cannot be read'),
+        (('--load-map', 'short.map'), 'short.map: is truncated or damaged'),
+        (('--load-map', 'short.map', '--localize', '--save-map', 'x'), 'leave --save-map out'),
+    ],
+)
+def test_a_map_that_cannot_be_used_is_one_line(recording, tmp_path, options, words):
+    (tmp_path / 'short.map').write_bytes(b'PK\x03\x04 not much')
+    done = segfloor('run', recording, '--out', tmp_path / 'out', *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in ' '.join(done.stderr.split())
+    assert not (tmp_path / 'out').exists()

@@ -4,10 +4,11 @@ import numpy as np
 
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.patch_alignment import SIDE_PX
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 
 
 def keyframe(index, point_id, x=0.0):

@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import invert, make_transform, transform_points
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.triangulation import fundamental_matrix, triangulate_between
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)

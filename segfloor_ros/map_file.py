@@ -1,0 +1,147 @@
+"""Maps on disk: named arrays and a header in one file, which is checked when it is read.
+
+A zip archive of `.npy` arrays, without pickled objects, so that reading it runs no code; every
+member has a checksum. It is written beside its target and moved into place.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.errors import InputError
+
+FORMAT = 'segfloor map'
+VERSION = 1
+HEADER = 'header.json'
+COMPRESSION_LEVEL = 3
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass
+class MapFile:
+    """The parts of a map by the name of the stage that they belong to, and a header of plain values
+    (numbers, texts, lists, dictionaries).
+    """
+
+    header: dict[str, Any]
+    parts: dict[str, Arrays] = field(default_factory=dict)
+
+
+def write_map_file(path: Path, saved: MapFile) -> None:
+    """Write a map in place of an older file. Raises InputError where that is not possible."""
+    path = path.absolute()
+    written: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.part', delete=False) as file:
+            written = Path(file.name)
+            file.write(to_bytes(saved))
+            file.flush()
+            os.fsync(file.fileno())
+        written.chmod(0o666 & ~_umask())
+        written.replace(path)
+    except OSError as error:
+        if written is not None:
+            written.unlink(missing_ok=True)
+        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def read_map_file(path: Path) -> MapFile:
+    """Read a map. Raises InputError, in one line, for a file that is missing, truncated, damaged,
+    of another kind or of a newer version.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
+    return from_bytes(data, str(path))
+
+
+def to_bytes(saved: MapFile) -> bytes:
+    """Return a map as the bytes of its file; the same map gives the same bytes."""
+    header = {**saved.header, 'format': FORMAT, 'version': VERSION}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(
+        buffer, 'w', zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION_LEVEL
+    ) as archive:
+        _add(archive, HEADER, json.dumps(header, sort_keys=True).encode())
+        for part, arrays in sorted(saved.parts.items()):
+            for name, array in sorted(arrays.items()):
+                member = io.BytesIO()
+                np.save(member, np.ascontiguousarray(array), allow_pickle=False)
+                _add(archive, f'{part}/{name}.npy', member.getvalue())
+    return buffer.getvalue()
+
+
+def from_bytes(data: bytes, name: str) -> MapFile:
+    """Return the map of a file's bytes; name: of the file, for what is wrong with it."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            header = json.loads(archive.read(HEADER))
+            _check_header(header, name)
+            saved = MapFile(header)
+            for member in archive.namelist():
+                if member != HEADER:
+                    part, _, array = member.removesuffix('.npy').partition('/')
+                    content = io.BytesIO(archive.read(member))
+                    saved.parts.setdefault(part, {})[array] = np.load(content, allow_pickle=False)
+            return saved
+    except KeyError:
+        raise InputError(f'{name}: is no map of segfloor; give a file of --save-map') from None
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError):
+        words = 'is truncated or damaged, or no map of segfloor'
+        raise InputError(f'{name}: {words}; give a file of --save-map') from None
+
+
+def _check_header(header: Any, name: str) -> None:
+    if not isinstance(header, dict) or header.get('format') != FORMAT:
+        raise KeyError(HEADER)
+    if header.get('version') != VERSION:
+        raise InputError(
+            f'{name}: is a map of version {header.get("version")}, this release reads version '
+            f'{VERSION}; take the release that wrote it'
+        )
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    member = zipfile.ZipInfo(name)  # without the time of day
+    member.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(member, content)
+
+
+def joined(arrays: list[NDArray[Any]], empty: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return arrays (N_i, ...) as one (sum N_i, ...) and their lengths; empty: one of no rows."""
+    lengths = np.array([len(array) for array in arrays], np.int64)
+    return np.concatenate([empty, *arrays]), lengths
+
+
+def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
+    """Return the arrays that `joined` made one of. Raises ValueError where lengths do not fit."""
+    if lengths.sum() != len(array):
+        raise ValueError(f'{len(array)} rows, but {lengths.sum()} are told')
+    return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
+
+
+def check_lengths(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError unless all arrays have the same length."""
+    if len({len(array) for array in arrays.values()}) > 1:
+        raise ValueError('columns of different lengths')

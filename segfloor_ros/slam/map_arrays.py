@@ -1,0 +1,129 @@
+"""The sparse map as arrays, for a file, and back.
+
+Features that show no point are left out, and so are the motions that sensors told; nothing is lost
+that tracking, relocalisation or the closing of loops need.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+from segfloor_ros.map_file import Arrays, check_lengths, joined, split
+from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.keyframe_record import KeyframeRecord, LoopEdge, Retirement
+from segfloor_ros.slam.residuals import Observations
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.sparse_map import SparseMap
+
+GAP_NS = 1_000_000_000
+
+
+def map_to_arrays(sparse_map: SparseMap) -> Arrays:
+    """Return a map as arrays; points are numbered anew in the order of their ids."""
+    alive = np.flatnonzero(sparse_map.alive)
+    alive = alive[np.argsort(sparse_map.stable_id[alive])]
+    arrays: Arrays = {
+        f'point_{name}': column.rows[alive].astype(kind)
+        for name, (column, kind) in sparse_map.point_columns().items()
+    }
+    new_row = np.full(len(sparse_map.alive) + 1, NO_POINT, np.int32)
+    new_row[alive] = np.arange(len(alive), dtype=np.int32)
+    keyframes = sparse_map.keyframes
+    shown = [np.flatnonzero(k.point_id != NO_POINT) for k in keyframes]
+    pairs = list(zip(keyframes, shown, strict=True))
+    uvd, length = joined([k.observations.uvd_px[r] for k, r in pairs], np.zeros((0, 3)))
+    sigma, _ = joined([k.observations.sigma_px[r] for k, r in pairs], np.zeros((0, 3)))
+    octave, _ = joined([k.features.octave[r] for k, r in pairs], np.zeros(0, np.uint8))
+    point, _ = joined([new_row[k.point_id[r]] for k, r in pairs], np.zeros(0, np.int32))
+    links, link_length = joined(
+        [np.array(k.links, np.int32) for k in keyframes], np.zeros(0, np.int32)
+    )
+    retired = [_followed(sparse_map, k) for k in keyframes]
+    loops = sparse_map.loops
+    return arrays | {
+        'num_ever': np.array([sparse_map.num_ever]),
+        'keyframe_frame_index': np.array([k.frame_index for k in keyframes], np.int64),
+        'keyframe_stamp_ns': np.array([k.stamp_ns for k in keyframes], np.int64),
+        'keyframe_T_camera_world': _stack([k.T_camera_world for k in keyframes]),
+        'keyframe_features': length,
+        'keyframe_link_count': link_length,
+        'keyframe_links': links,
+        'keyframe_follows': np.array([r.reference for r in retired], np.int32),
+        'keyframe_T_camera_followed': _stack([r.T_camera_reference for r in retired]),
+        'feature_uvd_px': uvd.astype(np.float32),
+        'feature_sigma_px': sigma.astype(np.float16),
+        'feature_octave': octave,
+        'feature_point': point,
+        'loop_ends': np.array([(e.i, e.j) for e in loops], np.int32).reshape(-1, 2),
+        'loop_T_i_j': _stack([e.T_i_j for e in loops]),
+    }
+
+
+def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
+    """Fill an empty map. The stamps end a second before 0: a new drive comes after it, whatever its
+    clock says. Raises KeyError or ValueError for arrays that are no map.
+    """
+    columns = sparse_map.point_columns()
+    check_lengths({name: arrays[f'point_{name}'] for name in columns})
+    for name, (column, _) in columns.items():
+        column.extend(arrays[f'point_{name}'])
+    sparse_map.count_points(int(arrays['num_ever'][0]))
+    stamps = arrays['keyframe_stamp_ns'] - arrays['keyframe_stamp_ns'].max(initial=0) - GAP_NS
+    for index, record in enumerate(_keyframes(arrays, stamps, sparse_map.descriptor)):
+        if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
+            raise ValueError('features of points that are not there')
+        sparse_map.restore(record)
+    ends = zip(arrays['loop_ends'].tolist(), arrays['loop_T_i_j'], strict=True)
+    sparse_map.loops += [LoopEdge(i, j, T) for (i, j), T in ends]
+
+
+def _keyframes(
+    arrays: Arrays, stamps: NDArray[np.int64], descriptor: NDArray[np.uint8]
+) -> list[KeyframeRecord]:
+    length = arrays['keyframe_features']
+    uvd, sigma, octave, point = (
+        split(arrays[f'feature_{name}'], length)
+        for name in ('uvd_px', 'sigma_px', 'octave', 'point')
+    )
+    links = split(arrays['keyframe_links'], arrays['keyframe_link_count'])
+    records = []
+    for k, stamp_ns in enumerate(stamps.tolist()):
+        # Points carry the look of their features.
+        features = Features(uvd[k][:, :2].copy(), octave[k], descriptor[point[k]])
+        observations = Observations(uvd[k].astype(np.float64), sigma[k].astype(np.float64))
+        follows = int(arrays['keyframe_follows'][k])
+        retired = Retirement(follows, arrays['keyframe_T_camera_followed'][k])
+        records.append(
+            KeyframeRecord(
+                k,
+                int(arrays['keyframe_frame_index'][k]),
+                stamp_ns,
+                arrays['keyframe_T_camera_world'][k],
+                features,
+                observations,
+                point[k].copy(),
+                retired=retired if follows != NO_POINT else None,
+                links=tuple(links[k].tolist()),
+            )
+        )
+    return records
+
+
+def _followed(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Retirement:
+    """Return the keyframe with features that a retired one follows in the end, `NO_POINT` for one
+    that is not retired.
+    """
+    root = keyframe
+    while root.retired is not None:
+        root = sparse_map.keyframes[root.retired.reference]
+    if root is keyframe:
+        return Retirement(NO_POINT, np.eye(4))
+    return Retirement(root.index, keyframe.T_camera_world @ root.T_world_camera)
+
+
+def _stack(transforms: list[Array]) -> NDArray[Any]:
+    return np.array(transforms, np.float64).reshape(-1, 4, 4)

@@ -1,0 +1,110 @@
+"""A map that is saved, loaded, localized in, and mapped on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.geometry import invert
+from segfloor_ros.map_file import MapFile, from_bytes, to_bytes
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+SETTINGS = StereoSlamSettings(num_features=600)
+ROOM = StereoRoom()
+
+
+def there(count, aside=0.0):
+    return [planar_pose(0.04 * k, aside, 0.03 * k) for k in range(count)]
+
+
+def drive(slam, poses):
+    """Return the results, and the errors in metres of the frames that were tracked."""
+    results = [slam.process(ROOM.frame(k, pose))[0] for k, pose in enumerate(poses)]
+    pairs = [(r, p) for r, p in zip(results, poses, strict=True) if r.tracked]
+    return results, [
+        np.linalg.norm((invert(pose) @ r.T_map_odom @ r.T_odom_base)[:3, 3]) for r, pose in pairs
+    ]
+
+
+@pytest.fixture(scope='module')
+def mapped():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    drive(slam, there(25))
+    return slam
+
+
+@pytest.fixture(scope='module')
+def saved(mapped):
+    return mapped.to_arrays()
+
+
+def loaded(arrays, localize):
+    slam = StereoSlam(CAMERA, SETTINGS)
+    slam.load(arrays, MOUNT, localize)
+    return slam
+
+
+def test_a_loaded_map_is_the_one_that_was_saved(mapped, saved):
+    slam = loaded(saved, localize=True)
+    alive = np.flatnonzero(mapped.map.alive)
+    order = alive[np.argsort(mapped.map.stable_id[alive])]
+    np.testing.assert_array_equal(slam.map.stable_id, mapped.map.stable_id[order])
+    np.testing.assert_array_equal(slam.map.xyz_world, mapped.map.xyz_world[order])
+    np.testing.assert_array_equal(slam.map.observer_count, mapped.map.observer_count[order])
+    np.testing.assert_array_equal(slam.map.patch, mapped.map.patch[order])
+    assert slam.map.num_ever == mapped.map.num_ever
+    for a, b in zip(slam.map.keyframes, mapped.map.keyframes, strict=True):
+        np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-12)
+        assert a.links == b.links
+        assert (a.retired is None) == (b.retired is None)
+    stamps = [k.stamp_ns for k in slam.map.keyframes]
+    assert stamps[-1] < 0
+    assert np.diff(stamps).tolist() == np.diff([k.stamp_ns for k in mapped.map.keyframes]).tolist()
+
+
+def test_saving_again_does_not_grow_the_file(saved):
+    def size(arrays):
+        return len(to_bytes(MapFile({}, {'slam': arrays})))
+
+    again = loaded(saved, localize=True).to_arrays()
+    assert size(again) == pytest.approx(size(saved), rel=0.01)
+    assert size(saved) < 60_000 * len(saved['keyframe_stamp_ns'])
+    back = from_bytes(to_bytes(MapFile({}, {'slam': saved})), 'x').parts['slam']
+    for name, array in saved.items():
+        np.testing.assert_array_equal(back[name], array)
+
+
+def test_localizing_finds_the_camera_and_adds_nothing(saved):
+    slam = loaded(saved, localize=True)
+    results, errors = drive(slam, there(20, aside=0.05)[3:])
+    assert sum(not r.tracked for r in results[:3]) < 3
+    assert all(r.tracked for r in results[3:])
+    assert all(r.keyframe is None for r in results)
+    assert max(errors) < 0.02
+    again = slam.to_arrays()
+    for name in ('point_xyz_world', 'point_found_count', 'keyframe_T_camera_world'):
+        np.testing.assert_array_equal(again[name], saved[name])
+
+
+def test_mapping_goes_on_in_the_same_frame_with_new_ids(saved):
+    slam = loaded(saved, localize=False)
+    before = slam.map.num_ever, len(slam.map.keyframes)
+    poses = there(25)[15:] + [planar_pose(1.0, 0.04 * k, 0.75 + 0.06 * k) for k in range(12)]
+    results, errors = drive(slam, poses)
+    assert all(r.tracked for r in results[3:])
+    assert max(errors) < 0.03
+    assert len(slam.map.keyframes) > before[1]
+    new = [r.keyframe for r in results if r.keyframe][-1]
+    assert new.cloud.point_id.max() >= before[0]
+    assert set(saved['point_stable_id'][:50]) & set(new.cloud.point_id.tolist())
+
+
+def test_another_room_is_not_this_one(saved):
+    slam = loaded(saved, localize=True)
+    other = StereoRoom(seed=77)
+    for k in range(6):
+        result = slam.process(other.frame(k, planar_pose(0.04 * k, 0, 0)))[0]
+        assert not result.tracked
+        assert result.covariance[0, 0] > 1e3
