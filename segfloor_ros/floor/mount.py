@@ -34,6 +34,7 @@ _MAX_FRAMES = 12
 _SAMPLES_PER_FRAME = 4000
 _PROPOSALS = 600
 _KEPT = 60
+_SCORED_EVERY = 5
 _PLAIN_SUPPORT = 0.3
 _WEAK_SUPPORT = 0.08
 _MAX_VIOLATIONS = 0.05
@@ -116,7 +117,9 @@ class MountEstimator:
         guesses = np.concatenate([with_known(self._guesses, self._known), fresh])
         if len(guesses) == 0:
             return
-        total = np.sum([scores(frame, guesses) for frame in self._frames], axis=0)
+        # A few samples tell which guess is best; all of them refine it.
+        few = [frame.every(_SCORED_EVERY) for frame in self._frames]
+        total = np.sum([scores(frame, guesses) for frame in few], axis=0)
         total = np.maximum(total, 0) * preference(guesses, self._travel())
         order = np.argsort(-total, kind='stable')[:_KEPT]
         self._guesses = guesses[order]

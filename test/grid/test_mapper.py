@@ -6,13 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import Drive, World, cells_at, no_points, path_of
+from conftest import Drive, World, cells_at, centres, no_points, path_of
 
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid import history
+from segfloor_ros.grid.log_odds import ZERO, LogOddsRaster
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.rendering import render
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
@@ -136,18 +138,16 @@ def test_resolutions(make_drive: MakeDrive, resolution_m: float) -> None:
 
 
 def test_free_cells_that_nothing_joins_to_the_path_are_unknown() -> None:
-    # The floor is seen on both sides of a gap in the scan: rays to two points beyond.
-    settings = OccupancyGridSettings(footprint_radius_m=0.2)
-    far = FloorScan(0.0, 0.01, np.zeros(3, np.float32))
-    mapper = OccupancyGridMapper(settings)
-    mapper.update(0, no_points(), NO_FEATURES, path_of([(0.0, 0.0, 0.0)]), far)
-    mapper.update(
-        400_000_000, no_points(), NO_FEATURES, path_of([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0)]), far
-    )
-    moved = path_of([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (9.05, 0.0, 0.0)])
-    mapper.update(800_000_000, no_points(), NO_FEATURES, moved, far)
-    # Both places the base has been at are joined to the path, by being on it.
-    assert (cells_at(mapper.grid(), np.array([[0.0, 0.0], [9.0, 0.0]])) == 0).all()
+    raster = LogOddsRaster()
+    cells = raster.patch((0, 0), (10, 30))
+    cells[2:8, 2:10] = cells[2:8, 15:25] = ZERO - 40
+    here, there = centres((0.1, 0.5), (0.1, 0.4)), centres((0.75, 1.25), (0.1, 0.4))
+    alone = render(raster, np.array([[0.3, 0.25]]), OccupancyGridSettings())
+    assert (cells_at(alone, here) == 0).all()
+    assert (cells_at(alone, there) == -1).all()
+    both = render(raster, np.array([[0.3, 0.25], [1.0, 0.25]]), OccupancyGridSettings())
+    assert (cells_at(both, here) == 0).all()
+    assert (cells_at(both, there) == 0).all()
 
 
 def test_probabilities() -> None:
