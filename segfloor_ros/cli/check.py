@@ -14,9 +14,9 @@ from rich.table import Table
 from segfloor_ros.cli.output import console, figure_table, print_error
 from segfloor_ros.errors import InputError, SettingsError
 from segfloor_ros.suite.bounds import number
-from segfloor_ros.suite.description import Entry, Suite, read_suite
+from segfloor_ros.suite.description import Suite, read_suite
 from segfloor_ros.suite.job import Job, Outcome, package_digest
-from segfloor_ros.suite.result_files import MEASURED, unpack
+from segfloor_ros.suite.result_files import MEASURED, pack, unpack
 from segfloor_ros.suite.verdicts import (
     Baseline,
     Checked,
@@ -67,7 +67,7 @@ def check_suite(
     known = read_baseline(baseline) if baseline is not None else None
     _check_folder(out)
     folder = (cache or _default_cache()).absolute()
-    todo = [_job(entry, folder, not no_cache) for entry in described.entries]
+    todo = _jobs(described, folder, not no_cache)
     found: dict[str, Checked] = {}
     for job, outcome in _all_outcomes(todo, out, resume, jobs, scheduler):
         checked = check(job.entry, outcome, known)
@@ -82,9 +82,14 @@ def check_suite(
         raise typer.Exit(1)
 
 
-def _job(entry: Entry, cache: Path, reuse: bool) -> Job:
-    params = Path(entry.params).read_text() if entry.params else ''
-    return Job(entry, params, str(cache), reuse)
+def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:
+    continued = {entry.continue_from for entry in suite.entries}
+    jobs: dict[str, Job] = {}
+    for entry in suite.entries:
+        params = Path(entry.params).read_text() if entry.params else ''
+        origin = jobs[entry.continue_from].digest() if entry.continue_from else ''
+        jobs[entry.name] = Job(entry, params, str(cache), reuse, entry.name in continued, origin)
+    return list(jobs.values())
 
 
 def _all_outcomes(
@@ -92,12 +97,11 @@ def _all_outcomes(
 ) -> Iterator[tuple[Job, Outcome]]:
     """Yield jobs with what came of them; what is in `out` already comes first."""
     by_name = {job.entry.name: job for job in todo}
-    for job in todo if resume else ():
-        kept = _read_outcome(job, out)
-        if kept is not None:
-            del by_name[job.entry.name]
-            yield job, kept
-    for outcome in outcomes(list(by_name.values()), processes, scheduler):
+    read = (_read_outcome(job, out) for job in todo if resume)
+    kept = {outcome.name: outcome for outcome in read if outcome is not None}
+    yield from ((by_name[name], outcome) for name, outcome in kept.items())
+    left = [job for job in todo if job.entry.name not in kept]
+    for outcome in outcomes(left, kept, processes, scheduler):
         if outcome.package not in ('', package_digest()):
             raise SettingsError(
                 f'worker {outcome.worker} has another version of segfloor_ros than this machine; '
@@ -106,21 +110,33 @@ def _all_outcomes(
         job = by_name[outcome.name]
         unpack(outcome.archive, out / outcome.name)
         if not outcome.problem:
-            record = {'job': job.digest(), 'seconds': outcome.seconds, **outcome.measured}
+            record = {
+                'job': job.digest(),
+                'seconds': outcome.seconds,
+                'start_pose': outcome.start_pose,
+                'measured': outcome.measured,
+            }
             (out / outcome.name / MEASURED).write_text(json.dumps(record, indent=2) + '\n')
         yield job, outcome
 
 
 def _read_outcome(job: Job, out: Path) -> Outcome | None:
     """Return what an earlier check found, None where it did not or with other parameters."""
+    folder = out / job.entry.name
     try:
-        record = json.loads((out / job.entry.name / MEASURED).read_text())
-        if record.pop('job') != job.digest():
+        record = json.loads((folder / MEASURED).read_text())
+        if record['job'] != job.digest():
             return None
-        seconds = record.pop('seconds')
+        return Outcome(
+            job.entry.name,
+            record['measured'],
+            archive=pack(folder) if job.is_continued else b'',
+            start_pose=record['start_pose'] and tuple(record['start_pose']),
+            seconds=record['seconds'],
+            reused=True,
+        )
     except (OSError, ValueError, KeyError):
         return None
-    return Outcome(job.entry.name, record, seconds=seconds, reused=True)
 
 
 def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:

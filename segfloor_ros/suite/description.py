@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ TIMEOUT_S = 3600.0
 SUITE_KEYS = ('name', 'defaults', 'recordings')
 SHARED_KEYS = ('truth', 'reference_map', 'mode', 'rate', 'params', 'set', 'timeout_s', 'expect',
                'no_worse_by')  # fmt: skip
-RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name')
+RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name', 'continue_from')
+PREVIOUS = 'previous'
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Entry:
     that is there already and only measured. scene_assignments: what differs from the scene. mode:
     `run`, or `replay` through the nodes at `rate`. truth, reference_map: paths or URLs; truth ''
     means the recording itself where it holds one. params: a parameter file, '' for none. slacks: by
-    measure, for a baseline.
+    measure, for a baseline. continue_from: name of the recording whose map this one continues, ''
+    for none.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Entry:
     timeout_s: float = TIMEOUT_S
     bounds: tuple[Bound, ...] = ()
     slacks: Mapping[str, Slack] = field(default_factory=dict)
+    continue_from: str = ''
 
 
 @dataclass(frozen=True)
@@ -72,12 +75,35 @@ def read_suite(path: Path) -> Suite:
     for index, item in enumerate(recordings):
         key: Key = ('recordings', index)
         own = _mapping(document, key, item, RECORDING_KEYS + SHARED_KEYS)
-        entries += _Reader(document, key, own, defaults).entries()
+        for entry in _Reader(document, key, own, defaults).entries():
+            entries.append(_continued(document, key, own.get('continue_from'), entry, entries))
         names = [entry.name for entry in entries]
         doubled = [name for name in names if names.count(name) > 1]
         if doubled:
             raise document.error(key, f'two recordings are called {doubled[0]}; give one a name')
     return Suite(str(values.get('name') or path.stem), tuple(entries))
+
+
+def _continued(
+    document: MarkedYaml, key: Key, wanted: Any, entry: Entry, before: list[Entry]
+) -> Entry:
+    """Return an entry that continues the map of an earlier one, as `continue_from` says. The first
+    one of a suite has no previous one, and starts a map.
+    """
+    names = [earlier.name for earlier in before]
+    if not wanted or (wanted == PREVIOUS and not names):
+        return entry
+    name = names[-1] if wanted == PREVIOUS else str(wanted)
+    if name not in names:
+        raise document.error(
+            (*key, 'continue_from'), f'continue_from: {name} is no earlier recording of the suite'
+        )
+    for one in (entry, before[names.index(name)]):
+        if one.source == RESULTS or one.mode != RUN:
+            raise document.error(
+                (*key, 'continue_from'), f'continue_from: {one.name} is not mapped by mode run'
+            )
+    return replace(entry, continue_from=name)
 
 
 class _Reader:

@@ -4,16 +4,12 @@ folder. A job runs where its worker is and needs nothing but the recording.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import fcntl
 import functools
 import hashlib
 import os
-import signal
 import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -23,35 +19,38 @@ from typing import Any
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
+from segfloor_ros.evaluation.truth import Pose2d
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.drive_files import RecordingOptions
 from segfloor_ros.simulation.render_once import render_once
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
-from segfloor_ros.suite.measures import measure_run
+from segfloor_ros.suite.measures import measure_run, start_pose_of
+from segfloor_ros.suite.program import run_segfloor
 from segfloor_ros.suite.recordings import digest_of, local_copy
-from segfloor_ros.suite.result_files import Cache, pack
+from segfloor_ros.suite.result_files import Cache, pack, unpack
 
 LOG = 'log.txt'
-STOP_S = 15.0
-"""For a program to end that was told to; a replay ends its nodes first."""
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
+SAVED_MAP = 'saved.map'
+"""In the results folder of a recording that another one continues."""
 
 
 class JobError(SegfloorError):
-    """A recording could not be mapped or measured."""
+    """A recording cannot be mapped."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
     """What a worker needs to know. params: the text of the parameter file. cache: folder for copies
-    of recordings, renderings and, where `reuse`, results.
+    of recordings, renderings and, where `reuse`, results. is_continued: another recording continues
+    its map. origin: digest of the job whose map it continues.
     """
 
     entry: Entry
     params: str
     cache: str
     reuse: bool
+    is_continued: bool = False
+    origin: str = ''
 
     def digest(self) -> str:
         """Return a hash of all that decides the result but the content of files."""
@@ -64,45 +63,45 @@ class Job:
 
     def _digest(self, **without: Any) -> str:
         entry = dataclasses.replace(self.entry, bounds=(), slacks={}, params='', **without)
-        return _digest_of_text(repr((package_digest(), entry, self.params)))
+        kind = (self.is_continued, self.origin)
+        return _digest_of_text(repr((package_digest(), entry, self.params, kind)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
     """What came of a job. problem: why there is no map, '' where there is one. archive: the results
-    folder, packed. worker: host and process. reused: from the cache.
+    folder, packed. start_pose: where the map's frame lies in the truth's. worker: host and process.
+    reused: from the cache.
     """
 
     name: str
     measured: dict[str, float]
     problem: str = ''
     archive: bytes = b''
+    start_pose: Pose2d | None = None
     seconds: float = 0.0
     worker: str = ''
     reused: bool = False
     package: str = ''
 
 
-def do_job(job: Job) -> Outcome:
-    """Map and measure one recording. What goes wrong with it is in the outcome."""
+def do_job(job: Job, origin: Outcome | None = None) -> Outcome:
+    """Map and measure one recording. What goes wrong with it is in the outcome. origin: of the
+    recording whose map is continued.
+    """
     start_s = time.monotonic()
     try:
-        measured, archive, reused = _map_and_measure(job)
-        problem = ''
+        outcome = _map_and_measure(job, origin)
     except SegfloorError as error:
-        measured, archive, reused, problem = {}, b'', False, str(error)
+        outcome = Outcome(job.entry.name, {}, str(error))
     except Exception as error:
         # Whatever it is, the other recordings go on.
-        measured, archive, reused, problem = {}, b'', False, f'{type(error).__name__}: {error}'
-    return Outcome(
-        job.entry.name,
-        measured,
-        problem,
-        archive,
-        time.monotonic() - start_s,
-        f'{socket.gethostname()}:{os.getpid()}',
-        reused,
-        package_digest(),
+        outcome = Outcome(job.entry.name, {}, f'{type(error).__name__}: {error}')
+    return dataclasses.replace(
+        outcome,
+        seconds=time.monotonic() - start_s,
+        worker=f'{socket.gethostname()}:{os.getpid()}',
+        package=package_digest(),
     )
 
 
@@ -112,32 +111,43 @@ def package_digest() -> str:
     return f'{__version__}-{digest_of(Path(__file__).resolve().parents[1])}'
 
 
-def _map_and_measure(job: Job) -> tuple[dict[str, float], bytes, bool]:
+def _map_and_measure(job: Job, origin: Outcome | None) -> Outcome:
     entry, folder = job.entry, Path(job.cache)
     recording = _recording(entry, folder)
     truth = _truth(entry, recording, folder)
+    start_pose = origin.start_pose if origin is not None else start_pose_of(truth)
     reference_map = (
         local_copy(entry.reference_map, folder / 'recordings') if entry.reference_map else None
     )
     if entry.source == RESULTS:
-        return measure_run(recording, truth, reference_map), pack(recording), False
-    cache = Cache(folder / 'results')
-    named = [recording, truth, reference_map, *_files_of(entry.assignments)]
-    files = dict.fromkeys(path for path in named if path is not None)
-    key = job.content_digest(files) if job.reuse else ''
-    if job.reuse and (kept := cache.get(key)) is not None:
-        return *kept, True
+        measured = measure_run(recording, truth, reference_map, start_pose)
+        return Outcome(entry.name, measured, archive=pack(recording))
     with tempfile.TemporaryDirectory(prefix='segfloor-check-') as temporary:
-        out = Path(temporary) / 'out'
+        loaded = _map_to_load(origin, Path(temporary))
+        named = [recording, truth, reference_map, loaded, *_files_of(entry.assignments)]
+        files = dict.fromkeys(path for path in named if path is not None)
+        cache, key = Cache(folder / 'results'), job.content_digest(files) if job.reuse else ''
+        if job.reuse and (kept := cache.get(key)) is not None:
+            return Outcome(entry.name, kept[0], '', kept[1], start_pose, reused=True)
         reference = ReferenceWorkload()
         reference.time()
-        _run(job, recording, Path(temporary), out)
+        out = _run(job, recording, loaded, Path(temporary))
         reference.time()
-        measured = measure_run(out, truth, reference_map, reference.median_ms)
+        measured = measure_run(out, truth, reference_map, start_pose, reference.median_ms)
         archive = pack(out)
     if job.reuse:
         cache.put(key, measured, archive)
-    return measured, archive, False
+    return Outcome(entry.name, measured, '', archive, start_pose)
+
+
+def _map_to_load(origin: Outcome | None, folder: Path) -> Path | None:
+    """Return the map that is continued, as a file. Raises JobError where there is none."""
+    if origin is None:
+        return None
+    if origin.problem:
+        raise JobError(f'there is no map of {origin.name} to continue')
+    unpack(origin.archive, folder / 'origin')
+    return folder / 'origin' / SAVED_MAP
 
 
 def _recording(entry: Entry, folder: Path) -> Path:
@@ -169,59 +179,22 @@ def _files_of(assignments: Iterable[str]) -> list[Path]:
     return [Path(value) for value in values if '/' in value and Path(value).exists()]
 
 
-def _run(job: Job, recording: Path, temporary: Path, out: Path) -> None:
-    """Map the recording with the command line and write the report. Raises JobError."""
-    entry = job.entry
+def _run(job: Job, recording: Path, loaded: Path | None, temporary: Path) -> Path:
+    """Map the recording with the command line, and return the results folder."""
+    entry, out, log, saved = job.entry, *(temporary / n for n in ('out', LOG, SAVED_MAP))
     words = [entry.mode, str(recording), '--out', str(out), '--report']
     words += ['--rate', str(entry.rate)] if entry.mode == REPLAY else []
+    words += ['--load-map', str(loaded)] if loaded is not None else []
+    words += ['--save-map', str(saved)] if job.is_continued else []
     if job.params:
         (temporary / 'params.yaml').write_text(job.params)
         words += ['--params', str(temporary / 'params.yaml')]
     words += [word for assignment in entry.assignments for word in ('--set', assignment)]
-    log = temporary / LOG
-    _call(words, log, entry.timeout_s)
+    run_segfloor(words, log, entry.timeout_s)
     log.replace(out / LOG)
-
-
-def _call(words: list[str], log: Path, timeout_s: float) -> None:
-    """Run the command `segfloor` and end it where it takes too long. Raises JobError."""
-    with log.open('wb') as output:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'segfloor_ros.cli.main', *words],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_end_with_worker if sys.platform == 'linux' else None,
-        )
-    try:
-        status = process.wait(timeout_s)
-    except subprocess.TimeoutExpired:
-        raise JobError(f'no map within {timeout_s:g} s') from None
-    finally:
-        _end(process)
-    if status:
-        lines = log.read_text(errors='replace').strip().splitlines()
-        last = lines[-1].removeprefix('segfloor: ') if lines else ''
-        cause = f'status {status}' if status > 0 else f'signal {signal.Signals(-status).name}'
-        raise JobError(f'{last or "ended without a word"} ({cause})')
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a program and what it has started."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is not None:
-            return
-        os.killpg(process.pid, number)
-        try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            continue
-
-
-def _end_with_worker() -> None:
-    """Have the kernel end this program when its worker dies (prctl(2)): its result is lost."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if job.is_continued:
+        saved.replace(out / SAVED_MAP)
+    return out
 
 
 def _digest_of_text(text: str) -> str:

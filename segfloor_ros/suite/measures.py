@@ -14,7 +14,7 @@ from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.evaluation.truth import load_truth, read_map
+from segfloor_ros.evaluation.truth import Pose2d, load_truth, read_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
@@ -58,13 +58,18 @@ MEASURES = {
 
 
 def measure_run(
-    run: Path, truth: Path | None, reference_map: Path | None, reference_ms: float = float('nan')
+    run: Path,
+    truth: Path | None,
+    reference_map: Path | None,
+    start_pose: Pose2d | None = None,
+    reference_ms: float = float('nan'),
 ) -> dict[str, float]:
     """Return the measures of a results folder by name, those that its files and the truth allow.
 
     truth: a folder with map.yaml (and scene.yaml, base_poses.txt), poses.txt or floor/, or a map
-    YAML. reference_map: a map of an earlier run from the same start. reference_ms: median time of
-    the reference workload. Raises InputError naming what cannot be read.
+    YAML. reference_map: a map of an earlier run from the same start. start_pose: where the map's
+    frame lies in the truth's. reference_ms: median time of the reference workload. Raises
+    InputError naming what cannot be read.
     """
     grid = read_map(run / 'map.yaml')
     known = float((states(grid) != UNKNOWN).sum())
@@ -74,10 +79,25 @@ def measure_run(
     if (run / 'trajectory.txt').is_file():
         measured['return_m'] = _return_m(run / 'trajectory.txt')
     if truth is not None:
-        measured.update(_against_truth(run, grid, truth))
+        measured.update(_against_truth(run, grid, truth, start_pose))
     if reference_map is not None:
         measured['agreement_percent'] = 100 * agreement(grid, read_map(reference_map))
     return {name: round(value, 6) for name, value in measured.items() if np.isfinite(value)}
+
+
+def start_pose_of(truth: Path | None) -> Pose2d | None:
+    """Return where the frame of a map that starts with this drive lies in the truth's; None where
+    nobody said. Raises InputError.
+    """
+    if truth is None or not _has_map(truth):
+        return None
+    return load_truth(truth).start_pose
+
+
+def _has_map(truth: Path) -> bool:
+    if not truth.exists():
+        raise InputError(f'{truth}: there is no such truth')
+    return not truth.is_dir() or (truth / 'map.yaml').is_file()
 
 
 def agreement(grid: OccupancyGrid, reference: OccupancyGrid) -> float:
@@ -110,13 +130,12 @@ def _return_m(trajectory: Path) -> float:
     return float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]))
 
 
-def _against_truth(run: Path, grid: OccupancyGrid, truth: Path) -> dict[str, float]:
+def _against_truth(
+    run: Path, grid: OccupancyGrid, truth: Path, start_pose: Pose2d | None
+) -> dict[str, float]:
     measured: dict[str, float] = {}
-    if not truth.exists():
-        raise InputError(f'{truth}: there is no such truth')
-    if not truth.is_dir() or (truth / 'map.yaml').is_file():
-        known = load_truth(truth)
-        score = score_map(grid, known, known.start_pose or (0.0, 0.0, 0.0))
+    if _has_map(truth):
+        score = score_map(grid, load_truth(truth), start_pose or (0.0, 0.0, 0.0))
         measured['precision_percent'] = 100 * score.opened.precision.mean
         measured['recall_percent'] = 100 * score.opened.recall.mean
         measured['free_precision_percent'] = 100 * score.cells.free_precision

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from segfloor_ros.errors import SettingsError
@@ -13,34 +13,43 @@ from segfloor_ros.suite.job import Job, Outcome, do_job
 CONNECT_S = 10
 
 
-def outcomes(jobs: list[Job], processes: int = 1, scheduler: str = '') -> Iterator[Outcome]:
-    """Yield what comes of the jobs, as they finish. scheduler: address of a Dask scheduler, whose
-    workers do them; else so many processes of this machine. Raises SettingsError.
+def outcomes(
+    jobs: list[Job], kept: Mapping[str, Outcome], processes: int = 1, scheduler: str = ''
+) -> Iterator[Outcome]:
+    """Yield what comes of the jobs, as they finish. A job that continues a map comes after the one
+    that makes it. kept: outcomes by name of jobs that were done before. scheduler: address of a
+    Dask scheduler, whose workers do the jobs; else so many processes of this machine. Raises
+    SettingsError.
     """
-    if not scheduler and processes == 1:
-        yield from map(do_job, jobs)
+    if scheduler or processes > 1:
+        with _client(processes, scheduler) as client:
+            yield from _distributed(client, jobs, kept)
         return
-    with _client(processes, scheduler) as client:
-        yield from _distributed(client, jobs)
+    done = dict(kept)
+    for job in jobs:
+        done[job.entry.name] = do_job(job, done.get(job.entry.continue_from))
+        yield done[job.entry.name]
 
 
-def _distributed(client: Any, jobs: list[Job]) -> Iterator[Outcome]:
+def _distributed(client: Any, jobs: list[Job], kept: Mapping[str, Outcome]) -> Iterator[Outcome]:
     """A worker that dies has its job done again by another one (Dask sees to that, a few times)."""
     from distributed import as_completed
 
-    names = {}
-    futures = []
+    futures: dict[str, Any] = {}
     for job in jobs:
-        future = client.submit(do_job, job, pure=False)
-        names[future.key] = job.entry.name
-        futures.append(future)
-    finished = as_completed(futures)
+        origin = job.entry.continue_from
+        futures[job.entry.name] = client.submit(
+            do_job, job, futures.get(origin, kept.get(origin)), pure=False
+        )
+    names = {future.key: name for name, future in futures.items()}
+    finished = as_completed(list(futures.values()))
+    futures.clear()
     for future in finished:
         if future.status == 'finished':
             outcome = future.result()
         else:
             outcome = Outcome(names[future.key], {}, problem=f'{future.exception()}')
-        # The cluster need not keep what is here now.
+        # The cluster need not keep what is here now, unless a job that waits needs it.
         future.release()
         yield outcome
 

@@ -64,7 +64,7 @@ def test_a_suite_is_checked_kept_and_resumed(room, tmp_path):
     assert (document.tests, document.failures, document.errors, document.skipped) == (6, 0, 1, 1)
     assert '1 of 2 recordings' in (out / 'suite.html').read_text()
     assert '<h2>Time per stage</h2>' in (out / 'good' / 'report.html').read_text()
-    measured = json.loads((out / 'good' / 'measured.json').read_text())
+    measured = json.loads((out / 'good' / 'measured.json').read_text())['measured']
     assert measured['tracked_percent'] == 100
     assert 0 < measured['path_error_m'] < 0.02
     # Driven 0.3 m straight on.

@@ -67,6 +67,23 @@ def test_a_pattern_is_all_it_matches(tmp_path):
     assert [entry.name for entry in suite.entries] == ['a', 'b']
 
 
+def test_drives_in_order_each_continue_the_map_of_the_last(tmp_path):
+    text = """
+        recordings:
+          - input: bags/other
+            continue_from: previous
+          - input: bags/?
+            continue_from: previous
+          - input: bags/other
+            name: again
+            continue_from: a
+        """
+    suite = read_suite(write(tmp_path, text))
+    assert {e.name: e.continue_from for e in suite.entries} == {
+        'other': '', 'a': 'other', 'b': 'a', 'again': 'a',
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ('text', 'line', 'words'),
     [
@@ -95,6 +112,13 @@ def test_a_pattern_is_all_it_matches(tmp_path):
         ('recordings:\n  - input: bags/a\n    set: {stereo_slm.x: 1}\n', 3, 'mean stereo_slam'),
         ('recordings:\n  - input: bags/a\n    no_worse_by: {loops: -1}\n', 3, 'negative'),
         ('defaults: {expect: {recall: 3}}\nrecordings: []\n', 2, 'a list of recordings'),
+        ('recordings:\n  - input: bags/a\n    continue_from: b\n', 3, 'no earlier recording'),
+        (
+            'recordings:\n  - input: bags/a\n  - input: bags/b\n    mode: replay\n'
+            '    continue_from: a\n',
+            5,
+            'b is not mapped by mode run',
+        ),
         ('recordings:\n  - input: [\n', 3, ''),
         ('', 1, 'expected name, defaults, recordings'),
     ],
