@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.depth import is_disparity, shrunk_disparity
 from segfloor_ros.camera.model import StereoCamera
 
-SHRUNK_WIDTH_PX = 320
+SHRUNK_WIDTH_PX = 240
 
 
 def shrink_factor(camera: StereoCamera) -> int:

@@ -103,7 +103,7 @@ FRAME_PARTS = tuple(
 
 
 def _frame_images() -> list[Topic]:
-    about = 'Every tracked frame, rectified, some 320 pixels wide; published while someone listens'
+    about = 'Every tracked frame, rectified, some 240 pixels wide; published while someone listens'
     return [
         Topic(
             name,
