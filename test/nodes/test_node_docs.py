@@ -27,6 +27,7 @@ ALTERNATIVES = (
     ('-p', 'image_transport:=compressed'),
     ('-p', 'image_kind:=rect'),
     ('-p', 'image_kind:=rect', '-p', 'image_transport:=compressed'),
+    ('-p', 'use_depth:=true'),
 )
 ON_DEMAND = {
     'floor_segmentation': {'scan': 'frame/left/image_rect'},
