@@ -39,6 +39,9 @@ SLIP_NS = 1_000_000_000
 WINDOW_M, WINDOW_RAD, WINDOW_NS = 0.1, 0.1, 1_000_000_000
 """A stretch of the drive to learn from ends when one of these is reached."""
 
+WINDOWS_TO_JUDGE = 25
+"""Stretches after which something is said of the wheels; the slip of a few of them is not it."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -174,6 +177,8 @@ class BodyMotion:
             self.slips += 1
             self._slipped_ns = now_ns
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
+        if len(self._calibrator) < WINDOWS_TO_JUDGE:
+            return
         for what, remark in self._calibrator.current.remarks().items():
             if what not in self.remarks:
                 logger.warning('%s', remark)

@@ -27,9 +27,8 @@ MAX_COASTING_NS = 1_000_000_000
 SIGMA_COASTING_M_S = 0.3
 """Error of a velocity that is taken for constant."""
 
-CONSISTENT_CHI2 = 4 * 22.46
-"""Bound on the difference between images and sensors: 99.9 % of six degrees of freedom, for twice
-the errors that both are taken to have."""
+CONSISTENT_CHI2 = 22.46
+"""Bound on the difference between images and sensors: 99.9 % of six degrees of freedom."""
 
 
 class CameraMotion:

@@ -46,16 +46,16 @@ RECOVERY_RATIO = 0.15
 """Share of the points expected in view that a camera which was lost must find: far points alone
 fit many places."""
 
-CERTAIN_POINTS, CERTAIN_RATIO = 100, 0.3
-"""Points, and their share, that must be found where the sensors have the camera somewhere else."""
+CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
+"""Points, and their share of those expected, that must be found where the sensors have the camera
+somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
-FEW_POINTS = 60
-"""Wheels tell the pose better than fewer points than this: on blank walls they are edges, along
-which they slide.
-"""
+FEW_POINTS, RESUMING_POINTS = 60, 100
+"""Wheels tell the pose better than fewer points: on blank walls they are edges, along which they
+slide. So many more end a blind stretch."""
 
 MAX_BLIND_SIGMA_M = 0.5
-"""Uncertainty of where the sensors have the camera up to which keyframes are made of it."""
+"""Uncertainty of the pose up to which keyframes are made of it."""
 
 UNKNOWN_COVARIANCE = 1e6
 NOTHING_SEEN = 'too few known points in view'
@@ -206,11 +206,13 @@ class StereoSlam:
         motion, pose = self._motion, track.T_camera_world
         if motion.is_lost:
             return True
-        if motion.is_held and len(track.point_ids) < FEW_POINTS:
+        few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
+        if motion.is_held and len(track.point_ids) < few:
             return False
         if motion.is_consistent(pose, track.covariance, stamp_ns):
             return motion.is_plausible(pose, stamp_ns)
-        return len(track.point_ids) >= CERTAIN_POINTS and _recognised(track, CERTAIN_RATIO)
+        least, ratio = CONTRARY_WHEN_BLIND if motion.is_blind else CONTRARY
+        return len(track.point_ids) >= least and _recognised(track, ratio)
 
     def _bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""

@@ -142,12 +142,15 @@ class WheelCalibrator:
     With the base's motion (R, t) as seen and t' as told, t' = s R(yaw) t - (R - I) s x: linear in
     s cos(yaw), s sin(yaw) and s x (after Censi et al., Simultaneous calibration of odometry and
     sensor parameters for mobile robots, IEEE T-RO 2013). Stretches with slip are outliers, whose
-    weight falls with their error (Cauchy).
+    weight falls with their error (Geman-McClure).
     """
 
     def __init__(self) -> None:
         self.current = WheelCalibration()
         self._windows: list[Window] = []
+
+    def __len__(self) -> int:
+        return len(self._windows)
 
     def add(self, window: Window) -> bool:
         """Take in a stretch; returns whether it agrees with the others: the wheels did not slip."""
@@ -201,7 +204,7 @@ def _robust(rows: Array, told: Array, prior: Array, sigma: Array) -> tuple[Array
     information = np.diag(sigma**-2)
     for _ in range(ROUNDS):
         chi2 = (told - rows @ solution) ** 2
-        weight = 1 / (1 + chi2 / OUTLIER_CHI2)
+        weight = 1 / (1 + chi2 / OUTLIER_CHI2) ** 2
         weighted = rows * weight[:, None]
         H = information + weighted.T @ rows
         solution = np.linalg.solve(H, information @ prior + weighted.T @ told)
