@@ -103,7 +103,7 @@ class StereoSlam:
         self._held = HeldResults()
         self._moving = MotionSearch(camera) if settings.detect_moving else None
         self._frames_since_keyframe = 0
-        self._is_fixed = False
+        self._is_fixed = self._is_closing = False
 
     @property
     def disparity_offset_px(self) -> float:
@@ -259,7 +259,7 @@ class StereoSlam:
         )
 
     def _wants_keyframe(self, track: Track | None) -> bool:
-        if self._is_fixed:
+        if self._is_fixed or (self._is_closing and not self._adjusting.idle):
             return False
         if track is None:
             return not self.map.keyframes or self._wants_blind_keyframe()
@@ -298,8 +298,8 @@ class StereoSlam:
             gone = self._moving.seen_through(searched, self.map, self._local.point_ids, keyframe)
             self.map.note_seen_through(gone)
         self._places.add(keyframe)
-        self._adjust(keyframe)
-        self._close_loop(keyframe, images)
+        if not self._close_loop(keyframe, images):
+            self._adjust(keyframe)
         self._go_on_from(images, keyframe)
         self._measure_mount(frame, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
@@ -350,20 +350,24 @@ class StereoSlam:
         if not self._background:
             self._take_adjustment(wait=True)
 
-    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> None:
-        """Close a loop where a new keyframe sees a place again."""
+    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Close a loop where a new keyframe sees a place again. False where the neighbourhood is
+        still to be adjusted.
+        """
         matches = self._loops.detect(keyframe, images, self.disparity_offset_px, self.mount)
         if not matches:
-            return
-        self._take_adjustment(wait=True)
+            return False
         closing = plan_closing(self.map, matches)
+        self._is_closing = True
         self._adjusting.submit(
             partial(solve_closing, closing), partial(self._apply_closing, closing)
         )
-        self._take_adjustment(wait=True)
-        self._adjust(keyframe)
+        if not self._background:
+            self._take_adjustment(wait=True)
+        return self._background
 
     def _apply_closing(self, closing: Closing, result: tuple[Array, Array]) -> None:
+        self._is_closing = False
         if apply_closing(self._camera, self.map, closing, result):
             self.loop_count += 1
 
