@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.blank_border import blank_border, matched_in
+from segfloor_ros.camera.blank_border import blank_border
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity import BLOCK_PX, TwoScaleMatcher, disparity_range, stereo_view
@@ -21,10 +21,10 @@ from segfloor_ros.floor.filling import (
     fill_regions,
     trim_to_edges,
 )
+from segfloor_ros.floor.hidden import clear_hidden, drop_hidden, joined
 from segfloor_ros.floor.histograms import filtered_v_disparity, rising
 from segfloor_ros.floor.observation import (
     FLOOR,
-    NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
@@ -110,13 +110,13 @@ class FloorSegmentation:
         (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
         what it hides is unknown. The black border that rectification leaves is treated alike.
         """
-        settings, measure = self._settings, self._times.measure
+        measure = self._times.measure
         self._prepare(mount)
         expected = self._expectations(mount, T_map_base)
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
-            moving = _joined(moving, blank_border(left))
+            moving = joined(moving, blank_border(left))
             right_border = None if is_disparity(right) else blank_border(right)
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
@@ -130,10 +130,7 @@ class FloorSegmentation:
             disparity = measured
             if disparity is None:
                 disparity = self._disparity(first_row, left, right)
-            if moving is not None:
-                disparity[moving > 0] = 0
-            if right_border is not None:
-                disparity[matched_in(right_border, disparity)] = 0
+            drop_hidden(disparity, moving, right_border)
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             fit = self._plane(first_row, below, texture, enough, expected)
@@ -144,16 +141,12 @@ class FloorSegmentation:
         with measure('comparison'):
             compared = compare(view, profile, left_rows, right_rows, below, noise)
         with measure('evidence'):
-            table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
-            evidence = judge(view, profile, below, textured, compared, table, settings)
-            seen = trim_to_edges(evidence.mask, left[columns], _TEXTURE_WINDOW_PX // 2 + 3)
-            if moving is not None:
-                seen[moving[columns] > 0] = NO_EVIDENCE
-            evidence = Evidence(seen, evidence.height_m)
+            evidence = self._evidence(view, profile, below, left[columns], textured, compared)
+            seen = evidence.mask
+            clear_hidden(seen, moving, columns)
         with measure('filling'):
             mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
-            if moving is not None:
-                mask[moving[columns] > 0] = NO_EVIDENCE
+            clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
             overhead_xy = self._overhead.positions(
                 left, right, view.mount, first_row, enough, moving, measured
@@ -161,6 +154,22 @@ class FloorSegmentation:
         with measure('scan'):
             scan = self._scan(view, profile, below, evidence, mask, overhead_xy, T_map_base)
         return self._observation(view, profile, disparity, mask, scan, counted)
+
+    def _evidence(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        below: NDArray[np.float32],
+        image: NDArray[np.uint8],
+        textured: NDArray[np.bool_],
+        compared: Comparison,
+    ) -> Evidence:
+        """Return what the pixels (R, W) of the view say by themselves, cut back to edges."""
+        settings = self._settings
+        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
+        evidence = judge(view, profile, below, textured, compared, table, settings)
+        seen = trim_to_edges(evidence.mask, image, _TEXTURE_WINDOW_PX // 2 + 3)
+        return Evidence(seen, evidence.height_m)
 
     def _observation(
         self,
@@ -368,13 +377,6 @@ class FloorSegmentation:
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
-
-
-def _joined(a: NDArray[np.uint8] | None, b: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-    """Return the mask of what is in either of two masks, None for none at all."""
-    if a is None or b is None:
-        return b if a is None else a
-    return np.maximum(a, b)
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:
