@@ -1,0 +1,70 @@
+"""The comparison of a stereo pair with earlier views."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA
+
+from segfloor_ros.slam.moving_regions import MovingRegions
+
+FACTOR = 2
+"""The images are twice as wide as those that are searched."""
+
+WALL_PX, NEARER_PX = 4.0, 12.0
+
+
+def pair(texture, disparity_px):
+    """A wall that fills both images at a disparity of the shrunk image."""
+    shift = round(FACTOR * disparity_px)
+    left = texture[:, 100 : 100 + CAMERA.width]
+    return left, texture[:, 100 + shift : 100 + shift + CAMERA.width]
+
+
+def noise(width):
+    grey = np.random.default_rng(2).normal(128, 40, (CAMERA.height // FACTOR, width // FACTOR))
+    big = grey.repeat(FACTOR, axis=0).repeat(FACTOR, axis=1)
+    return np.clip(big, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def regions():
+    """Five earlier views of a wall from here."""
+    made = MovingRegions(CAMERA)
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    for _ in range(5):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), wall)
+    return made
+
+
+def found_share(regions, texture, disparity_px):
+    regions.measure(*pair(texture, disparity_px))
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:100] = NEARER_PX
+    found = regions.find(seen, np.eye(4), None)
+    return (found[20:100, 60:100] > 0).mean(), (found[:, 110:] > 0).mean()
+
+
+def test_what_stands_in_front_of_what_was_seen_moves(regions):
+    inside, outside = found_share(regions, noise(600), NEARER_PX)
+    assert inside > 0.95 and outside == 0
+
+
+def test_a_pattern_that_repeats_does_not_move(regions):
+    tile = noise(round(FACTOR * (NEARER_PX - WALL_PX)))
+    inside, _ = found_share(regions, np.tile(tile, 40)[:, :600], NEARER_PX)
+    assert inside == 0
+
+
+def test_a_strip_no_wider_than_a_block_does_not_move(regions):
+    regions.measure(*pair(noise(600), NEARER_PX))
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:64] = NEARER_PX
+    assert not regions.find(seen, np.eye(4), None).any()
+
+
+def test_points_are_seen_through_where_the_image_shows_what_is_behind_them(regions):
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    depth_m = CAMERA.disparity_times_depth / FACTOR / np.array([WALL_PX, NEARER_PX, 2.0])
+    points = np.stack([np.zeros(3), np.zeros(3), depth_m], axis=1)
+    np.testing.assert_array_equal(regions.seen_through(wall, points), [False, True, False])
