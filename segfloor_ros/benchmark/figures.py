@@ -10,7 +10,7 @@ import numpy as np
 
 from segfloor_ros.timing import StageTimes
 
-EVERY_FRAME = 'tracking'
+EVERY_FRAME = ('tracking', 'moving')
 BEFORE_UPDATE = 'mapping'
 
 
@@ -53,7 +53,7 @@ class UpdateTimes(StageTimes):
         if name == BEFORE_UPDATE:
             # SLAM may hold keyframes back: each takes its own mapping time along.
             self._mapping_s.append(duration_s)
-        elif name != EVERY_FRAME:
+        elif name not in EVERY_FRAME:
             self._pending_s += duration_s
 
     def end_update(self) -> None:
