@@ -18,7 +18,7 @@ from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.motion_links import Link
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
-from segfloor_ros.slam.residuals import Observations
+from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -26,12 +26,19 @@ from segfloor_ros.slam.triangulation import triangulate_between
 
 DISPARITY_REACH_PX = 4
 MIN_DISPARITY_PX = 1.0
+CONTRADICTED_SHARE = 0.1
+"""A feature whose disparity differs by more than this share from that of the point it was matched
+with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
+"""
+
 MIN_SHARED_POINTS = 15
 MIN_LINK_SHARE = 0.1
 """Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
 
 SETTLING_KEYFRAMES = 2
 MIN_FOUND_RATIO = 0.25
+MIN_KEPT_RATIO = 0.5
+"""Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
 
 LOCAL_KEYFRAMES = 10
 FIXED_KEYFRAMES = 10
@@ -93,9 +100,10 @@ class LocalMapper:
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
     ) -> None:
         """Add a keyframe, new points from its stereo features, and from the parallax to others
-        where the right image shows none; points that turn out to be
-        known already are fused with the older ones.
+        where the right image shows none; points that turn out to be known are fused with the older
+        ones.
         """
+        keyframe.point_id[self._contradicted(sparse_map, keyframe)] = NO_POINT
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
         for other in self._partners(sparse_map, keyframe):
@@ -116,6 +124,18 @@ class LocalMapper:
         near = order[(shared >= enough) & (order != keyframe.index)]
         before = [keyframe.index - 1] if keyframe.index > 0 else []
         return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
+
+    def _contradicted(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+        """Return the features (N,) that were matched with a point at another depth: their pixels
+        fit it, but their disparity does not.
+        """
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        points = sparse_map.xyz_world[keyframe.point_id[rows]]
+        depth = np.maximum(transform_points(keyframe.T_camera_world, points)[:, 2], MIN_DEPTH_M)
+        expected = self._camera.disparity_times_depth / depth
+        measured = keyframe.observations.uvd_px[rows, 2] - self.offset.value_px
+        limit = np.maximum(DISPARITY_REACH_PX, CONTRADICTED_SHARE * expected)
+        return rows[np.abs(measured - expected) > limit]
 
     def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
         """Return the covisible keyframes with which rays cross best: the farthest away of them, and
@@ -178,8 +198,11 @@ class LocalMapper:
 
     def apply(self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
-        points.
+        points. One that loses what the newest keyframe saw has followed something that moves, or a
+        wrong match, and is left out.
         """
+        if result.inliers[adjustment.edge_keyframe == adjustment.newest].mean() < MIN_KEPT_RATIO:
+            return
         self.offset.learn(result.offset)
         self._write_back(sparse_map, adjustment, result)
         self._drop_outliers(
