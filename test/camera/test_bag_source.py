@@ -343,7 +343,7 @@ def test_a_folder_of_several_bags_asks_for_one(tmp_path: Path) -> None:
         opened(tmp_path)
 
 
-def test_without_the_library_the_message_names_the_extra(
+def test_without_the_library_the_message_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = mcap_file(tmp_path, stereo_messages(grey_pairs(1), STAMPS[:1]))
@@ -355,5 +355,5 @@ def test_without_the_library_the_message_names_the_extra(
         return real_import(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, '__import__', no_rosbags)
-    with pytest.raises(InputError, match=r"pip install 'segfloor_ros\[cli\]'"):
+    with pytest.raises(InputError, match=r'pip install rosbags.*bag\.launch\.py'):
         opened(path)

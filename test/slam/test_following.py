@@ -42,7 +42,7 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all():
 
     def follow(frame):
         ids = slam._local.point_ids
-        return slam._follower.follow(Images.of(frame), slam.map, ids, np.eye(4), 0.0)
+        return slam._follower.follow(Images.of(frame, CAMERA), slam.map, ids, np.eye(4), 0.0)
 
     track = follow(frame)
     error = MOUNT.T_base_left @ invert(track.T_camera_world) @ invert(truth)
@@ -59,7 +59,7 @@ def test_points_that_are_gone_are_not_followed():
     slam.map.remove_points(ids[::2])
     follower.drop_dead(slam.map)
     np.testing.assert_array_equal(follower.seen_ids, ids[1::2])
-    images = Images.of(ROOM.frame(1, planar_pose(0.03, 0, 0.02)))
+    images = Images.of(ROOM.frame(1, planar_pose(0.03, 0, 0.02)), CAMERA)
     track = follower.follow(images, slam.map, ids[1::2], np.eye(4), 0.0)
     assert not np.isin(track.point_ids, ids[::2]).any()
 

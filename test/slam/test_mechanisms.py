@@ -82,7 +82,7 @@ def test_patches_tell_the_pose_better_than_corners(seed):
     frame = room.frame(1, moved)
     features = FeatureExtractor(SETTINGS).extract(frame.left)
     ids = slam.map.points_of(np.array([0]))
-    track = Tracker(CAMERA).track(Images.of(frame), features, slam.map, ids, [np.eye(4)])
+    track = Tracker(CAMERA).track(Images.of(frame, CAMERA), features, slam.map, ids, [np.eye(4)])
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015
