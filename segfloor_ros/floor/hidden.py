@@ -27,10 +27,3 @@ def clear_hidden(
     """Set a mask of the view to no evidence where the left image shows nothing that counts."""
     if hidden is not None:
         mask[hidden[columns] > 0] = NO_EVIDENCE
-
-
-def joined(a: NDArray[np.uint8] | None, b: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-    """Return the mask of what is in either of two masks, None for none at all."""
-    if a is None or b is None:
-        return b if a is None else a
-    return np.maximum(a, b)

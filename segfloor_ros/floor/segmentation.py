@@ -21,7 +21,7 @@ from segfloor_ros.floor.filling import (
     fill_regions,
     trim_to_edges,
 )
-from segfloor_ros.floor.hidden import clear_hidden, drop_hidden, joined
+from segfloor_ros.floor.hidden import clear_hidden, drop_hidden
 from segfloor_ros.floor.histograms import filtered_v_disparity, rising
 from segfloor_ros.floor.observation import (
     FLOOR,
@@ -49,6 +49,7 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.texture import MIN_TEXTURE_GREY, NOISE_TEXTURE, noise_grey, texture_grey
 from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
+from segfloor_ros.slam.excluded import join
 from segfloor_ros.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
@@ -116,7 +117,7 @@ class FloorSegmentation:
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
-            moving = joined(moving, blank_border(left))
+            moving = join(moving, blank_border(left))
             right_border = None if is_disparity(right) else blank_border(right)
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]

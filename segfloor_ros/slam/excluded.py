@@ -1,4 +1,4 @@
-"""Parts of an image that are left out of tracking and mapping because they move.
+"""Parts of an image that do not count, because they move or lie on the border of rectification.
 
 Two sources say so: a segmentation network (`StereoFrame.excluded`) and `moving_regions`.
 """
