@@ -35,7 +35,9 @@ def test_scripts_can_be_run(script) -> None:
 
 
 def test_the_launch_test_can_be_read() -> None:
-    ast.parse((REPOSITORY / '.ci' / 'bag_test.launch.py').read_text())
+    module = ast.parse((REPOSITORY / '.ci' / 'bag_test.launch.py').read_text())
+    names = [node.name for node in module.body if isinstance(node, ast.FunctionDef)]
+    assert 'generate_test_description' in names
 
 
 def test_the_suite_of_the_demo_can_be_read() -> None:
