@@ -97,6 +97,7 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     diagonal = H.diagonal()
     g = J.T @ (np.sqrt(weight)[:, None] * error).ravel()
     step = np.zeros(6 * count)
-    damped = H + sparse.diags_array(damping * diagonal + 1e-12, format='csc')
+    added = (damping * diagonal + 1e-12)[None]
+    damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
     step[moving] = -splu(damped.tocsc()).solve(g)
     return step.reshape(-1, 6)
