@@ -76,13 +76,14 @@ def read_map_file(path: Path) -> MapFile:
     return from_bytes(data, str(path))
 
 
-def to_bytes(saved: MapFile) -> bytes:
-    """Return a map as the bytes of its file; the same map gives the same bytes."""
+def to_bytes(saved: MapFile, compress: bool = True) -> bytes:
+    """Return a map as the bytes of its file; the same map gives the same bytes. Without `compress`
+    it is written many times faster and takes half as much space again.
+    """
     header = {**saved.header, 'format': FORMAT, 'version': VERSION}
     buffer = io.BytesIO()
-    with zipfile.ZipFile(
-        buffer, 'w', zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION_LEVEL
-    ) as archive:
+    kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+    with zipfile.ZipFile(buffer, 'w', kind, compresslevel=COMPRESSION_LEVEL) as archive:
         _add(archive, HEADER, json.dumps(header, sort_keys=True).encode())
         for part, arrays in sorted(saved.parts.items()):
             for name, array in sorted(arrays.items()):
@@ -124,7 +125,7 @@ def _check_header(header: Any, name: str) -> None:
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
     member = zipfile.ZipInfo(name)  # without the time of day
-    member.compress_type = zipfile.ZIP_DEFLATED
+    member.compress_type = archive.compression
     archive.writestr(member, content)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,9 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import transform_points
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.map_file import Arrays, MapFile
@@ -30,6 +29,7 @@ from segfloor_ros.slam.results import (
     KeyframePath,
     SparseCloud,
 )
+from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, save_slam
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 
@@ -98,11 +98,16 @@ class KeyframeStages:
         """Return what is known of points and grid, for a file."""
         return {'cloud': self._labelling.to_arrays(), 'grid': self._mapper.to_arrays()}
 
-    def load(self, parts: dict[str, Arrays], cloud: SparseCloud, shift_ns: int) -> None:
-        """Go on with a map, whose sparse cloud is given and whose stamps move by shift_ns."""
-        self._labelling.from_arrays(parts['cloud'])
-        self.labelled = self._labelling.labelled(cloud)
-        self._mapper.from_arrays(parts['grid'], parts['grid']['stamp_ns'] + shift_ns)
+    def load(self, parts: dict[str, Arrays], loaded: LoadedMap, name: str) -> None:
+        """Go on with a map that SLAM has loaded. Raises InputError, by the file's name, for parts
+        that are damaged.
+        """
+        try:
+            self._labelling.from_arrays(parts['cloud'])
+            self.labelled = self._labelling.labelled(loaded.cloud)
+            self._mapper.from_arrays(parts['grid'], parts['grid']['stamp_ns'] + loaded.shift_ns)
+        except (KeyError, ValueError, IndexError, TypeError):
+            raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
         self._is_loaded = True
 
     def grid(self) -> OccupancyGrid | None:
@@ -154,26 +159,16 @@ class Pipeline:
         """Return the whole map, once all keyframes are finished. Raises MapError before there is
         one.
         """
-        if self.mount is None or not self.slam.map.keyframes:
-            raise MapError('there is no map yet that could be saved')
-        header = {'camera': asdict(self._camera), 'mount': asdict(self.mount)}
-        return MapFile(header, {'slam': self.slam.to_arrays(), **self.keyframe_stages.to_arrays()})
+        saved = save_slam(self.slam, self._camera)
+        saved.parts |= self.keyframe_stages.to_arrays()
+        return saved
 
     def load(self, saved: MapFile, name: str, localize: bool) -> None:
         """Go on with a saved map, before the first frame. localize: it stays as it is. Raises
         InputError, by the file's name, for one that is damaged or of another camera.
         """
-        try:
-            if saved.header['camera'] != asdict(self._camera):
-                raise InputError(f'{name}: was made with another camera or calibration; map anew')
-            mount, slam = Mount(**saved.header['mount']), saved.parts['slam']
-            self.slam.load(slam, mount, localize)
-            xyz = transform_points(mount.T_base_left, slam['point_xyz_world'])
-            cloud = SparseCloud(slam['point_stable_id'], xyz.astype(np.float32))
-            shift_ns = self.slam.map.keyframes[-1].stamp_ns - int(slam['keyframe_stamp_ns'][-1])
-            self.keyframe_stages.load(saved.parts, cloud, shift_ns)
-        except (KeyError, ValueError, IndexError, TypeError):
-            raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
+        loaded = load_slam(self.slam, self._camera, saved, name, localize)
+        self.keyframe_stages.load(saved.parts, loaded, name)
 
     def close(self) -> None:
         """Drop what is pending, e.g. after an error."""

@@ -46,6 +46,12 @@ def test_a_map_comes_back_as_it_was_and_its_bytes_repeat(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ['building.map']
 
 
+def test_an_uncompressed_map_is_read_the_same_way():
+    back = from_bytes(to_bytes(some_map(), compress=False), 'x')
+    np.testing.assert_array_equal(back.parts['slam']['ids'], np.arange(50))
+    assert len(to_bytes(some_map(), compress=False)) > len(to_bytes(some_map()))
+
+
 @pytest.mark.parametrize('share', [0.0, 0.1, 0.5, 0.9, 0.999])
 def test_a_truncated_file_is_one_line(share):
     data = to_bytes(some_map())

@@ -19,8 +19,6 @@ from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
 
-GAP_NS = 1_000_000_000
-
 
 def map_to_arrays(sparse_map: SparseMap) -> Arrays:
     """Return a map as arrays; points are numbered anew in the order of their ids."""
@@ -64,16 +62,13 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
 
 
 def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
-    """Fill an empty map. The stamps end a second before 0: a new drive comes after it, whatever its
-    clock says. Raises KeyError or ValueError for arrays that are no map.
-    """
+    """Fill an empty map. Raises KeyError or ValueError for arrays that are no map."""
     columns = sparse_map.point_columns()
     check_lengths({name: arrays[f'point_{name}'] for name in columns})
     for name, (column, _) in columns.items():
         column.extend(arrays[f'point_{name}'])
     sparse_map.count_points(int(arrays['num_ever'][0]))
-    stamps = arrays['keyframe_stamp_ns'] - arrays['keyframe_stamp_ns'].max(initial=0) - GAP_NS
-    for index, record in enumerate(_keyframes(arrays, stamps, sparse_map.descriptor)):
+    for index, record in enumerate(_keyframes(arrays, sparse_map.descriptor)):
         if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
             raise ValueError('features of points that are not there')
         sparse_map.restore(record)
@@ -81,9 +76,7 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
     sparse_map.loops += [LoopEdge(i, j, T) for (i, j), T in ends]
 
 
-def _keyframes(
-    arrays: Arrays, stamps: NDArray[np.int64], descriptor: NDArray[np.uint8]
-) -> list[KeyframeRecord]:
+def _keyframes(arrays: Arrays, descriptor: NDArray[np.uint8]) -> list[KeyframeRecord]:
     length = arrays['keyframe_features']
     uvd, sigma, octave, point = (
         split(arrays[f'feature_{name}'], length)
@@ -91,7 +84,7 @@ def _keyframes(
     )
     links = split(arrays['keyframe_links'], arrays['keyframe_link_count'])
     records = []
-    for k, stamp_ns in enumerate(stamps.tolist()):
+    for k, stamp_ns in enumerate(arrays['keyframe_stamp_ns'].tolist()):
         # Points carry the look of their features.
         features = Features(uvd[k][:, :2].copy(), octave[k], descriptor[point[k]])
         observations = Observations(uvd[k].astype(np.float64), sigma[k].astype(np.float64))

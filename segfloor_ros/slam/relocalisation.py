@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from segfloor_ros.geometry import invert, rotation_angle
+from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.place_recognition import BEST_KEYFRAMES, PlaceRecognition
@@ -19,6 +20,15 @@ SAME_RAD = 0.3
 """Two finds further apart than this are two places that look alike."""
 
 
+NARROW_SEARCHES = 100
+"""Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
+
+VIEW_REACH_M = 2.0
+"""A view shows a place also from so far before or behind where a keyframe stands."""
+
+MAX_VIEW_TURN_RAD = 1.0
+
+
 class Relocaliser:
     """Looks for a view in the map, some places per frame."""
 
@@ -26,12 +36,20 @@ class Relocaliser:
         self._map = sparse_map
         self._places = places
         self._turn = 0
+        self._near: tuple[Array, float, float] | None = None
+        self._searches_left = 0
+
+    def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
+        """Look around a pose (4, 4) alone, for some time or until the camera is found."""
+        self._near = T_world_camera, reach_m, reach_rad
+        self._searches_left = NARROW_SEARCHES
 
     def find(self, images: Images, features: Features, offset_px: float) -> Track | None:
         """Return a frame with its pose; None where no place of the map is seen, or two that look
         alike.
         """
-        groups = self._places.groups(self._places.score(features), BEST_KEYFRAMES)
+        score = self._places.score(features) * self._allowed()
+        groups = self._places.groups(score, BEST_KEYFRAMES)
         chosen, others = groups[:BEST_GROUPS], groups[BEST_GROUPS:]
         if others:
             chosen.append(others[self._turn % len(others)])
@@ -40,14 +58,37 @@ class Relocaliser:
         for group in chosen:
             ids = self._map.points_of(group)
             track = self._places.locate(images, features, ids, offset_px)
-            if track is not None:
+            if track is not None and self._is_near(track):
                 found.append(track)
         if not found or any(_apart(found[0], other) for other in found[1:]):
             return None
+        self._near = None
         return max(found, key=lambda track: len(track.point_ids))
+
+    def _allowed(self) -> NDArray[np.bool_]:
+        """Return the keyframes (K,) that may show where the camera is."""
+        keyframes = self._map.keyframes
+        if self._near is None or self._searches_left == 0:
+            return np.ones(len(keyframes), bool)
+        self._searches_left -= 1
+        T_world_camera, reach_m, reach_rad = self._near
+        poses = np.stack([k.T_world_camera for k in keyframes])
+        distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
+        return (distance < reach_m + VIEW_REACH_M) & (turned < reach_rad + MAX_VIEW_TURN_RAD)
+
+    def _is_near(self, track: Track) -> bool:
+        if self._near is None or self._searches_left == 0:
+            return True
+        T_world_camera, reach_m, reach_rad = self._near
+        return is_within(track.T_camera_world @ T_world_camera, reach_m, reach_rad)
+
+
+def is_within(motion: Array, reach_m: float, reach_rad: float) -> bool:
+    """Whether a motion (4, 4) is at most so far and so much of a turn."""
+    moved_m = float(np.linalg.norm(motion[:3, 3]))
+    return moved_m <= reach_m and rotation_angle(motion[:3, :3]) <= reach_rad
 
 
 def _apart(a: Track, b: Track) -> bool:
-    motion = a.T_camera_world @ invert(b.T_camera_world)
-    moved_m = float(np.linalg.norm(motion[:3, 3]))
-    return moved_m > SAME_M or rotation_angle(motion[:3, :3]) > SAME_RAD
+    return not is_within(a.T_camera_world @ invert(b.T_camera_world), SAME_M, SAME_RAD)

@@ -9,7 +9,7 @@ import numpy as np
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
@@ -33,7 +33,7 @@ from segfloor_ros.slam.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.place_recognition import PlaceRecognition
-from segfloor_ros.slam.relocalisation import Relocaliser
+from segfloor_ros.slam.relocalisation import Relocaliser, is_within
 from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.snapshot import take_snapshot
@@ -111,6 +111,11 @@ class StereoSlam:
         return self._mapper.offset.value_px
 
     @property
+    def T_world_odom(self) -> Array:
+        """The present correction (4, 4) of the odometry, in optical axes."""
+        return self._motion.T_world_odom
+
+    @property
     def sensors(self) -> BodyMotion:
         """What wheels and IMU told, and what was found to be wrong with them."""
         return self._body
@@ -151,15 +156,39 @@ class StereoSlam:
         arrays = map_to_arrays(self.map) | self._places.to_arrays()
         return arrays | {'disparity_offset': np.array([offset.value_px, offset.information])}
 
-    def load(self, arrays: Arrays, mount: Mount, localize: bool) -> None:
+    def load(
+        self, arrays: Arrays, mount: Mount, localize: bool, T_world_odom: Array | None = None
+    ) -> None:
         """Go on with a map, before the first frame; the camera must be found in it. localize: the
-        map stays as it is. Raises KeyError or ValueError for arrays that are no map.
+        map stays as it is. T_world_odom: (4, 4), where the drive that made the map goes on. Raises
+        KeyError or ValueError for arrays that are no map.
         """
         fill_map(self.map, arrays)
         self._places.from_arrays(arrays)
         self._mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
         self.mount, self._is_fixed = mount, localize
+        if T_world_odom is not None:
+            last = self.map.keyframes[-1]
+            self._motion.T_camera_world = last.T_camera_world
+            self._motion.T_world_odom = T_world_odom
+            self._local.move_to(last.point_id[last.point_id != NO_POINT], last.T_camera_world)
         self._motion.stop()
+
+    def search_near(self, T_map_base: Array, reach_m: float, reach_rad: float) -> None:
+        """Look for the camera around a pose of the base (4, 4) alone, as far as somebody who knows
+        it may be wrong; also where it is tracked, but elsewhere.
+        """
+        assert self.mount is not None
+        T_left_base = invert(self.mount.T_base_left)
+        T_world_camera = T_left_base @ T_map_base @ self.mount.T_base_left
+        motion = self._motion
+        here = is_within(motion.T_camera_world @ T_world_camera, reach_m, reach_rad)
+        if here and not motion.is_lost:
+            return
+        self._relocaliser.search_near(T_world_camera, reach_m, reach_rad)
+        self._follower.reset()
+        motion.stop()
+        self._local.point_ids = np.zeros(0, np.int32)
 
     def close(self) -> None:
         """End the background thread, if there is one."""

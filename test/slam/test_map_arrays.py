@@ -8,6 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
 from segfloor_ros.map_file import MapFile, from_bytes, to_bytes
+from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -35,19 +36,14 @@ def mapped():
     return slam
 
 
-@pytest.fixture(scope='module')
-def saved(mapped):
-    return mapped.to_arrays()
-
-
-def loaded(arrays, localize):
+def loaded(mapped, localize, **options):
     slam = StereoSlam(CAMERA, SETTINGS)
-    slam.load(arrays, MOUNT, localize)
+    load_slam(slam, CAMERA, save_slam(mapped, CAMERA), 'x', localize, **options)
     return slam
 
 
-def test_a_loaded_map_is_the_one_that_was_saved(mapped, saved):
-    slam = loaded(saved, localize=True)
+def test_a_loaded_map_is_the_one_that_was_saved(mapped):
+    slam = loaded(mapped, localize=True)
     alive = np.flatnonzero(mapped.map.alive)
     order = alive[np.argsort(mapped.map.stable_id[alive])]
     np.testing.assert_array_equal(slam.map.stable_id, mapped.map.stable_id[order])
@@ -64,11 +60,13 @@ def test_a_loaded_map_is_the_one_that_was_saved(mapped, saved):
     assert np.diff(stamps).tolist() == np.diff([k.stamp_ns for k in mapped.map.keyframes]).tolist()
 
 
-def test_saving_again_does_not_grow_the_file(saved):
+def test_saving_again_does_not_grow_the_file(mapped):
+    saved = mapped.to_arrays()
+
     def size(arrays):
         return len(to_bytes(MapFile({}, {'slam': arrays})))
 
-    again = loaded(saved, localize=True).to_arrays()
+    again = loaded(mapped, localize=True).to_arrays()
     assert size(again) == pytest.approx(size(saved), rel=0.01)
     assert size(saved) < 60_000 * len(saved['keyframe_stamp_ns'])
     back = from_bytes(to_bytes(MapFile({}, {'slam': saved})), 'x').parts['slam']
@@ -76,8 +74,9 @@ def test_saving_again_does_not_grow_the_file(saved):
         np.testing.assert_array_equal(back[name], array)
 
 
-def test_localizing_finds_the_camera_and_adds_nothing(saved):
-    slam = loaded(saved, localize=True)
+def test_localizing_finds_the_camera_and_adds_nothing(mapped):
+    saved = mapped.to_arrays()
+    slam = loaded(mapped, localize=True)
     results, errors = drive(slam, there(20, aside=0.05)[3:])
     assert sum(not r.tracked for r in results[:3]) < 3
     assert all(r.tracked for r in results[3:])
@@ -88,8 +87,9 @@ def test_localizing_finds_the_camera_and_adds_nothing(saved):
         np.testing.assert_array_equal(again[name], saved[name])
 
 
-def test_mapping_goes_on_in_the_same_frame_with_new_ids(saved):
-    slam = loaded(saved, localize=False)
+def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
+    saved = mapped.to_arrays()
+    slam = loaded(mapped, localize=False)
     before = slam.map.num_ever, len(slam.map.keyframes)
     poses = there(25)[15:] + [planar_pose(1.0, 0.04 * k, 0.75 + 0.06 * k) for k in range(12)]
     results, errors = drive(slam, poses)
@@ -101,10 +101,33 @@ def test_mapping_goes_on_in_the_same_frame_with_new_ids(saved):
     assert set(saved['point_stable_id'][:50]) & set(new.cloud.point_id.tolist())
 
 
-def test_another_room_is_not_this_one(saved):
-    slam = loaded(saved, localize=True)
+def test_another_room_is_not_this_one(mapped):
+    slam = loaded(mapped, localize=True)
     other = StereoRoom(seed=77)
     for k in range(6):
         result = slam.process(other.frame(k, planar_pose(0.04 * k, 0, 0)))[0]
         assert not result.tracked
         assert result.covariance[0, 0] > 1e3
+
+
+def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
+    mapped._motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
+    slam = loaded(mapped, localize=False, ends_ns=None)
+    stamps = [k.stamp_ns for k in slam.map.keyframes]
+    assert stamps == [k.stamp_ns for k in mapped.map.keyframes]
+    result = slam.process(ROOM.frame(30, there(25)[-1]))[0]
+    assert result.tracked
+    error = invert(there(25)[-1]) @ result.T_map_odom @ result.T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.03
+    np.testing.assert_allclose(slam.T_world_odom, mapped.T_world_odom, atol=1e-9)
+
+
+def test_a_search_around_a_pose_finds_the_camera_there_alone(mapped):
+    here, elsewhere = there(25)[5], planar_pose(30.0, 0.0, 0.0)
+    slam = loaded(mapped, localize=True)
+    slam.search_near(elsewhere, 1.0, 0.5)
+    assert not any(slam.process(ROOM.frame(k, here))[0].tracked for k in range(3))
+    slam.search_near(here, 0.5, 0.5)
+    assert slam.process(ROOM.frame(4, here))[0].tracked
+    slam.search_near(elsewhere, 1.0, 0.5)
+    assert not slam.process(ROOM.frame(5, here))[0].tracked
