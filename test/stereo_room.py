@@ -6,8 +6,12 @@ own smooth random texture.
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import cv2
 import numpy as np
+from drawing import drawn
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import make_transform
@@ -23,46 +27,32 @@ class StereoRoom:
     """Renders stereo pairs of the room for camera poses in world coordinates."""
 
     def __init__(self, seed: int = 0, contrast: float = 60.0, noise: float = 1.0) -> None:
-        self._rng = np.random.default_rng(seed)
+        self._textures, state = _textures(seed, contrast)
+        self._rng = np.random.default_rng()
+        self._rng.bit_generator.state = state
         self._noise = noise
-        size = int(TEXELS_PER_M * 10)
-        self._textures = [self._texture(size, contrast) for _ in range(6)]
-
-    def _texture(self, size: int, contrast: float) -> np.ndarray:
-        fine = cv2.GaussianBlur(self._rng.normal(size=(size, size)), (0, 0), 2.0)
-        coarse = cv2.GaussianBlur(self._rng.normal(size=(size, size)), (0, 0), 8.0)
-        mixed = fine / fine.std() + coarse / coarse.std()
-        return np.clip(128 + contrast * mixed / 2, 0, 255).astype(np.float32)
 
     def view(self, T_world_camera: np.ndarray, camera: StereoCamera = CAMERA) -> np.ndarray:
         """Return the grey image (H, W) uint8 seen from an optical frame."""
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = np.stack(
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1
-        )
-        directions = rays @ T_world_camera[:3, :3].T
-        origin = T_world_camera[:3, 3]
+        directions = (T_world_camera[:3, :3] @ _rays(camera)).astype(np.float32)
+        origin = T_world_camera[:3, 3].astype(np.float32)
+        bound = [np.where(directions[k] > 0, ROOM_MAX[k], ROOM_MIN[k]) for k in range(3)]
         with np.errstate(divide='ignore'):
-            to_face = np.where(directions > 0, ROOM_MAX - origin, ROOM_MIN - origin) / directions
-        axis = to_face.argmin(axis=-1)
-        hits = origin + directions * to_face.min(axis=-1)[..., None]
-        image = np.zeros(u.shape, np.float32)
+            to_face = (np.array(bound, np.float32) - origin[:, None]) / directions
+        axis, distance = to_face.argmin(axis=0), to_face.min(axis=0)
+        is_upper = np.take_along_axis(directions, axis[None], 0)[0] > 0
+        image = np.zeros(len(axis), np.float32)
         for face in range(6):
-            on_face = (axis == face // 2) & (
-                (np.take_along_axis(directions, axis[..., None], -1)[..., 0] > 0) == face % 2
-            )
+            at = np.flatnonzero(2 * axis + is_upper == face)
             across = [k for k in range(3) if k != face // 2]
-            s, t = ((hits[..., k] - ROOM_MIN[k]) * TEXELS_PER_M for k in across)
-            drawn = cv2.remap(
-                self._textures[face],
-                s.astype(np.float32),
-                t.astype(np.float32),
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REFLECT,
+            s, t = (
+                (origin[k] - ROOM_MIN[k] + directions[k, at] * distance[at]) * TEXELS_PER_M
+                for k in across
             )
-            image[on_face] = drawn[on_face]
+            image[at] = drawn(self._textures[face], s, t, cv2.BORDER_REFLECT)
         image += self._rng.normal(scale=self._noise, size=image.shape)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return image.reshape(camera.height, camera.width)
 
     def frame(
         self,
@@ -81,6 +71,28 @@ class StereoRoom:
             self.view(T_world_left, camera),
             self.view(T_world_left @ right, camera),
         )
+
+
+@cache
+def _textures(seed: int, contrast: float) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """Return the textures of the faces, and how the generator goes on."""
+    rng, size = np.random.default_rng(seed), int(TEXELS_PER_M * 10)
+    textures = []
+    for _ in range(6):
+        fine, coarse = (
+            cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), sigma) for sigma in (2.0, 8.0)
+        )
+        mixed = fine / fine.std() + coarse / coarse.std()
+        textures.append(np.clip(128 + contrast * mixed / 2, 0, 255).astype(np.float32))
+    return textures, rng.bit_generator.state
+
+
+@cache
+def _rays(camera: StereoCamera) -> np.ndarray:
+    """Return the rays (3, N) of all pixels."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)]
+    return np.stack(rays).reshape(3, -1)
 
 
 def planar_pose(x: float, y: float, yaw: float) -> np.ndarray:

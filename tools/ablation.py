@@ -1,10 +1,12 @@
-"""What each mechanism of floor segmentation, labelling and grid brings: it is left out, and the
-maps of drives are scored without it.
+"""What each mechanism brings: it is left out, and drives are scored without it.
 
-    python -m tools.ablation record CACHE DRIVE…     SLAM once per drive; its keyframes are kept
-    python -m tools.ablation compare CACHE DRIVE…    one row for each mechanism left out
+    python -m tools.ablation path DRIVE…               SLAM: the error of the path
+    python -m tools.ablation masks DRIVE…              floor segmentation: true masks, true poses
+    python -m tools.ablation record CACHE DRIVE…       SLAM once per drive; its keyframes are kept
+    python -m tools.ablation map CACHE DRIVE…          floor, labelling and grid on these: the map
 
-Only floor, cloud and grid run again, on the same keyframes: differences are not those of SLAM.
+`--noise SEED` adds noise of one grey level to the images: how far a figure goes with it is its
+spread, and what changes less than that on every drive brings nothing.
 """
 
 from __future__ import annotations
@@ -12,101 +14,157 @@ from __future__ import annotations
 import dataclasses
 import pickle
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
-from unittest import mock
 
+import cv2
 import numpy as np
 import typer
+import yaml
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.configuration import Configuration, resolve
+from segfloor_ros.evaluation.floor import count_pixels
 from segfloor_ros.evaluation.map_score import MapScore, score_map
+from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.slam.results import Keyframe
 from segfloor_ros.stages import make_slam
+from tools.driving import noisy
+from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
+from tools.mechanisms import GRID, NOTHING, RECORDED, SLAM
+from tools.slam_drives import track
 
-ROOM = 'segfloor_ros.'
-Patch = tuple[str, Any]
+Drives = Annotated[list[Path], typer.Argument(help='Recordings with a truth.')]
+Only = Annotated[list[str] | None, typer.Option(help='Only these mechanisms.')]
+Noise = Annotated[int, typer.Option(help='Seed of the noise added; 0: none.')]
 app = typer.Typer(help=__doc__)
 
 
-def _nothing(*_: object, **__: object) -> None:
-    return None
+def chosen(names: Any, only: list[str] | None) -> list[str]:
+    """Return the names to leave out, `nothing` always among them."""
+    return [name for name in names if not only or name in (NOTHING, *only)]
 
 
-def _first(value: Any, *_: object, **__: object) -> Any:
-    return value
+def print_row(*values: object) -> None:
+    """Print a row of a table."""
+    texts = (f'{v:.4f}' if isinstance(v, float) else str(v) for v in values)
+    print(*texts, sep=' | ', flush=True)
 
 
-def _second(_: object, value: Any, *__: object) -> Any:
-    return value
+@app.command('path')
+def compare_paths(
+    drives: Drives,
+    end: Annotated[
+        str, typer.Option(help='Where the camera ends: X,Y,Z from where it began.')
+    ] = '',
+    params: Annotated[Path | None, typer.Option()] = None,
+    only: Only = None,
+    noise: Noise = 0,
+) -> None:
+    """Print the error of the path without each mechanism of SLAM: RMSE, or with --end that of the
+    last pose, in metres; the frames tracked, keyframes and points.
+    """
+    for drive in drives:
+        configuration = resolve(params, (), stereo_camera={'input': str(drive)})
+        for name in chosen(SLAM, only):
+            mechanism = SLAM[name]
+            with mechanism.left_out():
+                tracked = track(drive, mechanism.configured(configuration), noise)
+            if end:
+                error_m = tracked.end_error_m(np.array([float(v) for v in end.split(',')]))
+            else:
+                error_m = tracked.score(drive).ate_rmse_m
+            print_row(drive.name, name, error_m, tracked.frames, tracked.keyframes, tracked.points)
 
 
-VARIANTS: dict[str, list[Patch]] = {
-    'nothing': [],
-    'memory': [('floor.remembered_floor.FloorMemory.fill', lambda self, view, mask, *_: mask)],
-    'slope ahead': [('floor.segmentation.FloorSegmentation._slope', _nothing)],
-    'level expectation': [
-        (
-            'floor.segmentation.FloorSegmentation._expectations',
-            lambda self, mount, _: np.array([[mount.pitch_rad, mount.roll_rad, mount.height_m]]),
-        )
-    ],
-    'guard at the right border': [('floor.segmentation._BORDER_BLOCKS', 0)],
-    'floor up to contacts': [
-        (
-            'floor.filling.fill_to_contact',
-            lambda view, mask, alike, *_: np.zeros(alike.shape, np.bool_),
-        )
-    ],
-    'filling of regions': [('floor.segmentation.fill_regions', lambda view, mask, *_: mask)],
-    'filling of gaps': [('floor.segmentation.fill_gaps', lambda view, profile, mask, *_: mask)],
-    'islands dropped': [('floor.segmentation.drop_islands', _first)],
-    'end of texture': [
-        ('floor.segmentation.beyond_texture', lambda mask, _: np.zeros(mask.shape, np.bool_))
-    ],
-    'what stands beside the left border': [
-        ('floor.segmentation.beside_something', lambda _, mask: np.zeros(mask.shape, np.bool_))
-    ],
-    'trimming to edges': [('floor.segmentation.trim_to_edges', _first)],
-    'ray limit Q3 + 1.5 IQR': [('grid.keyframe_evidence.ray_length_limit', lambda _: np.inf)],
-    'rays shortened': [('grid.keyframe_evidence._certain', _first)],
-    'partly free edges': [
-        ('grid.fan.Fan.edges', lambda self: np.zeros(len(self.lengths), np.bool_))
-    ],
-    'dilation of hits': [('grid.fold._AROUND', np.ones((1, 1), np.uint8))],
-    'slant': [('grid.keyframe_evidence.slant', lambda range_m, _: np.ones(len(range_m)))],
-    'shadows of what stands': [('grid.fan.Fan.shadow', _nothing)],
-}
-"""By name, what is patched to leave a mechanism out."""
+@dataclass(frozen=True)
+class TrueMask:
+    """A frame, its true mask (H, W) and the base's true pose (4, 4), where known."""
+
+    frame: StereoFrame
+    mask: NDArray[np.uint8]
+    T_map_base: Array | None
 
 
-def left_out(name: str) -> ExitStack:
-    """Return a context in which a mechanism is left out."""
-    stack = ExitStack()
-    for target, value in VARIANTS[name]:
-        stack.enter_context(mock.patch(ROOM + target, value))
-    return stack
+def true_masks(
+    drive: Path, mount: Mount, outlines: Path | None, noise: int
+) -> tuple[StereoCamera, list[TrueMask]]:
+    """Return the frames of a drive of which the floor is known: by `floor/`, or by outlines."""
+    source = open_source(resolve(None, (), stereo_camera={'input': str(drive)}).stereo_camera)
+    camera, poses = source.camera, None
+    if (drive / 'poses.txt').is_file():
+        T_first_left = read_trajectory(drive / 'poses.txt')[1]
+        poses = mount.T_base_left @ T_first_left @ invert(mount.T_base_left)
+    known = yaml.safe_load(outlines.read_text())['frames'] if outlines else {}
+    found = []
+    for frame in noisy(source.frames(), noise):
+        # The files of the outlines are numbered from 1.
+        outline, file = known.get(frame.index + 1), drive / 'floor' / f'{frame.index:06d}.png'
+        if outline is not None:
+            mask = drawn(outline, frame.left.shape)
+        elif file.is_file():
+            mask = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
+        else:
+            continue
+        found.append(TrueMask(frame, mask, None if poses is None else poses[frame.index]))
+    return camera, found
 
 
-def record_keyframes(file: Path, configuration: Configuration) -> int:
+def drawn(outline: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return the mask (H, W) of polygons of floor; what is unsure, and its border, says nothing."""
+    mask = np.full(shape, NOT_FLOOR, np.uint8)
+    for polygon in outline['floor']:
+        corners = np.array(polygon, np.int32).reshape(-1, 2)
+        cv2.fillPoly(mask, [corners], FLOOR)
+        cv2.polylines(mask, [corners], True, NO_EVIDENCE, 5)
+    for polygon in outline.get('unsure', []):
+        cv2.fillPoly(mask, [np.array(polygon, np.int32).reshape(-1, 2)], NO_EVIDENCE)
+    return mask
+
+
+@app.command('masks')
+def compare_masks(
+    drives: Drives,
+    mount: Annotated[str, typer.Option(help='Height m, pitch and roll deg.')] = '0.3,7,0',
+    outlines: Annotated[Path | None, typer.Option(help='Polygons of the floor.')] = None,
+    only: Only = None,
+    noise: Noise = 0,
+) -> None:
+    """Print precision and recall of the masks, in percent, without each mechanism of the floor."""
+    height_m, *angles_deg = (float(value) for value in mount.split(','))
+    where = Mount(height_m, *np.radians(angles_deg).tolist())
+    for drive in drives:
+        camera, frames = true_masks(drive, where, outlines, noise)
+        for name in chosen(FLOOR_MECHANISMS, only):
+            counts = np.zeros(5, np.int64)
+            with FLOOR_MECHANISMS[name].left_out():
+                stage = FloorSegmentation(camera, resolve().floor_segmentation)
+                for one in frames:
+                    left, right = one.frame.left, one.frame.right
+                    found = stage.process(left, right, where, one.T_map_base)
+                    counts += count_pixels(found.mask, one.mask)
+            hit, false, missed = (float(v) for v in counts[:3])
+            print_row(drive.name, name, 100 * hit / (hit + false), 100 * hit / (hit + missed))
+
+
+def record_keyframes(file: Path, configuration: Configuration, noise: int = 0) -> int:
     """Run SLAM over a drive and pickle the camera and each keyframe with its mount."""
     source = open_source(configuration.stereo_camera)
     slam = make_slam(source.camera, configuration.stereo_slam)
     count = 0
     with file.open('wb') as out:
         pickle.dump(source.camera, out)
-        for frame in source.frames():
+        for frame in noisy(source.frames(), noise):
             for result in slam.process(frame):
                 if result.keyframe is not None:
                     pickle.dump((slam.mount, result.keyframe), out)
@@ -179,39 +237,42 @@ def figures(score: MapScore) -> list[float]:
 
 
 @app.command()
-def record(
-    cache: Path, drives: list[Path], params: Annotated[Path | None, typer.Option()] = None
-) -> None:
-    """Run SLAM over drives and keep the keyframes."""
+def record(cache: Path, drives: Drives, noise: Noise = 0) -> None:
+    """Run SLAM over drives and keep the keyframes, also of SLAM without what changes its input."""
     cache.mkdir(parents=True, exist_ok=True)
     for drive in drives:
-        configuration = resolve(params, (), stereo_camera={'input': str(drive)})
-        count = record_keyframes(cache / f'{drive.name}.pkl', configuration)
-        print(drive.name, count, flush=True)
+        configuration = resolve(None, (), stereo_camera={'input': str(drive)})
+        print(drive.name, record_keyframes(cache / f'{drive.name}.pkl', configuration, noise))
+        for name, mechanism in RECORDED.items() if not noise else ():
+            with mechanism.left_out():
+                record_keyframes(cache / f'{drive.name}-{name}.pkl', configuration)
 
 
-@app.command('compare')
-def compare_variants(
+@app.command('map')
+def compare_maps(
     cache: Path,
-    drives: list[Path],
+    drives: Drives,
     every: Annotated[int, typer.Option(help='Use one keyframe in so many.')] = 1,
-    only: Annotated[list[str] | None, typer.Option(help='Only these mechanisms.')] = None,
+    only: Only = None,
 ) -> None:
-    """Print a row of figures for each mechanism left out of the map of each drive."""
+    """Print precision and recall of road maps and of free cells, and the share of the outline that
+    is marked, in percent, without each mechanism.
+    """
     configuration = resolve()
     for drive in drives:
-        file = cache / f'{drive.name}.pkl'
-        whole = segment(file, configuration, every)
-        for name, patches in VARIANTS.items():
-            if only and name not in ('nothing', *only):
+        whole = segment(cache / f'{drive.name}.pkl', configuration, every)
+        for name in chosen([*FLOOR_MECHANISMS, *GRID, *RECORDED], only):
+            mechanism = {**FLOOR_MECHANISMS, **GRID, **RECORDED}[name]
+            own = cache / f'{drive.name}-{name}.pkl'
+            if name in RECORDED and not own.is_file():
                 continue
-            with left_out(name):
-                in_grid = all(target.startswith('grid.') for target, _ in patches)
-                seen = (
-                    whole if in_grid else segment(cache / f'{drive.name}.pkl', configuration, every)
-                )
-                row = figures(score(map_of(seen, configuration), drive))
-            print(drive.name, name, *(f'{value:.2f}' for value in row), sep=' | ', flush=True)
+            with mechanism.left_out():
+                seen = whole
+                if name in RECORDED or (name in FLOOR_MECHANISMS and name != NOTHING):
+                    file = own if name in RECORDED else cache / f'{drive.name}.pkl'
+                    seen = segment(file, configuration, every)
+                grid = map_of(seen, configuration) if seen else None
+            print_row(drive.name, name, *(figures(score(grid, drive)) if grid else ('no map',)))
 
 
 if __name__ == '__main__':

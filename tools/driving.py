@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.output import Announce
@@ -43,6 +45,19 @@ def drive(
         results = stages.process(frame)
         yield Step(frame, results, time.thread_time() - start_s)
         on_progress(done)
+
+
+def noisy(frames: Iterable[StereoFrame], seed: int) -> Iterator[StereoFrame]:
+    """Yield frames with noise of one grey level added, by a seed; 0: as they are."""
+    rng = np.random.default_rng(seed)
+    for frame in frames:
+        if seed:
+            left, right = (
+                np.clip(np.rint(image + rng.normal(0, 1, image.shape)), 0, 255).astype(np.uint8)
+                for image in (frame.left, frame.right)
+            )
+            frame = dataclasses.replace(frame, left=left, right=right)
+        yield frame
 
 
 def open_recording(recording: str | Path, configuration: Configuration) -> StereoSource:

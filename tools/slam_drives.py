@@ -13,11 +13,12 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
-from tools.driving import drive, open_recording
+from tools.driving import drive, noisy, open_recording
 
 DRIVES = ('corridor1', 'corridor2', 'ramp', 'rolling', 'exposure_difference')
 """Shipped scenes: weak texture, a narrow corridor, a slope, a shaking and an uneven camera."""
@@ -35,23 +36,49 @@ class DriveResult:
     stages: Mapping[str, Mapping[str, float]]
 
 
-def measure_drive(
-    name: str, recording: Path, configuration: Configuration, on_progress: Callable[[int], None]
-) -> DriveResult:
-    """Track a recording with a true path (poses.txt) and score the camera's path, every frame
-    carried along by its keyframe's final pose. on_progress is told the number of frames done.
-
-    Raises InputError for a recording without truth, MapError when fewer than two keyframes came.
+@dataclasses.dataclass(frozen=True)
+class TrackedDrive:
+    """A drive as SLAM tracked it. trajectory: the left camera. frames: how many of `total` were
+    tracked.
     """
-    truth = read_trajectory(recording / 'poses.txt')
+
+    trajectory: Trajectory
+    frames: int
+    total: int
+    keyframes: int
+    points: int
+    stages: Mapping[str, Mapping[str, float]]
+
+    def score(self, recording: Path) -> TrajectoryScore:
+        """Return the score against the true path of a recording, poses.txt."""
+        truth = read_trajectory(recording / 'poses.txt')
+        return score_trajectory(match(_timed(self.trajectory), truth, self.total))
+
+    def end_error_m(self, end_m: Array) -> float:
+        """Return how far the last pose is from where the camera ended, (3,) from the first."""
+        first, last = self.trajectory.poses[[0, -1]]
+        return float(np.linalg.norm((invert(first) @ last)[:3, 3] - end_m))
+
+
+def track(
+    recording: Path,
+    configuration: Configuration,
+    noise: int = 0,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> TrackedDrive:
+    """Track a recording, every frame carried along by its keyframe's final pose. noise: seed of
+    noise added to the images. on_progress is told the number of frames done.
+
+    Raises MapError when fewer than two keyframes came.
+    """
     source, times = open_recording(recording, configuration), StageTimes()
     slam = make_slam(source.camera, configuration.stereo_slam, times=times)
     poses: list[TrackedPose] = []
     path: KeyframePath | None = None
-    frames = 0
+    total = 0
     with contextlib.closing(slam):
-        for step in drive(slam, source.frames(), on_progress):
-            frames += 1
+        for step in drive(slam, noisy(source.frames(), noise), on_progress):
+            total += 1
             for result in step.results:
                 if result.tracked:
                     pose = TrackedPose(
@@ -60,10 +87,22 @@ def measure_drive(
                     poses.append(pose)
                 path = result.keyframe.path if result.keyframe is not None else path
     if path is None or slam.mount is None or len(path.stamp_ns) < 2:
-        raise MapError(f'{name}: no path came of {frames} frames')
-    tracked = corrected_trajectory(poses, path).seen_from(slam.mount.T_base_left)
-    score = score_trajectory(match(_timed(tracked), truth, frames))
-    return DriveResult(name, score, len(path.stamp_ns), times.summary())
+        raise MapError(f'{recording.name}: no path came of {total} frames')
+    trajectory = corrected_trajectory(poses, path).seen_from(slam.mount.T_base_left)
+    points = int(slam.map.alive.sum())
+    return TrackedDrive(trajectory, len(poses), total, len(path.stamp_ns), points, times.summary())
+
+
+def measure_drive(
+    name: str, recording: Path, configuration: Configuration, on_progress: Callable[[int], None]
+) -> DriveResult:
+    """Track a recording with a true path (poses.txt) and score the camera's path.
+
+    Raises InputError for a recording without truth, MapError when fewer than two keyframes came.
+    """
+    read_trajectory(recording / 'poses.txt')
+    tracked = track(recording, configuration, on_progress=on_progress)
+    return DriveResult(name, tracked.score(recording), tracked.keyframes, tracked.stages)
 
 
 def _timed(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:

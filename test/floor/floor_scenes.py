@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import cv2
 import numpy as np
+from drawing import drawn
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 320.0, 240.0, 0.12)
+SMALL_CAMERA = StereoCamera(320, 240, 160.0, 160.0, 160.0, 120.0, 0.12)
 MOUNT = Mount(0.30, np.radians(7.0))
+FLOORS = [{}, {'seed': 21, 'grey': 85.0, 'contrast': 11.0}]
+"""A floor, and another pattern of weaker texture on darker ground: mechanisms are not to depend on
+one of them.
+"""
 SUPERSAMPLING = 2
+TILE_PX = 256
 
 
 @dataclass(frozen=True)
@@ -58,58 +66,74 @@ class Scene:
         return images[0][0], images[1][0], images[0][1], images[0][2]
 
     def _cast(self, offset_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera, n = self.camera, SUPERSAMPLING
-        u, v = np.meshgrid(
-            (np.arange(camera.width * n) + 0.5) / n - 0.5,
-            (np.arange(camera.height * n) + 0.5) / n - 0.5,
-        )
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
+        n = SUPERSAMPLING
         T = self.mount.T_base_left
         origin = T[:3, 3] + T[:3, 0] * offset_m
-        rays = np.einsum('ij,jhw->ihw', T[:3, :3], rays)
-        grey = np.full(u.shape, 60.0, np.float32)
-        floor = np.zeros(u.shape, bool)
-        nearest = np.full(u.shape, np.inf)
+        x, y = _rays(self.camera, n)
+        shape = (len(y), x.shape[1])
+        grey = np.full(shape, 60.0, np.float32)
+        floor = np.zeros(shape, bool)
+        nearest = np.full(shape, np.inf, np.float32)
         for patch in self.patches:
-            first, second = np.array(patch.first), np.array(patch.second)
+            first, second, corner = (
+                np.array(side) for side in (patch.first, patch.second, patch.corner)
+            )
+
+            def along_rays(direction: np.ndarray) -> np.ndarray:
+                """Return the products of a direction with the rays of all pixels."""
+                a, b, c = (direction @ T[:3, :3]).astype(np.float32)
+                return a * x + (b * y + c)
+
             normal = np.cross(first, second)
-            with np.errstate(divide='ignore', invalid='ignore'):
-                depth = (
-                    normal
-                    @ (np.array(patch.corner) - origin)
-                    / np.einsum('i,ihw->hw', normal, rays)
-                )
-                hit = origin[:, None, None] + rays * depth - np.array(patch.corner)[:, None, None]
-                s = np.einsum('i,ihw->hw', first, hit) / (first @ first)
-                t = np.einsum('i,ihw->hw', second, hit) / (second @ second)
-                inside = (
-                    (depth > 0.05) & (depth < nearest) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-                )
+            with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+                depth = np.float32(normal @ (corner - origin)) / along_rays(normal)
+                inside = (depth > 0.05) & (depth < nearest)
+                sides = []
+                for side in (first / (first @ first), second / (second @ second)):
+                    share = depth * along_rays(side) + np.float32(side @ (origin - corner))
+                    inside &= (share >= 0) & (share <= 1)
+                    sides.append(share)
+            s, t = (share[inside] for share in sides)
             texture = self._texture(patch, s * np.linalg.norm(first), t * np.linalg.norm(second))
-            grey[inside] = (patch.grey + patch.contrast * texture)[inside]
-            floor[inside] = patch.is_floor
-            nearest[inside] = depth[inside]
+            grey[inside] = patch.grey + patch.contrast * texture
+            floor[inside], nearest[inside] = patch.is_floor, depth[inside]
         if self.reflectance:
             standing = [patch.below() for patch in self.patches if not patch.is_floor]
             below = replace(self, patches=standing, reflectance=0.0)._cast(offset_m)[0]
             grey[floor] += self.reflectance * (below - grey)[floor]
-        return grey, floor[n // 2 :: n, n // 2 :: n], nearest[n // 2 :: n, n // 2 :: n]
+        middle = np.s_[n // 2 :: n, n // 2 :: n]
+        return grey, floor[middle], nearest[middle].astype(np.float64)
 
     def _texture(self, patch: Patch, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return noise of several scales, of about unit deviation, that repeats far apart."""
-        size = 256
-        rng = np.random.default_rng(patch.seed + 1)
-        tile = np.zeros((size, size), np.float32)
-        for sigma in (1.0, 2.0, 4.0, 8.0):
-            layer = cv2.GaussianBlur(
-                np.tile(rng.normal(size=(size, size)).astype(np.float32), (3, 3)), (0, 0), sigma
-            )[size : 2 * size, size : 2 * size]
-            tile += layer / layer.std()
-        tile /= tile.std()
-        scale = size / self.texture_m / 2
-        x = np.nan_to_num(np.remainder(x_m * scale, size), posinf=0, neginf=0).astype(np.float32)
-        y = np.nan_to_num(np.remainder(y_m * scale, size), posinf=0, neginf=0).astype(np.float32)
-        return cv2.remap(tile, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        scale = TILE_PX / self.texture_m / 2
+        return drawn(_tile(patch.seed), x_m * scale, y_m * scale, cv2.BORDER_WRAP)
+
+
+@cache
+def _rays(camera: StereoCamera, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x (1, W n) and y (H n, 1) of the rays (x, y, 1) through n by n points of a pixel."""
+    x, y = (
+        ((np.arange(size * n) + 0.5) / n - 0.5 - centre) / focal
+        for size, centre, focal in (
+            (camera.width, camera.cx, camera.fx),
+            (camera.height, camera.cy, camera.fy),
+        )
+    )
+    return x[None].astype(np.float32), y[:, None].astype(np.float32)
+
+
+@cache
+def _tile(seed: int) -> np.ndarray:
+    """Return noise of several scales, of about unit deviation, that repeats far apart."""
+    size = TILE_PX
+    rng = np.random.default_rng(seed + 1)
+    tile = np.zeros((size, size), np.float32)
+    for sigma in (1.0, 2.0, 4.0, 8.0):
+        layer = cv2.GaussianBlur(
+            np.tile(rng.normal(size=(size, size)).astype(np.float32), (3, 3)), (0, 0), sigma
+        )[size : 2 * size, size : 2 * size]
+        tile += layer / layer.std()
+    return tile / tile.std()
 
 
 def floor_patch(near_m=-1.0, far_m=8.0, half_width_m=4.0, height_m=0.0, **kwargs) -> Patch:
@@ -142,5 +166,5 @@ def box(x_m, y_m, size_m, height_m, is_floor=False, **kwargs) -> list[Patch]:
 def ramp(start_m, slope_rad, length_m=3.0, half_width_m=4.0, **kwargs) -> Patch:
     along = (length_m * np.cos(slope_rad), 0, length_m * np.sin(slope_rad))
     return Patch(
-        (start_m, -half_width_m, 0), along, (0, 2 * half_width_m, 0), True, seed=5, **kwargs
+        (start_m, -half_width_m, 0), along, (0, 2 * half_width_m, 0), True, **{'seed': 5, **kwargs}
     )

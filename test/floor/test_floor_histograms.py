@@ -1,8 +1,18 @@
 """u- and v-disparity counted by hand."""
 
 import numpy as np
+import pytest
+from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.histograms import obstacle_rows, rising, u_disparity, v_disparity
+from segfloor_ros.floor.histograms import (
+    filtered_v_disparity,
+    obstacle_rows,
+    rising,
+    u_disparity,
+    v_disparity,
+)
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.view import FloorView
 
 
 def test_u_disparity_counts_per_column_and_ignores_no_match():
@@ -32,3 +42,16 @@ def test_only_what_rises_as_a_floor_does_is_kept():
     assert rising(floor / 2, slope)[2:-2].all()  # the lower end of a ramp
     assert not rising(upright, slope).any()
     assert rising(steps, slope)[2:-2].mean() < 0.3
+
+
+@pytest.mark.parametrize(('obstacle_height_m', 'share'), [(0.02, 0.0), (0.2, 0.93)])
+def test_what_covers_as_many_rows_as_an_obstacle_is_not_counted(obstacle_height_m, share):
+    # Four steps one above the other, each rising as the floor does: a disparity covers four times
+    # the 2.5 rows of the floor, and a thing of 2 cm no more than 7 rows at 20 to 44 px.
+    view = FloorView.of(CAMERA, MOUNT, 240)
+    rows = np.arange(240)[:, None] % 60
+    disparity = np.broadcast_to(20 + view.line.slope * rows, view.derolled.shape)
+    textured = np.ones(disparity.shape, bool)
+    settings = FloorSegmentationSettings(obstacle_height_m=obstacle_height_m)
+    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128, 1, settings)
+    assert seen.counts.sum() / disparity.size / view.step == pytest.approx(share, abs=0.1)

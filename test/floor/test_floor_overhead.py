@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from floor_scenes import CAMERA, MOUNT, Patch, Scene, floor_patch, wall
+from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
@@ -25,8 +25,10 @@ def scan_of(scene: Scene, **settings: float) -> tuple[np.ndarray, np.ndarray, np
     return np.degrees(scan.bearings_rad), scan.ranges_m * along_x, scan.obstacle_m * along_x
 
 
-def test_a_board_at_the_robots_height_ends_the_scan():
-    bearing, floor_m, standing_m = scan_of(Scene([floor_patch(), wall(WALL_M), board(0.55)]))
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_board_at_the_robots_height_ends_the_scan(floor_kind):
+    patches = [floor_patch(**floor_kind), wall(WALL_M), board(0.55)]
+    bearing, floor_m, standing_m = scan_of(Scene(patches))
     below = np.abs(bearing) < 12  # the board reaches to 14 degrees
     assert np.median(floor_m[below]) == pytest.approx(BOARD_M, abs=0.05)
     assert np.nanmedian(standing_m[below]) == pytest.approx(BOARD_M, abs=0.05)

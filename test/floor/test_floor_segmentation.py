@@ -1,11 +1,23 @@
 """Floor masks of rendered scenes whose floor is known."""
 
 import dataclasses
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from floor_scenes import CAMERA, MOUNT, Patch, Scene, box, floor_patch, ramp, wall
+from floor_scenes import (
+    CAMERA,
+    FLOORS,
+    MOUNT,
+    SMALL_CAMERA,
+    Patch,
+    Scene,
+    box,
+    floor_patch,
+    ramp,
+    wall,
+)
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
@@ -85,12 +97,15 @@ def test_a_blank_wall_right_ahead_is_no_floor():
     assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
 
 
-def test_a_blank_strip_between_floor_is_filled():
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_blank_strip_between_floor_is_filled(floor_kind):
     scene = Scene(
         [
-            floor_patch(far_m=1.2),
-            floor_patch(near_m=1.2, far_m=1.8, contrast=0.0, grey=140.0),
-            floor_patch(near_m=1.8),
+            floor_patch(far_m=1.2, **floor_kind),
+            floor_patch(
+                near_m=1.2, far_m=1.8, contrast=0.0, grey=floor_kind.get('grey', 120.0) + 20
+            ),
+            floor_patch(near_m=1.8, **floor_kind),
             wall(),
         ]
     )
@@ -120,9 +135,11 @@ def test_a_door_sill_is_floor():
     assert np.all(observation.scan.ranges_m[ahead] > 3.5)
 
 
+@pytest.mark.parametrize('floor_kind', FLOORS)
 @pytest.mark.parametrize(('slope_deg', 'least_recall'), [(10.0, 0.85), (15.0, 0.7)])
-def test_a_ramp_is_floor(slope_deg, least_recall):
-    scene = Scene([floor_patch(far_m=1.5), ramp(1.5, np.radians(slope_deg))])
+def test_a_ramp_is_floor(slope_deg, least_recall, floor_kind):
+    slope_rad = np.radians(slope_deg)
+    scene = Scene([floor_patch(far_m=1.5, **floor_kind), ramp(1.5, slope_rad, **floor_kind)])
     observation, floor, depth = segment(scene)
     precision, _ = shares(observation, floor, depth)
     below_horizon = points_of(scene, depth)[..., 2] < 0.25
@@ -131,9 +148,11 @@ def test_a_ramp_is_floor(slope_deg, least_recall):
     assert recall > least_recall
 
 
+@pytest.mark.parametrize('floor_kind', FLOORS)
 @pytest.mark.parametrize('slope_deg', [8.0, 15.0])
-def test_a_ramp_is_floor_when_nothing_else_is_in_sight(slope_deg):
-    scene = Scene([floor_patch(far_m=0.25), ramp(0.25, np.radians(slope_deg))])
+def test_a_ramp_is_floor_when_nothing_else_is_in_sight(slope_deg, floor_kind):
+    slope_rad = np.radians(slope_deg)
+    scene = Scene([floor_patch(far_m=0.25, **floor_kind), ramp(0.25, slope_rad, **floor_kind)])
     observation, floor, depth = segment(scene)
     precision, _ = shares(observation, floor, depth)
     below_camera = points_of(scene, depth)[..., 2] < 0.25
@@ -181,18 +200,22 @@ def test_unequal_exposure_does_no_harm():
     assert recall > 0.95
 
 
-@pytest.mark.parametrize(('pitch_deg', 'roll_deg'), [(2.5, 0.0), (0.0, -4.0)])
-def test_a_robot_that_tilts_on_its_wheels_still_sees_its_floor(pitch_deg, roll_deg):
-    """The pose in the map tells that the camera is not as it is mounted."""
+@pytest.mark.parametrize('floor_kind', FLOORS)
+@pytest.mark.parametrize(('pitch_deg', 'roll_deg'), [(2.5, 0.0), (0.0, -4.0), (0.0, 6.0)])
+def test_a_robot_that_tilts_on_its_wheels_still_sees_its_floor(pitch_deg, roll_deg, floor_kind):
+    """The pose in the map tells that the camera is not as it is mounted. Floor of weak texture,
+    rolled by 6 degrees, is not found from the mount.
+    """
     pitch_rad = MOUNT.pitch_rad + np.radians(pitch_deg)
     tilted = dataclasses.replace(MOUNT, pitch_rad=pitch_rad, roll_rad=np.radians(roll_deg))
-    scene = Scene([floor_patch(), wall(2.0)], mount=tilted)
+    floor = floor_patch(**{**floor_kind, 'contrast': 6.0})
+    scene = Scene([floor, wall(2.0)], SMALL_CAMERA, mount=tilted)
     left, right, floor, depth = scene.render()
     T_map_base = tilted.T_base_left @ np.linalg.inv(MOUNT.T_base_left)
-    observation = FloorSegmentation(CAMERA, SETTINGS).process(left, right, MOUNT, T_map_base)
+    observation = FloorSegmentation(SMALL_CAMERA, SETTINGS).process(left, right, MOUNT, T_map_base)
     precision, recall = shares(observation, floor, depth)
     assert precision > 0.99
-    assert recall > 0.97
+    assert recall > 0.93
 
 
 def test_the_border_that_rectification_leaves_is_no_floor():
@@ -206,6 +229,15 @@ def test_the_border_that_rectification_leaves_is_no_floor():
     assert np.mean(mask[inside] == FLOOR) > 0.97
 
 
+@pytest.mark.parametrize(('whole', 'expected'), [(True, 1.0), (False, 0.0)])
+def test_the_rows_above_the_horizon_are_matched_where_asked_for(whole, expected):
+    left, right, _, depth = Scene([floor_patch(), wall(2.0)], SMALL_CAMERA).render()
+    settings = FloorSegmentationSettings(disparity_above_horizon=whole)
+    found = FloorSegmentation(SMALL_CAMERA, settings).process(left, right, MOUNT).disparity_px
+    above, true = found[:60, 20:-20], SMALL_CAMERA.disparity_times_depth / depth[:60, 20:-20]
+    assert np.mean(np.abs(above - true) < 0.5) == pytest.approx(expected, abs=0.05)
+
+
 def test_same_input_same_output():
     scene = Scene([floor_patch(), wall(), *box(1.5, 0.3, 0.3, 0.2)])
     first, _, _ = segment(scene, (np.eye(4), np.eye(4)))
@@ -217,15 +249,23 @@ def test_same_input_same_output():
 LEFT_CORNER = np.s_[440:, 5:40]
 
 
-def approach(stage):
+@cache
+def way(kind):
+    """Return the images of a drive ahead, and the way driven, over one kind of floor."""
+    patches = [floor_patch(**{'seed': 4, **FLOORS[kind]}), wall(6.0)]
+    seen = []
+    for x_m in (0.0, 0.1, 0.2, 0.3, 0.4):
+        moved = [dataclasses.replace(p, corner=(p.corner[0] - x_m, *p.corner[1:])) for p in patches]
+        seen.append((x_m, Scene(moved).render()[:2]))
+    return seen
+
+
+def approach(stage, kind=0):
     """Drive ahead, to where the corner that the right camera cannot see was seen from farther
     away. Returns the last images and the pose; the corner is floor in the last mask alone.
     """
-    patches = [floor_patch(seed=4), wall(6.0)]
     shares_of_corner = []
-    for x_m in (0.0, 0.1, 0.2, 0.3, 0.4):
-        moved = [dataclasses.replace(p, corner=(p.corner[0] - x_m, *p.corner[1:])) for p in patches]
-        images = Scene(moved).render()[:2]
+    for x_m, images in way(kind):
         T_map_base = np.eye(4)
         T_map_base[0, 3] = x_m
         mask = stage.process(*images, MOUNT, T_map_base).mask
@@ -235,8 +275,10 @@ def approach(stage):
     return images, T_map_base
 
 
-def test_the_left_border_is_known_from_before():
-    approach(FloorSegmentation(CAMERA, FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)))
+@pytest.mark.parametrize('kind', range(len(FLOORS)))
+def test_the_left_border_is_known_from_before(kind):
+    settings = FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)
+    approach(FloorSegmentation(CAMERA, settings), kind)
 
 
 @pytest.mark.parametrize(
@@ -259,13 +301,17 @@ def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_
     assert (share > 0.7) if is_remembered else (share < 0.3)
 
 
+@pytest.mark.parametrize('floor_kind', FLOORS)
 @pytest.mark.parametrize(('grey', 'wall_m'), [(70.0, 1.2), (120.0, 2.5), (200.0, 1.8)])
-def test_floor_known_from_the_other_side_is_not_drawn_through_a_blank_wall(grey, wall_m):
+def test_floor_known_from_the_other_side_is_not_drawn_through_a_blank_wall(
+    grey, wall_m, floor_kind
+):
     stage = FloorSegmentation(CAMERA, SETTINGS)
-    left, right, _, _ = Scene([floor_patch(), wall(6.0)]).render()
+    ground = floor_patch(**floor_kind)
+    left, right, _, _ = Scene([ground, wall(6.0)]).render()
     for _ in range(3):
         stage.process(left, right, MOUNT, np.eye(4))
-    blank = Scene([floor_patch(), wall(wall_m, contrast=0.0, grey=grey)])
+    blank = Scene([ground, wall(wall_m, contrast=0.0, grey=grey)])
     left, right, floor, _ = blank.render()
     observation = stage.process(left, right, MOUNT, np.eye(4))
     called = observation.mask == FLOOR

@@ -1,6 +1,7 @@
 """The disparity offset: its filter, its place in the adjustment, and whole drives."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from segfloor_ros.slam.bundle_adjustment import adjust
 from segfloor_ros.slam.disparity_offset import DisparityOffset, OffsetEstimate
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
+
+FRAMES, TURNED_FRAMES = 40, 21
 
 
 def with_offset(problem, offset_px):
@@ -81,21 +84,25 @@ def test_the_filter_never_runs_away_nor_grows_sure():
     assert offset.estimate.information <= 1.0001 / 0.01**2
 
 
-def room_drive(poses, offset_px=0.0, **settings):
-    """Drive through the room with a right image shifted so that disparities are off."""
+@cache
+def frames(step_m, step_rad, offset_px):
+    """Return the frames of a drive whose right image is shifted so that disparities are off."""
     room = StereoRoom()
     shifted = replace(CAMERA, cx=CAMERA.cx - offset_px)
     right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
+    seen = []
+    for k in range(FRAMES if step_m else TURNED_FRAMES):
+        T = planar_pose(step_m * k, 0.0, step_rad * k) @ MOUNT.T_base_left
+        left_right = room.view(T), room.view(T @ right, shifted)
+        seen.append(StereoFrame(k, k * 100_000_000, *left_right))
+    return seen
+
+
+def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, **settings):
+    """Drive through the room, straight ahead if not told otherwise."""
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800, **settings), MOUNT)
-    results = []
-    for k, pose in enumerate(poses):
-        T = pose @ MOUNT.T_base_left
-        frame = StereoFrame(k, k * 100_000_000, room.view(T), room.view(T @ right, shifted))
-        results += slam.process(frame)
+    results = [slam.process(frame)[0] for frame in frames(step_m, step_rad, offset_px)]
     return slam, results
-
-
-STRAIGHT = [planar_pose(0.05 * k, 0.0, 0.0) for k in range(40)]
 
 
 def length(results):
@@ -104,14 +111,15 @@ def length(results):
 
 
 def test_a_bent_rig_is_found_and_its_distances_put_right():
-    slam, results = room_drive(STRAIGHT, 0.25)
-    _, believed = room_drive(STRAIGHT, 0.25, disparity_offset_sigma_px=0.0)
+    slam, results = room_drive(0.25)
+    switched_off, believed = room_drive(0.25, disparity_offset_sigma_px=0.0)
     assert slam.disparity_offset_px == pytest.approx(0.25, abs=0.1)
+    assert switched_off.disparity_offset_px == 0.0
     assert abs(length(results) - 1.95) < 0.5 * abs(length(believed) - 1.95)
 
 
 def test_an_exact_rig_stays_exact():
-    slam, results = room_drive(STRAIGHT)
+    slam, results = room_drive()
     assert abs(slam.disparity_offset_px) < 0.03  # known to 0.036
     assert length(results) == pytest.approx(1.95, abs=0.01)
 
@@ -119,14 +127,9 @@ def test_an_exact_rig_stays_exact():
 def test_a_turn_on_the_spot_tells_little_and_changes_little():
     offsets = []
     for step in np.radians([1.5, 2.0, 2.5]):
-        slam, results = room_drive([planar_pose(0.0, 0.0, step * k) for k in range(30)])
+        slam, results = room_drive(step_m=0.0, step_rad=float(step))
         assert len(slam.map.keyframes) > 5
         assert all(result.tracked for result in results)
         offsets.append(abs(slam.disparity_offset_px))
     # One drive alone may err by as much as the noise of its matches.
     assert np.median(offsets) < 0.5 * StereoSlamSettings().disparity_offset_sigma_px
-
-
-def test_switched_off_it_is_zero():
-    slam, _ = room_drive(STRAIGHT[:20], 0.25, disparity_offset_sigma_px=0.0)
-    assert slam.disparity_offset_px == 0.0
