@@ -33,11 +33,12 @@ _UNIQUENESS_PERCENT = 5
 _LEFT_RIGHT_PX = 1
 """Largest left-right difference of a disparity."""
 
-_STEP = 16
+STEP = 16
+"""Numbers of disparities are multiples of this."""
 _SAME_GAIN = 0.08
 _SAME_MEAN_GREY = 8.0
 """Within this the two cameras are exposed alike; what they see differs anyway."""
-_COARSE_BLOCK_PX = 3
+COARSE_BLOCK_PX = 3
 _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
 _RUN_OUT_ROWS = 8
@@ -58,8 +59,8 @@ def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.
         u = (np.array([0.0, camera.width - 1.0]) - camera.cx) / camera.fx
         inverse_depth = -(up[0] * u + up[1] * v + up[2]) / mount.height_m
         wanted = float(inverse_depth.max()) * camera.disparity_times_depth * share
-    most = camera.width // 2 // _STEP * _STEP
-    return int(np.clip(math.ceil(wanted / _STEP) * _STEP, 2 * _STEP, max(2 * _STEP, most)))
+    most = camera.width // 2 // STEP * STEP
+    return int(np.clip(math.ceil(wanted / STEP) * STEP, 2 * STEP, max(2 * STEP, most)))
 
 
 def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -131,6 +132,26 @@ class DisparityMatcher:
         return disparity
 
 
+def halved_disparity(
+    matcher: DisparityMatcher, left: NDArray[np.uint8], right: NDArray[np.uint8]
+) -> NDArray[np.float32]:
+    """Return the disparities (H, W) of a pair, matched at half its resolution; 0 where there is no
+    match.
+    """
+    height, width = (size // 2 for size in left.shape)
+    halves = [
+        cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        for image in (left, right)
+    ]
+    disparity = np.zeros(left.shape, np.float32)
+    disparity[: 2 * height, : 2 * width] = cv2.resize(
+        2 * matcher.compute(halves[0], halves[1]),
+        (2 * width, 2 * height),
+        interpolation=cv2.INTER_NEAREST,
+    )
+    return disparity
+
+
 class TwoScaleMatcher:
     """Matches far floor at full resolution and all else at half of it.
 
@@ -138,12 +159,12 @@ class TwoScaleMatcher:
     """
 
     def __init__(self, num_disparities: int, settings: FloorSegmentationSettings) -> None:
-        fine = -(-math.ceil(settings.coarse_above_px) // _STEP) * _STEP + _STEP
+        fine = -(-math.ceil(settings.coarse_above_px) // STEP) * STEP + STEP
         self._coarse: DisparityMatcher | None = None
         self.num_disparities = num_disparities
         if fine < num_disparities:
-            halved = -(-num_disparities // (2 * _STEP)) * _STEP
-            self._coarse = DisparityMatcher(halved, _COARSE_BLOCK_PX, SPECKLE_PX // 4)
+            halved = -(-num_disparities // (2 * STEP)) * STEP
+            self._coarse = DisparityMatcher(halved, COARSE_BLOCK_PX, SPECKLE_PX // 4)
             self.num_disparities = 2 * self._coarse.num_disparities
         self._fine = DisparityMatcher(min(fine, num_disparities))
 
@@ -158,19 +179,7 @@ class TwoScaleMatcher:
         """
         if self._coarse is None:
             return self._fine.compute(left, right)
-        height, width = (size // 2 for size in left.shape)
-        halves = [
-            cv2.resize(
-                image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA
-            )
-            for image in (left, right)
-        ]
-        disparity = np.zeros(left.shape, np.float32)
-        disparity[: 2 * height, : 2 * width] = cv2.resize(
-            2 * self._coarse.compute(halves[0], halves[1]),
-            (2 * width, 2 * height),
-            interpolation=cv2.INTER_NEAREST,
-        )
+        disparity = halved_disparity(self._coarse, left, right)
         part = slice(0, fine_rows + _RUN_OUT_ROWS)
         far = self._fine.compute(left[part], right[part])[:fine_rows]
         near = disparity[:fine_rows]

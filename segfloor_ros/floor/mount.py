@@ -5,51 +5,42 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import DisparityMatcher, disparity_range, stereo_view
 from segfloor_ros.floor.mirror import (
     MIRRORED_SHARE,
     MirrorView,
     mirror_candidates,
     mirrored_share,
 )
-from segfloor_ros.floor.plane import (
-    PlaneFit,
-    Samples,
-    mean_climb,
-    plausible,
-    preference,
-    propose,
-    refine,
-    scores,
-    with_known,
-)
+from segfloor_ros.floor.mount_view import MountViewer
+from segfloor_ros.floor.plane import PlaneFit, Samples, mean_climb, plausible, shares
+from segfloor_ros.floor.plane_search import PlaneSearch
 from segfloor_ros.geometry import Array
 
 _MAX_FRAMES = 12
-_SAMPLES_PER_FRAME = 4000
-_PROPOSALS = 600
-_KEPT = 60
-_SCORED_EVERY = 5
+_PROPOSALS_OF_FIRST, _PROPOSALS = 600, 200
 _PLAIN_SUPPORT = 0.3
-_WEAK_SUPPORT = 0.08
+_WEAK_SUPPORT, _LITTLE_SUPPORT = 0.08, 0.2
 _MAX_VIOLATIONS = 0.05
 _REST = 5
 """So many keyframes in a row must agree where the floor is not plain to see."""
-_LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
-"""Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
+_LEAST_FEET, _ENOUGH_FEET = 20, 150
+"""Feet of one keyframe that are worth a look, and those that a floor needs."""
+_FEET_SUPPORT = 0.4
+_FEET_REST = 3
+_CONTRADICTED = 0.3
+"""A plane below which such a share of the feet stands is no floor."""
+_SIGMAS, _FEET_SIGMAS = (0.015, math.radians(0.2)), (0.025, math.radians(0.4))
+"""How well height, as a share of it, and tilt must be known, one sigma."""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
 _MAX_CLIMB = 3.0
 """Sigmas by which the path may leave the floor: a plane that the robot drives into is none."""
 _NEARER = 0.8
 """A mirror at so much of the height of what looks like the floor lies clearly above it."""
-_TEXTURE_GREY = 1.2
-"""Horizontal grey gradient per pixel below which a disparity is mostly invented."""
 
 
 def disagreement(used: Mount, seen: Mount) -> str | None:
@@ -70,8 +61,10 @@ def disagreement(used: Mount, seen: Mount) -> str | None:
 class MountEstimator:
     """Measures the mount over the first keyframes, in SLAM's own frame.
 
-    known values are kept and only the others measured; NaN where not known. Deterministic: the
-    same frames give the same mount.
+    Two searches run side by side: for the plane on which what has texture lies, and for the one on
+    which upright things stand: of a floor of one colour their feet are all there is to see. known
+    values are kept and only the others measured; NaN where not known. Deterministic: the same
+    frames give the same mount.
     """
 
     def __init__(
@@ -83,22 +76,23 @@ class MountEstimator:
         forward_m: float = 0.0,
         left_m: float = 0.0,
     ) -> None:
-        self._camera = camera
-        self._known = np.array([pitch_rad, roll_rad, height_m])
+        known = self._known = np.array([pitch_rad, roll_rad, height_m])
         self._offset = (forward_m, left_m)
+        self._viewer = MountViewer(camera)
         self._views: list[MirrorView] = []
-        self._guesses = np.zeros((0, 3))
-        self._matcher = DisparityMatcher(disparity_range(camera, None))
-        self._rng, self._mirror_rng = (np.random.default_rng(seed) for seed in (0, 1))
+        self._feet: list[Samples] = []
+        self._mirror_rng = np.random.default_rng(1)
+        self._on_surfaces, self._on_feet = PlaneSearch(known), PlaneSearch(known)
         self._fits: list[PlaneFit] = []
-        self._settled = False
+        self._feet_fits: list[PlaneFit] = []
+        self._settled: PlaneFit | None = None
 
     @property
     def mount(self) -> Mount | None:
         """The mount of the first camera pose, None until the evidence suffices."""
-        if not self._settled:
+        if self._settled is None:
             return None
-        pitch, roll, height = (float(value) for value in self._fits[-1].angles_height)
+        pitch, roll, height = (float(value) for value in self._settled.angles_height)
         return Mount(height, pitch, roll, *self._offset)
 
     def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
@@ -106,40 +100,31 @@ class MountEstimator:
 
         T_world_left: pose (4, 4) of the camera in a frame whose origin is the first camera's.
         """
-        if self._settled:
+        if self._settled is not None:
             return
-        view = self._view(left, right, T_world_left)
-        samples = view.samples
+        view = self._viewer.view(left, right, T_world_left)
+        samples = view.surfaces.samples
         if len(samples.weight) < 50 or samples.weight.sum() < 1:
             return
-        self._views = [*self._views, view][-_MAX_FRAMES:]
-        fresh = propose(samples, _PROPOSALS, self._rng, self._known)
-        guesses = np.concatenate([with_known(self._guesses, self._known), fresh])
-        if len(guesses) == 0:
+        self._views = [*self._views, view.surfaces][-_MAX_FRAMES:]
+        if len(view.feet.weight) >= _LEAST_FEET:
+            self._feet = [*self._feet, view.feet][-_MAX_FRAMES:]
+        proposals = _PROPOSALS if self._fits else _PROPOSALS_OF_FIRST
+        fit = self._on_surfaces.find(self._frames, self._travel(), proposals, [])
+        if fit is None:
             return
-        # A few samples tell which guess is best; all of them refine it.
-        few = [frame.every(_SCORED_EVERY) for frame in self._frames]
-        total = np.sum([scores(frame, guesses) for frame in few], axis=0)
-        total = np.maximum(total, 0) * preference(guesses, self._travel())
-        order = np.argsort(-total, kind='stable')[:_KEPT]
-        self._guesses = guesses[order]
-        fit = self._refined(self._guesses[0])
-        self._guesses = np.concatenate([fit.angles_height[None], self._guesses])
-        fit = self._mirror(fit) or fit
+        # Below the feet of things a mirror shows these things, not a blank floor.
+        if not self._feet or not self._fits:
+            fit = self._mirror(fit) or fit
         self._fits.append(fit)
-        self._settled = self._suffices(fit)
+        if self._is_plain(fit):
+            self._settled = fit
+        else:
+            self._settled = self._at_rest(fit) or self._stood_on(fit)
 
     @property
     def _frames(self) -> list[Samples]:
         return [view.samples for view in self._views]
-
-    def _refined(self, start: Array) -> PlaneFit:
-        # Frames that show the same err together: the prior counts once per frame, too.
-        sigma = _LEVEL_SIGMA / math.sqrt(len(self._views))
-        none, known = np.zeros(3), self._known
-        return refine(
-            self._frames, start, known, self._travel(), prior_sigma=sigma, prior_mean=none
-        )
 
     def _mirror(self, ordinary: PlaneFit) -> PlaneFit | None:
         """Return the plane that best mirrors what stands on it: of what is seen below it none
@@ -153,7 +138,8 @@ class MountEstimator:
             starts.append(ordinary.angles_height)
             highest_m = math.inf
         best, best_share = None, MIRRORED_SHARE
-        for fit in map(self._refined, starts):
+        for start in starts:
+            fit = self._on_surfaces.refined(self._frames, start, self._travel())
             if fit.angles_height[2] > highest_m:
                 continue
             share = mirrored_share(self._views, fit.angles_height)
@@ -169,50 +155,58 @@ class MountEstimator:
         steps = positions[1:] - positions[:1]
         return steps[np.linalg.norm(steps, axis=1) > 0.05]
 
-    def _suffices(self, fit: PlaneFit) -> bool:
-        """Tell whether the floor is plain to see, or weaker evidence has come to rest."""
-        climb = float(mean_climb(fit.angles_height[None], self._travel())[0])
-        if climb > _MAX_CLIMB or not plausible(fit.angles_height):
-            return False
-        if fit.violations > _MAX_VIOLATIONS:
-            return False
-        certain = fit.sigma[2] < 0.015 * fit.angles_height[2]
-        if fit.support > _PLAIN_SUPPORT and certain and fit.sigma[:2].max() < math.radians(0.2):
-            return True
-        if len(self._fits) < _REST or fit.support < _WEAK_SUPPORT:
-            return False
-        recent = np.array([past.angles_height for past in self._fits[-_REST:]])
-        spread = np.ptp(recent, axis=0)
-        return bool(
-            certain
-            and spread[2] < 0.03 * fit.angles_height[2]
-            and spread[0] < math.radians(1.0)
-            and spread[1] < math.radians(4.0)
-        )
+    def _is_plain(self, fit: PlaneFit) -> bool:
+        """Tell whether the floor is plain to see."""
+        plain = fit.support > _PLAIN_SUPPORT and _is_certain(fit, *_SIGMAS)
+        return plain and self._is_possible(fit) and fit.violations <= _MAX_VIOLATIONS
 
-    def _view(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
-    ) -> MirrorView:
-        camera = self._camera
-        right, measured = stereo_view(left, right)
-        disparity = self._matcher.compute(left, right) if measured is None else measured
-        smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
-        gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
-        texture = cv2.blur(gradient, (9, 9))
-        step = max(2, round(math.sqrt(left.size / 2 / _SAMPLES_PER_FRAME)))
-        grid = disparity[step // 2 :: step, step // 2 :: step]
-        rows, columns = (step // 2 + step * index for index in np.nonzero(grid >= 1))
-        rays = camera.back_project(np.stack([columns, rows], axis=1), np.ones(len(rows)))
-        grey = texture[rows, columns].astype(np.float64)
-        weight = grey**4 / (grey**4 + _TEXTURE_GREY**4)
-        if measured is not None:
-            # A depth camera needs no texture.
-            weight = np.ones(len(rows))
-        samples = Samples(
-            rays=rays @ T_world_left[:3, :3].T,
-            position_m=T_world_left[:3, 3].astype(np.float64),
-            disparity_px=disparity[rows, columns].astype(np.float64),
-            weight=weight,
-            disparity_m=camera.disparity_times_depth,
-        )
-        return MirrorView.of(camera, left, disparity, samples, T_world_left)
+    def _stood_on(self, textured: PlaneFit) -> PlaneFit | None:
+        """Return the plane on which things stand, once it has come to rest, where the floor itself
+        has no texture by which to measure it.
+        """
+        if not self._feet or textured.support > _LITTLE_SUPPORT:
+            return None
+        fit = self._on_feet.find(self._feet, self._travel(), _PROPOSALS, self._frames)
+        if fit is None:
+            return None
+        self._feet_fits.append(fit)
+        enough = fit.support * sum(len(feet.weight) for feet in self._feet) > _ENOUGH_FEET
+        if not enough or fit.support < _FEET_SUPPORT or not _is_certain(fit, *_FEET_SIGMAS):
+            return None
+        below = max(fit.violations, shares(self._frames, fit.angles_height)[1])
+        if below > _MAX_VIOLATIONS or not self._is_possible(fit):
+            return None
+        rests = _rests(self._feet_fits, _FEET_REST, 0.02, math.radians(0.5), math.radians(1.0))
+        return fit if rests else None
+
+    def _at_rest(self, fit: PlaneFit) -> PlaneFit | None:
+        """Return the plane of a floor of weak texture, once it has come to rest."""
+        if fit.support < _WEAK_SUPPORT or fit.violations > _MAX_VIOLATIONS:
+            return None
+        if not _is_certain(fit, _SIGMAS[0], math.inf) or not self._is_possible(fit):
+            return None
+        if self._feet and shares(self._feet, fit.angles_height)[1] > _CONTRADICTED:
+            return None
+        rests = _rests(self._fits, _REST, 0.03, math.radians(1.0), math.radians(4.0))
+        return fit if rests else None
+
+    def _is_possible(self, fit: PlaneFit) -> bool:
+        """Tell whether a robot can drive on the plane as it did."""
+        climb = float(mean_climb(fit.angles_height[None], self._travel())[0])
+        return climb <= _MAX_CLIMB and bool(plausible(fit.angles_height))
+
+
+def _is_certain(fit: PlaneFit, height: float, tilt_rad: float) -> bool:
+    """Tell whether a plane is known so well, one sigma, the height within a share of it."""
+    height_sigma = float(fit.sigma[2] / fit.angles_height[2])
+    return height_sigma < height and float(fit.sigma[:2].max()) < tilt_rad
+
+
+def _rests(
+    fits: list[PlaneFit], count: int, height: float, pitch_rad: float, roll_rad: float
+) -> bool:
+    """Tell whether the last so many planes are the same, the height within a share of it."""
+    recent = np.array([fit.angles_height for fit in fits[-count:]])
+    spread = np.ptp(recent, axis=0)
+    limits = (pitch_rad, roll_rad, height * recent[-1, 2])
+    return len(recent) == count and bool((spread < limits).all())

@@ -236,7 +236,7 @@ def refine(
     sigma = np.zeros(3)
     covariance = np.linalg.pinv(information[np.ix_(free, free)])
     sigma[free] = np.sqrt(np.maximum(np.diag(covariance), 0))
-    support, violations = _shares(frames, state)
+    support, violations = shares(frames, state)
     return PlaneFit(state, sigma, support, violations)
 
 
@@ -281,7 +281,10 @@ def _add_travel(information: Array, gradient: Array, state: Array, travel: Array
         gradient[:2] -= row * float(displacement @ normal) / sigma_m**2
 
 
-def _shares(frames: list[Samples], state: Array) -> tuple[float, float]:
+def shares(frames: list[Samples], state: Array) -> tuple[float, float]:
+    """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
+    and which below it.
+    """
     on = below = total = 0.0
     for samples in frames:
         expected = plane_disparity(samples, plane_of(state)[None])[:, 0]

@@ -1,5 +1,7 @@
 """The mount measured from the floor of rendered scenes and of recordings."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -51,6 +53,54 @@ def test_a_wall_is_not_the_floor():
 
 def test_nothing_is_seen_of_a_blank_scene():
     assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
+
+
+def blank_floored(mount: Mount, *things: Patch) -> Scene:
+    """Return a scene whose floor has no texture, with three walls that have, and things."""
+    left = Patch((-1, 1.5, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=3)
+    right = Patch((-1, -1.3, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=4)
+    patches = [
+        floor_patch(grey=175.0, contrast=0.0),
+        left,
+        right,
+        wall(3.0, contrast=45.0),
+        *things,
+    ]
+    return Scene(patches, mount=mount, noise_grey=1.0)
+
+
+def estimate_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> MountEstimator:
+    """Return what a robot measures that drives ahead over the floor."""
+    estimator = MountEstimator(scene.camera)
+    T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    for i in range(frames):
+        here = replace(scene.mount, forward_m=i * step_m)
+        left, right, _, _ = replace(scene, mount=here).render()
+        estimator.add(left, right, T_left_base @ here.T_base_left)
+    return estimator
+
+
+@pytest.mark.parametrize(('height_m', 'pitch_deg', 'roll_deg'), [(0.35, 8.0, 0.0), (0.2, 5.0, 2.0)])
+def test_a_floor_of_one_colour_is_where_things_stand(height_m, pitch_deg, roll_deg):
+    true = Mount(height_m, np.radians(pitch_deg), np.radians(roll_deg))
+    scene = blank_floored(true, *box(1.6, 0.5, 0.4, 0.3))
+    mount = estimate_on_the_way(scene, 4).mount
+    assert mount is not None
+    assert mount.height_m == pytest.approx(height_m, rel=0.03)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.3)
+    assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.5)
+
+
+def test_posters_on_a_blank_wall_are_not_the_floor():
+    """They hang at one height, and nothing shows where the wall ends."""
+    poster = [
+        Patch((2.9, y, 0.12), (0, 0.5, 0), (0, 0, 0.4), False, contrast=45.0, seed=i)
+        for i, y in enumerate((-1.0, 0.5))
+    ]
+    floor = floor_patch(grey=175.0, contrast=0.0)
+    blank = wall(3.0, grey=175.0, contrast=0.0)
+    scene = Scene([floor, blank, *poster], mount=Mount(0.35, np.radians(8.0)), noise_grey=1.0)
+    assert estimate_on_the_way(scene, 8).mount is None
 
 
 def test_disagreement_names_both_numbers():
