@@ -20,6 +20,8 @@ from segfloor_ros.floor.plane import PlaneFit, Samples, mean_climb, plausible, s
 from segfloor_ros.floor.plane_search import PlaneSearch
 from segfloor_ros.geometry import Array
 
+_USUAL = np.array([0.0, 0.0, 0.3])
+"""Pitch, roll and height while nothing is known."""
 _MAX_FRAMES = 12
 _PROPOSALS_OF_FIRST, _PROPOSALS = 600, 200
 _PLAIN_SUPPORT = 0.3
@@ -90,9 +92,18 @@ class MountEstimator:
     @property
     def mount(self) -> Mount | None:
         """The mount of the first camera pose, None until the evidence suffices."""
-        if self._settled is None:
-            return None
-        pitch, roll, height = (float(value) for value in self._settled.angles_height)
+        return None if self._settled is None else self._mount_of(self._settled.angles_height)
+
+    @property
+    def provisional(self) -> Mount:
+        """The mount as it seems so far, at first a level camera at a usual height."""
+        for fit in (*self._feet_fits[-1:], *self._fits[-1:]):
+            if self._is_possible(fit):
+                return self._mount_of(fit.angles_height)
+        return self._mount_of(np.where(np.isnan(self._known), _USUAL, self._known))
+
+    def _mount_of(self, angles_height: Array) -> Mount:
+        pitch, roll, height = (float(value) for value in angles_height)
         return Mount(height, pitch, roll, *self._offset)
 
     def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:

@@ -66,6 +66,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._resumption = SlamResumption(self._keep)
         self._frames = CameraFrames('', '')
         self._mount: Mount | None = None
+        self._provisional_ns = 0
         self._frame_count = 0
 
     def restore(self, state: tuple[int, LastState]) -> None:
@@ -177,8 +178,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._resumption.is_hopeless(stamp_ns):
             self.reset('the place where the last SLAM was killed is not found')
         if not results:
-            words = 'waiting for the floor, to measure the mount of the camera'
-            self.reporter.report_waiting(stamp_ns, words)
+            self._publish_provisional(stamp_ns, slam.provisional)
 
     def _start(self, stamp_ns: int, pair: Pair) -> StereoSlam:
         """Build the stage, now that the calibration is known."""
@@ -208,7 +208,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._mount is not None:
             self._resumption.keep(self._calibration.camera, self._mount, result)
         # What a robot steers by comes first, the images of a keyframe later.
-        self._transforms.broadcast(result)
+        if result.stamp_ns > self._provisional_ns:
+            self._transforms.broadcast(result)
         self._outputs.publish(result, self._calibration, self._frames)
         self.reporter.report_processed(
             result.stamp_ns,
@@ -222,6 +223,17 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             reference_keyframe_ns=result.reference_keyframe_ns,
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
         )
+
+    def _publish_provisional(self, stamp_ns: int, result: FrameResult | None) -> None:
+        """Publish the newest pose while the mount is being measured: it is corrected once, when
+        keyframes come.
+        """
+        if result is not None:
+            self._provisional_ns = stamp_ns
+            self._transforms.broadcast(result)
+            self._outputs.publish(result, self._calibration, self._frames)
+        words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
+        self.reporter.report_waiting(stamp_ns, words)
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self._mount = mount

@@ -34,6 +34,12 @@ class HeldResults:
         ready, self._held = self._held, []
         return [in_map(held, mount.T_base_left) for held in ready]
 
+    def newest(self, mount: Mount) -> FrameResult | None:
+        """Return the pose of the newest result that is held, as seen from a mount."""
+        if not self._held:
+            return None
+        return in_map(replace(self._held[-1], keyframe=None, moving=None), mount.T_base_left)
+
     def _drop_old_keyframes(self) -> None:
         """Keep the images of the latest keyframes only: a camera that never sees the floor must not
         fill the memory. The poses of all frames are kept.

@@ -22,3 +22,7 @@ class MountMeter(Protocol):
     @property
     def mount(self) -> Mount | None:
         """The mount at the first frame, once it is known."""
+
+    @property
+    def provisional(self) -> Mount:
+        """The mount as it seems so far, whatever little is known."""

@@ -65,7 +65,8 @@ class StereoSlam:
     """Tracks a stereo camera and maps what it sees.
 
     One call of `process` per frame, in order. Results are held back until the camera's mount is
-    known, since frame `map` lies on the floor; then all of them come at once, none is lost.
+    known, since frame `map` lies on the floor; then all of them come at once, none is lost. Until
+    then `provisional` tells the newest pose.
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
     adjustment, and results depend on timing.
     """
@@ -119,6 +120,15 @@ class StereoSlam:
     def sensors(self) -> BodyMotion:
         """What wheels and IMU told, and what was found to be wrong with them."""
         return self._body
+
+    @property
+    def provisional(self) -> FrameResult | None:
+        """The newest pose while the mount is being measured, by the mount as it seems so far; None
+        before the first frame, and once `process` returns results.
+        """
+        if self._mount_meter is None:
+            return None
+        return self._held.newest(self._mount_meter.provisional)
 
     def add(self, measurement: Measurement) -> None:
         """Take in what wheels or an IMU measured; those up to a frame come before it."""

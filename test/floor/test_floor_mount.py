@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from floor_scenes import Patch, Scene, box, floor_patch, wall
 
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.mount import MountEstimator, disagreement
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.stages import make_slam
 
 
 def estimate(scene: Scene, **known) -> Mount | None:
@@ -89,6 +91,24 @@ def test_a_floor_of_one_colour_is_where_things_stand(height_m, pitch_deg, roll_d
     assert mount.height_m == pytest.approx(height_m, rel=0.03)
     assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.3)
     assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.5)
+
+
+def test_poses_come_before_the_mount_is_known():
+    scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
+    slam = make_slam(scene.camera, StereoSlamSettings(keyframe_max_frames=1))
+    come, positions = [], []
+    for i in range(8):
+        here = replace(scene.mount, forward_m=0.1 * i)
+        left, right, _, _ = replace(scene, mount=here).render()
+        come.append(len(slam.process(StereoFrame(i, i * 10**8, left, right))))
+        if slam.provisional is not None:
+            positions.append(slam.provisional.T_odom_base[:3, 3])
+    settled = come.index(max(come))
+    assert settled > 0
+    # One for each frame before, none since, and nothing is lost.
+    assert len(positions) == settled
+    assert come == [0] * settled + [settled + 1] + [1] * (7 - settled)
+    assert positions[-1] == pytest.approx([0.1 * (settled - 1), 0.0, 0.0], abs=0.02)
 
 
 def test_posters_on_a_blank_wall_are_not_the_floor():
