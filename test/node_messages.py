@@ -15,6 +15,7 @@ from segfloor_ros.messages.poses import odometry_message, path_message
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 STAMP_NS = 12_345_678_901
+AT_ORIGIN = np.eye(4)
 POINTS = SparseCloud(
     np.array([2, 5, 8], np.int32), np.array([[1, 0, 0], [2, 0, 1], [3, 1, 0]], np.float32)
 )
@@ -55,9 +56,9 @@ def grid_messages(stamp_ns: int) -> dict[str, Any]:
     }
 
 
-def pose_message_at(stamp_ns: int) -> Any:
-    """Return the pose of a keyframe at the origin of the map."""
-    return odometry_message(stamp_ns, 'map', 'base_link', np.eye(4), np.zeros((6, 6)))
+def pose_message_at(stamp_ns: int, T_map_base: np.ndarray = AT_ORIGIN) -> Any:
+    """Return the pose of a keyframe."""
+    return odometry_message(stamp_ns, 'map', 'base_link', T_map_base, np.zeros((6, 6)))
 
 
 def publish(graph, messages: dict[str, Any], publishers: dict[str, Any] | None = None):

@@ -144,10 +144,10 @@ def compare_masks(
     height_m, *angles_deg = (float(value) for value in mount.split(','))
     where = Mount(height_m, *np.radians(angles_deg).tolist())
     for drive in drives:
-        camera, frames = true_masks(drive, where, outlines, noise)
-        for name in chosen(FLOOR_MECHANISMS, only):
+        for name in chosen([*FLOOR_MECHANISMS, 'deblocking'], only):
             counts = np.zeros(5, np.int64)
-            with FLOOR_MECHANISMS[name].left_out():
+            with {**FLOOR_MECHANISMS, **RECORDED}[name].left_out():
+                camera, frames = true_masks(drive, where, outlines, noise)
                 stage = FloorSegmentation(camera, resolve().floor_segmentation)
                 for one in frames:
                     left, right = one.frame.left, one.frame.right

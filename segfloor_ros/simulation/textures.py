@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -194,6 +195,7 @@ GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, fl
 """Generator, size in pixels and side in metres of each texture."""
 
 
+@lru_cache(maxsize=16)
 def make_texture(name: str, seed: int) -> Texture:
     """Return a texture by name; the same seed gives the same pixels.
 

@@ -1,9 +1,15 @@
 """The block grid of compressed images: seen where there is one, smoothed, real edges kept."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+import pytest
+from camera_recordings import calibration
 
+from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.deblocking import deblocked, is_blocky
+from segfloor_ros.camera.rectification import StereoRectifier
 
 
 def weak_texture(seed: int = 0) -> np.ndarray:
@@ -35,9 +41,10 @@ def test_an_image_without_a_grid_is_left_as_it_is():
     assert deblocked(image) is image
 
 
-def test_smoothing_brings_the_picture_back_nearer_to_the_truth():
-    truth = weak_texture().astype(float)
-    blocky = compressed(weak_texture(), 20)
+@pytest.mark.parametrize('seed', [0, 7])
+def test_smoothing_brings_the_picture_back_nearer_to_the_truth(seed):
+    truth = weak_texture(seed).astype(float)
+    blocky = compressed(weak_texture(seed), 20)
     smooth = deblocked(blocky)
     assert not is_blocky(smooth)
     assert np.abs(smooth - truth).mean() < 0.8 * np.abs(blocky - truth).mean()
@@ -55,3 +62,12 @@ def test_sizes_that_are_no_multiple_of_a_block():
     for height, width in ((233, 317), (225, 316), (239, 313), (16, 16), (5, 7)):
         image = compressed(weak_texture(), 20)[:height, :width]
         assert deblocked(image).shape == (height, width)
+
+
+def test_images_are_deblocked_before_they_are_rectified():
+    eyes = calibration()
+    sized = (replace(eye, width=320, height=240) for eye in (eyes.left, eyes.right))
+    rectifier = StereoRectifier(StereoCalibration(*sized))
+    blocky = compressed(weak_texture(), 20)
+    for image in rectifier.rectify(blocky, blocky.copy()):
+        assert not is_blocky(image)

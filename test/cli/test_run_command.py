@@ -23,14 +23,13 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 FRAMES = 16
 
 
-def segfloor(*arguments, cwd=None):
+def segfloor(*arguments):
     """Run the command line in a process of its own."""
     environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parents[2])}
     return subprocess.run(
         [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
         capture_output=True,
         text=True,
-        cwd=cwd,
         env=environment,
         timeout=120,
     )
@@ -324,9 +323,12 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
         (('--load-map', 'short.map', '--localize', '--save-map', 'x'), 'leave --save-map out'),
     ],
 )
-def test_a_map_that_cannot_be_used_is_one_line(recording, tmp_path, options, words):
+def test_a_map_that_cannot_be_used_is_one_line(
+    segfloor_here, monkeypatch, recording, tmp_path, options, words
+):
     (tmp_path / 'short.map').write_bytes(b'PK\x03\x04 not much')
-    done = segfloor('run', recording, '--out', tmp_path / 'out', *options, cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = segfloor_here('run', recording, '--out', tmp_path / 'out', *options)
     assert done.returncode == 2
     assert words in ' '.join(done.stderr.split())
     assert not (tmp_path / 'out').exists()

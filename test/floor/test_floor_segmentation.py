@@ -115,6 +115,24 @@ def test_a_blank_strip_between_floor_is_filled(floor_kind):
     assert np.mean(observation.mask[strip] == FLOOR) > 0.9
 
 
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_lone_bit_of_floor_is_left_open(floor_kind):
+    """Seen through an opening above a low sill, beside floor that is much larger."""
+    whole = wall(1.0, contrast=14.0)
+    ahead = [
+        dataclasses.replace(whole, corner=(1.0, 0.175, 0.0), seed=5),
+        dataclasses.replace(whole, corner=(1.0, -8.175, 0.0), seed=6),
+        Patch((1.0, -0.175, 0.0), (0, 0.35, 0), (0, 0, 0.12), False, contrast=14.0, seed=7),
+    ]
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), *ahead], SMALL_CAMERA)
+    observation, floor, depth = segment(scene)
+    behind = floor & (depth > 1.1)
+    assert behind.sum() > 500
+    assert (observation.mask[floor & (depth < 1.0)] == FLOOR).mean() > 0.95
+    # At half the resolution its border may stay.
+    assert (observation.mask[behind] == FLOOR).mean() < 0.1
+
+
 def test_a_low_box_is_not_floor():
     scene = Scene([floor_patch(), wall(), *box(1.5, 0.0, 0.3, 0.05)])
     observation, floor, depth = segment(scene)

@@ -152,6 +152,19 @@ def test_leaks_open_no_way_through_a_wall(make_drive: MakeDrive) -> None:
     assert (cells_at(drive.grid(), centres((2.5, 3.8), (-0.6, 0.6))) == 0).mean() > 0.99
 
 
+def test_floor_behind_what_stands_is_not_believed_at_first_sight(make_drive: MakeDrive) -> None:
+    wall = World(walls=((2.02, -3, 2.02, 3),))
+    drive = make_drive(OccupancyGridSettings(), error_per_m=0.0)
+    for _ in range(5):
+        drive.look(wall, (0.0, 0.0, 0.0))
+    drive.leak_share = 1.0
+    behind = centres((2.3, 3.2), (-0.4, 0.4))
+    for expected, looks in ((-1, 1), (0, 20)):
+        for _ in range(looks):
+            drive.look(wall, (0.0, 0.0, 0.0))
+        assert (cells_at(drive.grid(), behind) == expected).all()
+
+
 def point_cloud(xyz: list[tuple[float, float, float]], label: int) -> LabelledPoints:
     count = len(xyz)
     return LabelledPoints(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,17 +18,15 @@ from node_messages import (
     pose_message_at,
     publish,
 )
-from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
-from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.floor.free_ranges import free_ranges
-from segfloor_ros.floor.pictures import mask_overlay
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import invert
@@ -46,7 +43,6 @@ from segfloor_ros.messages.clouds import (
     sparse_cloud_arrays,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
@@ -232,92 +228,6 @@ class TestStereoSlam:
             return bool(seen) and seen[-1].values['odometry'] == '1'
 
         graph.until(connected, 'the connection of odometry')
-
-
-def keyframe_messages(stamp_ns: int, left, right) -> dict:
-    """Return what `floor_segmentation` needs of one keyframe."""
-    messages = {'keyframe/odometry': pose_message_at(stamp_ns)}
-    for side, image in (('left', left), ('right', right)):
-        messages[f'keyframe/{side}/image_rect'] = image_message(stamp_ns, side, image)
-        info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
-        messages[f'keyframe/{side}/camera_info'] = info
-    return messages
-
-
-def test_floor_segmentation_is_the_stage(make_graph) -> None:
-    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
-    expected = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(
-        frame.left, frame.right, MOUNT, np.eye(4)
-    )
-    graph = make_graph()
-    masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_scan')
-    graph.add(FloorSegmentationNode())
-    messages = keyframe_messages(STAMP_NS, frame.left, frame.right)
-    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
-    publish(graph, {**messages, 'camera_mount': mount})
-    graph.until(lambda: masks and scans, 'mask and scan')
-    assert to_ns(masks[0].header.stamp) == to_ns(scans[0].header.stamp) == STAMP_NS
-    assert (masks[0].encoding, masks[0].header.frame_id) == ('mono8', 'left')
-    np.testing.assert_array_equal(grey8_image(masks[0], ''), expected.mask)
-    assert scans[0].header.frame_id == 'base_link'
-    np.testing.assert_array_equal(scan_arrays(scans[0], '').ranges_m, expected.scan.ranges_m)
-    assert (expected.mask == 255).mean() > 0.1
-
-
-def test_pictures_of_the_floor_are_published_for_those_who_look(make_graph) -> None:
-    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
-    graph = make_graph()
-    masks, overlays = graph.collect('keyframe/floor_mask'), graph.collect('keyframe/floor_overlay')
-    node = graph.add(FloorSegmentationNode())
-    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
-    publishers = publish(graph, {'camera_mount': mount})
-    publish(graph, keyframe_messages(STAMP_NS, frame.left, frame.right), publishers)
-    graph.until(lambda: masks and overlays, 'mask and overlay')
-    expected = mask_overlay(frame.left, grey8_image(masks[0], ''))
-    assert (overlays[0].encoding, overlays[0].step) == ('bgr8', 3 * CAMERA.width)
-    pixels = np.frombuffer(overlays[0].data, np.uint8).reshape(expected.shape)
-    np.testing.assert_array_equal(pixels, expected)
-    drawn = graph.collect('keyframe/v_disparity')
-    (late,) = (p for p in node.publishers if p.topic_name.endswith('/v_disparity'))
-    graph.until(late.get_subscription_count, 'the subscription')
-    publish(graph, keyframe_messages(STAMP_NS + 1, frame.left, frame.right), publishers)
-    graph.until(lambda: drawn, 'the v-disparity')
-    assert to_ns(drawn[0].header.stamp) == STAMP_NS + 1
-    picture = np.frombuffer(drawn[0].data, np.uint8).reshape(CAMERA.height, -1, 3)
-    green = picture[..., 1].astype(int) - picture[..., 2] > 100
-    # The profile: one line from the horizon down, to the right.
-    rows, columns = np.nonzero(green)
-    assert len(np.unique(rows)) > 0.3 * CAMERA.height
-    assert np.corrcoef(rows, columns)[0, 1] > 0.98
-
-
-def test_a_changed_parameter_leaves_the_floor_its_memory(make_graph) -> None:
-    frame = StereoRoom(seed=5).frame(0, planar_pose(0.0, 0.0, 0.0))
-    blank = [image.copy() for image in (frame.left, frame.right)]
-    for image in blank:
-        image[180:, 100:220] = 90
-    settings = FloorSegmentationSettings()
-    changed = replace(settings, scan_gap_m=0.3)
-    stage = FloorSegmentation(CAMERA, settings)
-    for _ in range(3):
-        stage.process(frame.left, frame.right, MOUNT, np.eye(4))
-    stage.change_settings(changed)
-    expected = stage.process(*blank, MOUNT, np.eye(4)).mask
-    anew = FloorSegmentation(CAMERA, changed).process(*blank, MOUNT, np.eye(4)).mask
-    assert (expected != anew).any()
-    graph = make_graph()
-    masks = graph.collect('keyframe/floor_mask')
-    node = graph.add(FloorSegmentationNode())
-    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
-    publishers = publish(graph, {'camera_mount': mount})
-    for i in range(3):
-        publish(graph, keyframe_messages(STAMP_NS + i, frame.left, frame.right), publishers)
-    graph.until(lambda: len(masks) == 3, 'three masks')
-    (result,) = node.set_parameters([Parameter('scan_gap_m', value=0.3)])
-    assert result.successful
-    publish(graph, keyframe_messages(STAMP_NS + 3, *blank), publishers)
-    graph.until(lambda: len(masks) == 4, 'the mask of the blank image')
-    np.testing.assert_array_equal(grey8_image(masks[3], ''), expected)
 
 
 def test_cloud_labelling_is_the_stage(make_graph) -> None:

@@ -53,6 +53,7 @@ def test_the_demo_drive_is_small_and_complete():
     assert len(truth.base_poses) == source.frame_count == 273
 
 
+@pytest.mark.slow
 def test_demo_maps_and_scores(tmp_path):
     output = run('demo', '--lockstep', '--out', tmp_path / 'demo').split('\n')
     assert Path(output[-2]) == tmp_path / 'demo' / 'report.html'

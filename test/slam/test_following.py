@@ -13,17 +13,21 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=800)
-ROOM = StereoRoom()
+
+
+@pytest.fixture
+def room():
+    return StereoRoom()
 
 
 @pytest.mark.parametrize('width', [320, 640])
-def test_flow_of_a_turn_is_that_of_the_pinhole_camera(width):
+def test_flow_of_a_turn_is_that_of_the_pinhole_camera(width, room):
     scale = width / CAMERA.width
     camera = replace(CAMERA, width=width, height=round(CAMERA.height * scale))
     camera = replace(camera, fx=CAMERA.fx * scale, fy=CAMERA.fy * scale)
     camera = replace(camera, cx=(width - 1) / 2, cy=(camera.height - 1) / 2)
     poses = [planar_pose(0, 0, yaw) @ MOUNT.T_base_left for yaw in (0, np.radians(3))]
-    last, now = (shrink(ROOM.view(pose, camera)) for pose in poses)
+    last, now = (shrink(room.view(pose, camera)) for pose in poses)
     v, u = np.mgrid[40 : camera.height - 40 : 20, 60 : width - 60 : 20]
     uv = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
     rays = camera.back_project(uv, np.ones(len(uv)))
@@ -33,10 +37,10 @@ def test_flow_of_a_turn_is_that_of_the_pinhole_camera(width):
     assert np.median(np.abs(found_uv - truth)[found]) < 0.3
 
 
-def test_follows_a_frame_to_the_millimetre_or_not_at_all():
+def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    slam.process(ROOM.frame(0, planar_pose(0, 0, 0)))
-    frame = ROOM.frame(1, planar_pose(0.03, 0, 0.02))
+    slam.process(room.frame(0, planar_pose(0, 0, 0)))
+    frame = room.frame(1, planar_pose(0.03, 0, 0.02))
     other = StereoRoom(seed=5).frame(1, planar_pose(0.03, 0, 0.02))
     truth = planar_pose(0.03, 0, 0.02) @ MOUNT.T_base_left
 
@@ -52,19 +56,19 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all():
     assert follow(other) is None
 
 
-def test_points_that_are_gone_are_not_followed():
+def test_points_that_are_gone_are_not_followed(room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    slam.process(ROOM.frame(0, planar_pose(0, 0, 0)))
+    slam.process(room.frame(0, planar_pose(0, 0, 0)))
     follower, ids = slam._follower, slam._follower.seen_ids
     slam.map.remove_points(ids[::2])
     follower.drop_dead(slam.map)
     np.testing.assert_array_equal(follower.seen_ids, ids[1::2])
-    images = Images.of(ROOM.frame(1, planar_pose(0.03, 0, 0.02)), CAMERA)
+    images = Images.of(room.frame(1, planar_pose(0.03, 0, 0.02)), CAMERA)
     track = follower.follow(images, slam.map, ids[1::2], np.eye(4), 0.0)
     assert not np.isin(track.point_ids, ids[::2]).any()
 
 
-def test_only_keyframes_need_features(monkeypatch):
+def test_only_keyframes_need_features(monkeypatch, room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     extract = slam._extractor.extract
     calls = []
@@ -72,6 +76,6 @@ def test_only_keyframes_need_features(monkeypatch):
         slam._extractor, 'extract', lambda *given: calls.append(1) or extract(*given)
     )
     for k in range(12):
-        result = slam.process(ROOM.frame(k, planar_pose(0.03 * k, 0, 0.01 * k)))[0]
+        result = slam.process(room.frame(k, planar_pose(0.03 * k, 0, 0.01 * k)))[0]
         assert result.tracked
     assert len(calls) == len(slam.map.keyframes) < 8

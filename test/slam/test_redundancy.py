@@ -74,7 +74,7 @@ def test_driving_to_and_fro_makes_its_views_once():
     images = {}
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     stamps, views_per_turn = [], []
-    for k in range(6 * len(x)):
+    for k in range(4 * len(x)):
         at = int(x[k % len(x)])
         if at not in images:
             images[at] = room.frame(0, planar_pose(0.05 * at, 0.0, 0.0))
