@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.map_file import read_map_file, write_map_file
+from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.resident_memory import MemoryLog
@@ -29,6 +29,7 @@ from segfloor_ros.results_folder import (
     relocalisations,
 )
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
+from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
 
 ProgressListener = Callable[[int, str], None]
@@ -59,6 +60,23 @@ class MapOptions:
         if self.save is not None and self.save.is_dir():
             raise SettingsError(f'--save-map {self.save}: is a folder; give the name of a file')
 
+    def read(self, camera: StereoCamera) -> MapFile | None:
+        """Return the map to go on with, None where there is none. Raises InputError, also for a map
+        of another camera.
+        """
+        if self.load is None:
+            return None
+        saved = read_map_file(self.load)
+        check_camera(saved, camera, str(self.load))
+        return saved
+
+    def why_not_found(self, name: str, frames: int) -> str:
+        """Return why there is no map where one was loaded."""
+        return (
+            f'{name}: in none of {frames} frames was a place of {self.load} recognised; is it a '
+            'map of this building?'
+        )
+
 
 NO_MAPS = MapOptions()
 
@@ -87,8 +105,8 @@ class LockstepRun:
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
         self._map_options = map_options
-        if map_options.load is not None:
-            loaded = read_map_file(map_options.load)
+        loaded = map_options.read(source.camera)
+        if loaded is not None:
             self._pipeline.load(loaded, str(map_options.load), map_options.localize)
         self._unmasked: list[StereoFrame] = []
         self._results: list[FrameResult] = []
@@ -158,9 +176,7 @@ class LockstepRun:
         if self._save_masks is SaveMasks.all:
             self._mask_frame(self._unmasked.pop(0), result)
         if result.keyframe is not None:
-            path = result.keyframe.path
-            new = path.stamp_ns >= 0  # those of a map that was loaded are before this drive
-            self._path = KeyframePath(path.stamp_ns[new], path.T_map_base[new])
+            self._path = new_keyframes(result.keyframe.path)
             result = dataclasses.replace(result, keyframe=None)
         self._results.append(result)
 
@@ -190,10 +206,7 @@ class LockstepRun:
         if self._frames == 0:
             return f'{name}: no frame could be read, so there is no map'
         if self._map_options.load is not None:
-            return (
-                f'{name}: in none of {self._frames} frames was a place of {self._map_options.load} '
-                'recognised; is it a map of this building?'
-            )
+            return self._map_options.why_not_found(name, self._frames)
         if self._pipeline.mount is None:
             return (
                 f'{name}: no floor was recognised in {self._frames} frames, so the height of the '

@@ -97,6 +97,17 @@ class StereoSlamNodeSettings(NodeSettings):
         minimum=0.0,
         maximum=60.0,
     )
+    load_map: str = setting(
+        '',
+        'Saved map to go on with, at the start, at a reset and by ~/load_map; empty: an empty map.',
+        live=True,
+    )
+    localize: bool = setting(
+        False,
+        'Poses in the map of load_map only: nothing is added to it.',
+        live=True,
+    )
+    save_map: str = setting('', 'File that ~/save_map writes the whole map to.', live=True)
     background: bool = setting(
         True,
         'Adjust the map beside tracking, so that no frame waits for it; off: results do not '

@@ -13,10 +13,13 @@ from segfloor_ros.cli.options import (
     DepthOption,
     IgnoreOption,
     InputArgument,
+    LoadMapOption,
+    LocalizeOption,
     MasksOption,
     OutOption,
     ParamsOption,
     ReportOption,
+    SaveMapOption,
     SetOption,
     recording_settings,
 )
@@ -30,7 +33,7 @@ from segfloor_ros.cli.output import (
 )
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.lockstep import SaveMasks
+from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.results_folder import OutputFolder
 
@@ -52,6 +55,9 @@ def replay(
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
     masks: MasksOption = None,
+    save_map: SaveMapOption = None,
+    load_map: LoadMapOption = None,
+    localize: LocalizeOption = False,
     report: ReportOption = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
@@ -67,11 +73,13 @@ def replay(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
+    maps = MapOptions(load_map, save_map, localize)
     configuration = resolve(
         params, assignments or (), stereo_camera=recording_settings(input, masks, ignore, depth)
     )
     # The camera node reads the recording; here it is opened so that bad input ends at once.
     source = open_source(configuration.stereo_camera)
+    loaded = maps.read(source.camera)
     print_sensors(source.sensors)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with OutputFolder(out) as folder:
@@ -83,6 +91,8 @@ def replay(
                 rate,
                 on_mask,
                 lambda done, state: progress.update(TaskID(0), completed=done, note=state),
+                maps,
+                loaded,
             ).execute()
         folder.write(result)
     for notice in session.notices:

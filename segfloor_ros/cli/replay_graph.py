@@ -20,6 +20,7 @@ _reservation: socket.socket | None = None
 
 RECORDED = (
     'odometry',
+    'pose',
     'camera_mount',
     'keyframe/path',
     'keyframe/floor_mask',

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
-from nav_msgs.msg import Odometry, Path
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
@@ -52,7 +52,9 @@ class ReplayRecorder(Node):
         self.labelled: LabelledPoints | None = None
         self.mount: Mount | None = None
         self.last_sign_s = time.monotonic()
+        self.has_map = False
         self._T_odom_base: dict[int, Array] = {}
+        self._T_map_base: dict[int, Array] = {}
         self._on_mask = on_mask
         self._masks: dict[int, NDArray[np.uint8]] = {}
         self._subscribe()
@@ -60,11 +62,15 @@ class ReplayRecorder(Node):
     @property
     def tracked(self) -> list[TrackedPose]:
         """The tracked frames in order of their stamps."""
-        poses = []
-        for stamp_ns in sorted(self._T_odom_base.keys() & self.answers.keys()):
-            reference_ns = int(self.answers[stamp_ns].values['reference_keyframe_ns'])
-            poses.append(TrackedPose(stamp_ns, self._T_odom_base[stamp_ns], reference_ns))
-        return poses
+        return [
+            TrackedPose(
+                stamp_ns,
+                self._T_odom_base[stamp_ns],
+                int(self.answers[stamp_ns].values['reference_keyframe_ns']),
+                self._T_map_base.get(stamp_ns),
+            )
+            for stamp_ns in sorted(self._T_odom_base.keys() & self.answers.keys())
+        ]
 
     @property
     def keyframes(self) -> set[int]:
@@ -98,11 +104,13 @@ class ReplayRecorder(Node):
         tracked = {t for t, s in self.answers.items() if s.values.get('tracked') == '1'}
         newest = max(self.keyframes, default=0)
         path_ns = int(self.path.stamp_ns[-1]) if self.path is not None else 0
-        return tracked <= self._T_odom_base.keys() and path_ns >= newest
+        has_poses = tracked <= self._T_odom_base.keys() & self._T_map_base.keys()
+        return has_poses and path_ns >= newest
 
     def _subscribe(self) -> None:
         callbacks: dict[str, Callable[[Any], None]] = {
             'odometry': self._take_odometry,
+            'pose': self._take_pose,
             'camera_mount': self._take_mount,
             'keyframe/path': self._take_path,
             'keyframe/floor_mask': self._take_mask,
@@ -117,6 +125,17 @@ class ReplayRecorder(Node):
 
     def _take_odometry(self, message: Odometry) -> None:
         self._T_odom_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
+
+    def _take_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._T_map_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
+
+    def listen_to_map(self) -> None:
+        """Note when there is a map; before the nodes are connected."""
+
+        def take(_message: OccupancyGrid) -> None:
+            self.has_map = True
+
+        self.create_subscription(TOPICS['map'].type, 'map', take, TOPICS['map'].profile)
 
     def _take_mount(self, message: TransformStamped) -> None:
         self.mount = Mount.from_transform(transform_array(message))

@@ -23,18 +23,25 @@ from segfloor_ros.cli.interrupts import first_interrupt_noted
 from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
+from segfloor_ros.cloud.labelled_cloud import CloudLabelling
+from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.lockstep import NO_MAPS, MapOptions
+from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.results_folder import RunResult, RunSummary, lost_intervals, relocalisations
+from segfloor_ros.slam.results import KeyframePath
+from segfloor_ros.slam.saved_slam import loaded_map, new_keyframes
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
 
 DISCOVERY_S = 30.0
 STALL_S = 60.0
 DRAIN_S = 10.0
 SERVICE_S = 10.0
+SAVE_S = 120.0
 SPIN_S = 0.1
 
 ProgressListener = Callable[[int, str], None]
@@ -63,7 +70,11 @@ class ReplaySession:
         rate: float,
         on_mask: MaskListener | None,
         on_progress: ProgressListener,
+        maps: MapOptions = NO_MAPS,
+        loaded: MapFile | None = None,
     ) -> None:
+        self._maps = maps
+        self._loaded = loaded
         self._configuration = configuration
         self._params_file = params_file
         self._rate = rate
@@ -87,6 +98,7 @@ class ReplaySession:
                 processes = NodeProcesses(NODES, arguments, environment, Path(folder))
                 with processes:
                     recorder = ReplayRecorder(context, processes.rss_mb, self._on_mask)
+                    recorder.listen_to_map()
                     return self._follow(ReplayGraph(recorder, processes), Path(folder))
         finally:
             rclpy.try_shutdown(context=context)
@@ -108,6 +120,10 @@ class ReplaySession:
         parameters[SLAM]['ros__parameters'].update(
             background=False, image_transport='raw', tf_wait_s=0.0
         )
+        for name, file in (('load_map', self._maps.load), ('save_map', self._maps.save)):
+            if file is not None:
+                parameters[SLAM]['ros__parameters'][name] = str(file.absolute())
+        parameters[SLAM]['ros__parameters']['localize'] = self._maps.localize
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))
@@ -125,7 +141,10 @@ class ReplaySession:
                 graph.catch_up()
         wall_s = time.perf_counter() - start_s
         self._check_result(graph.recorder)
+        graph.wait_for_map()
         graph.call(Trigger, 'save_map', Trigger.Request())
+        if self._maps.save is not None:
+            graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), SAVE_S)
         result = self._result(graph.recorder, folder / 'map.yaml', wall_s)
         stop_s = time.perf_counter()
         graph.processes.stop()
@@ -142,6 +161,10 @@ class ReplaySession:
         finished = recorder.finished
         if finished is not None and finished.level is Level.ERROR:
             raise InputError(finished.message)
+        if self._loaded is not None:
+            if not recorder.tracked:
+                raise MapError(self._maps.why_not_found(name, sent))
+            return
         if recorder.mount is None:
             raise MapError(
                 f'{name}: no floor was recognised in {sent} frames, so the height of the camera is '
@@ -152,8 +175,10 @@ class ReplaySession:
             raise MapError(f'{name}: no map came of {sent} frames: {words}')
 
     def _result(self, recorder: ReplayRecorder, map_file: Path, wall_s: float) -> RunResult:
-        mount, labelled, path = recorder.mount, recorder.labelled, recorder.path
-        assert mount is not None and labelled is not None and path is not None
+        mount, labelled = recorder.mount, recorder.labelled or self._loaded_cloud()
+        assert mount is not None and labelled is not None
+        path = recorder.path or KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+        path = new_keyframes(path)
         return RunResult(
             load_map(map_file),
             corrected_trajectory(recorder.tracked, path),
@@ -164,18 +189,31 @@ class ReplaySession:
             self._configuration,
         )
 
+    def _loaded_cloud(self) -> LabelledPoints | None:
+        """Return the labelled points of the map that was loaded."""
+        if self._loaded is None:
+            return None
+        labelling = CloudLabelling(self._configuration.cloud_labelling)
+        labelling.from_arrays(self._loaded.parts['cloud'])
+        return labelling.labelled(loaded_map(self._loaded, 0).cloud)
+
+    def _keyframe_count(self, recorder: ReplayRecorder) -> int:
+        if recorder.path is not None:
+            return len(recorder.path.stamp_ns)
+        return 0 if self._loaded is None else len(loaded_map(self._loaded, 0).path.stamp_ns)
+
     def _summary(self, recorder: ReplayRecorder, wall_s: float) -> RunSummary:
         stamps = sorted(recorder.frame_index)
         answers = [recorder.answers.get(stamp) for stamp in stamps]
         tracked = np.array([bool(s and s.values.get('tracked') == '1') for s in answers], bool)
-        mount, finished, path = recorder.mount, recorder.finished, recorder.path
-        assert mount is not None and path is not None
+        mount, finished = recorder.mount, recorder.finished
+        assert mount is not None
         return RunSummary(
             frames=len(stamps),
             tracked_frames=int(tracked.sum()),
             skipped_frames=int(finished.values['skipped']) if finished is not None else 0,
             lost_intervals=lost_intervals([recorder.frame_index[s] for s in stamps], tracked),
-            keyframes=len(path.stamp_ns),
+            keyframes=self._keyframe_count(recorder),
             loops=recorder.loops,
             relocalisations=relocalisations(stamps, tracked),
             map_updates=len(recorder.updated),
@@ -217,10 +255,16 @@ class ReplayGraph:
             self.spin()
         return time.monotonic() - start_s
 
-    def call(self, kind: Any, name: str, request: Any) -> None:
+    def wait_for_map(self) -> None:
+        """Wait until there is a map: one that is loaded takes its time."""
+        deadline_s = time.monotonic() + DRAIN_S
+        while not self.recorder.has_map and time.monotonic() < deadline_s:
+            self.spin()
+
+    def call(self, kind: Any, name: str, request: Any, patience_s: float = SERVICE_S) -> None:
         """Call a service. Raises ReplayError with its answer when it fails."""
         client = self.recorder.create_client(kind, name)
-        deadline_s = time.monotonic() + SERVICE_S
+        deadline_s = time.monotonic() + patience_s
         while not client.service_is_ready() and time.monotonic() < deadline_s:
             self.spin()
         future = client.call_async(request)

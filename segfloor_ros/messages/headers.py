@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
@@ -22,3 +24,9 @@ def to_ns(time: Time) -> int:
 def make_header(stamp_ns: int, frame_id: str) -> Header:
     """Return a header with a stamp in ns and a frame."""
     return Header(stamp=to_time(stamp_ns), frame_id=frame_id)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message or of a header in ns; 0 for what carries none."""
+    header = message if isinstance(message, Header) else getattr(message, 'header', None)
+    return 0 if header is None else to_ns(header.stamp)

@@ -9,6 +9,7 @@ from geometry_msgs.msg import (
     Point,
     Pose,
     PoseStamped,
+    PoseWithCovarianceStamped,
     Quaternion,
     Transform,
     TransformStamped,
@@ -67,6 +68,16 @@ def odometry_message(
         )
         if twist_covariance is not None:
             message.twist.covariance = np.ascontiguousarray(twist_covariance, np.float64).ravel()
+    return message
+
+
+def pose_with_covariance_message(
+    stamp_ns: int, frame_id: str, T_a_b: Array, covariance: Array
+) -> PoseWithCovarianceStamped:
+    """Return the pose of frame b in frame a. covariance: (6, 6), order x y z roll pitch yaw."""
+    message = PoseWithCovarianceStamped(header=make_header(stamp_ns, frame_id))
+    message.pose.pose = pose_message(T_a_b)
+    message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
     return message
 
 

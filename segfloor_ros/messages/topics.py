@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import (
@@ -22,7 +22,7 @@ from sensor_msgs.msg import (
     PointCloud2,
     TimeReference,
 )
-from std_msgs.msg import Header
+from std_msgs.msg import Header, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.messages import qos
@@ -37,6 +37,7 @@ OTHERS = ''
 
 MOVING_MASK = 'keyframe/moving_mask'
 MAP_START = 'keyframe/map_start'
+MAP_LOADED, MAP_WANTED, MAP_PART = 'map_file/loaded', 'map_file/wanted', 'map_file/part'
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
 PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 """Topics that a lossless camera listens to: how far frames and keyframes are."""
@@ -177,6 +178,23 @@ _ALL = [
         on_demand_by=(CLOUD,),
     ),
     Topic(
+        'initialpose',
+        PoseWithCovarianceStamped,
+        qos.ODOMETRY,
+        OTHERS,
+        (SLAM,),
+        'About where base_link is in map, as RViz publishes it: the camera is looked for there.',
+        is_optional=True,
+    ),
+    Topic(
+        'pose',
+        PoseWithCovarianceStamped,
+        qos.ODOMETRY,
+        SLAM,
+        (),
+        'Every tracked frame: base_link in map. Published while someone listens.',
+    ),
+    Topic(
         'dynamic_mask',
         Image,
         qos.IMAGES_BEST_EFFORT,
@@ -237,6 +255,34 @@ _ALL = [
         (FLOOR, CLOUD, GRID),
         'The keyframe, and as time_ref when its map began: another time_ref is another map.',
         is_optional=True,
+    ),
+    Topic(
+        MAP_LOADED,
+        UInt8MultiArray,
+        qos.LATCHED,
+        SLAM,
+        (CLOUD, GRID),
+        'What the nodes behind need of a map that was loaded, as the bytes of a map file.',
+        is_optional=True,
+    ),
+    Topic(
+        MAP_WANTED,
+        Header,
+        qos.KEYFRAMES,
+        SLAM,
+        (CLOUD, GRID),
+        'The header of the latest keyframe of a map that is to be saved.',
+        is_optional=True,
+    ),
+    Topic(
+        MAP_PART,
+        UInt8MultiArray,
+        qos.KEYFRAMES,
+        CLOUD,
+        (SLAM,),
+        'What a node knows of the map at that keyframe, as the bytes of a map file.',
+        is_optional=True,
+        also_by=(GRID,),
     ),
     *_keyframe_images(),
     *_frame_images(),

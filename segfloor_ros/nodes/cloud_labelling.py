@@ -9,8 +9,9 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE
+from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.clouds import (
     features_arrays,
     labelled_message,
@@ -22,9 +23,11 @@ from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.map_part import MapPart
 from segfloor_ros.nodes.robot_check import RobotCheck
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.slam.results import SparseCloud
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
 POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
@@ -47,20 +50,28 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
             FLOOR: self.output('floor_points'),
             OBSTACLE: self.output('obstacle_points'),
         }
-        self._keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
+        keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
+        self._part = MapPart(self, keyframes, 'cloud', lambda: self._stage.to_arrays())
         self.inputs.subscribe('odometry', self._keep_alive, is_wanted=self._obstacles_are_wanted)
         self.inputs.every(KEEP_ALIVE_S, self.inputs.update)
 
     def reset_stage(self) -> None:
         """Begin without points."""
+        self._part.reset()
         self._stage = CloudLabelling(self.parameters.stage)
         self._obstacles: PointCloud2 | None = None
 
-    def restore(self, state: tuple[int | None, CloudLabelling]) -> None:
-        """Resume with the labels of a killed node."""
-        self._keyframes.map_start_ns, self._stage = state
-        self._stage.settings = self.parameters.stage
-        self.get_logger().warning('resumed with the labels of a node that was killed')
+    def restore(self, saved: MapFile) -> None:
+        """Go on with the labels of a map, and publish its obstacles where they are known."""
+        self._stage.from_arrays(saved.parts['cloud'])
+        self._part.resume(saved)
+        points = saved.parts.get('points')
+        if points is not None:
+            cloud = SparseCloud(points['point_id'], points['xyz_map'])
+            labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
+            self._publish_by_label(*at, labelled)
+            # Also for those who listen later: without keyframes it stays as it is.
+            self._obstacles = points_of_label(*at, labelled, OBSTACLE)
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
@@ -80,14 +91,18 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
         self._labelled.publish(labelled_message(stamp_ns, frame_id, labelled))
+        self._publish_by_label(stamp_ns, frame_id, labelled)
+        self._part.note(stamp_ns, frame_id)
+        return {'points': len(labelled.point_id)}
+
+    def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
+        """Publish floor and obstacles, each while someone listens."""
         if self._by_label[FLOOR].get_subscription_count():
             floor = points_of_label(stamp_ns, frame_id, labelled, FLOOR)
             self._by_label[FLOOR].publish(floor)
         if self._obstacles_are_wanted():
             self._obstacles = points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
             self._by_label[OBSTACLE].publish(self._obstacles)
-        self.kept_state.save((self._keyframes.map_start_ns, self._stage))
-        return {'points': len(labelled.point_id)}
 
     def _obstacles_are_wanted(self) -> bool:
         return self._by_label[OBSTACLE].get_subscription_count() > 0

@@ -14,7 +14,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.headers import stamp_of, to_ns
 from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.reporter import Reporter
@@ -64,7 +64,7 @@ class Inputs:
         topic = TOPICS[name]
 
         def take(message: Any, info: Mapping[str, Any]) -> None:
-            stamp_ns, subscription = to_ns(message.header.stamp), self.subscriptions[name]
+            stamp_ns, subscription = stamp_of(message), self.subscriptions[name]
             self._reporter.note_received(topic, stamp_ns, info, subscription)
             try:
                 callback(message)

@@ -14,12 +14,14 @@ from segfloor_ros.errors import SegfloorError
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.clouds import features_arrays, labelled_arrays
 from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.grids import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.map_part import MapPart
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
 
@@ -40,20 +42,20 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         self._map = self.output('map')
         parts = (POINTS, FEATURES, PATH, POSE, SCAN)
         self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
+        self._part = MapPart(self, self._keyframes, 'grid', lambda: self._stage.to_arrays())
         self.offer(Trigger, 'save_map', self._save)
 
     def reset_stage(self) -> None:
         """Begin with an empty map."""
+        self._part.reset()
         self._stage = OccupancyGridMapper(self.parameters.stage)
-        self._stamp_ns = 0
-        self._frame_id = ''
         self._published_s = -float('inf')
 
-    def restore(self, state: tuple[int | None, OccupancyGridMapper, int, str]) -> None:
-        """Resume with the map of a killed node, and publish it at once."""
-        self._keyframes.map_start_ns, self._stage, self._stamp_ns, self._frame_id = state
-        self._stage.change_settings(self.parameters.stage)
-        self.get_logger().warning('resumed with the map of a node that was killed')
+    def restore(self, saved: MapFile) -> None:
+        """Go on with a map, and publish it at once."""
+        arrays = saved.parts['grid']
+        self._stage.from_arrays(arrays, arrays['stamp_ns'])
+        self._part.resume(saved)
         self._publish()
 
     def on_inputs_closed(self) -> None:
@@ -71,9 +73,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         path = path_arrays(parts[PATH])
         scan = scan_arrays(parts[SCAN], SCAN)
         self._stage.update(stamp_ns, points, features, path, scan)
-        self._stamp_ns, self._frame_id = stamp_ns, parts[POSE].header.frame_id
-        map_start_ns = self._keyframes.map_start_ns
-        self.kept_state.save((map_start_ns, self._stage, self._stamp_ns, self._frame_id))
+        self._part.note(stamp_ns, parts[POSE].header.frame_id)
         self._publish_soon()
         return {}
 
@@ -92,11 +92,12 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
             self.destroy_timer(self._later)
             self._later = None
         self._published_s = time.monotonic()
-        self._map.publish(grid_message(self._stamp_ns, self._frame_id, self._stage.grid()))
+        last_ns, frame_id = self._part.last_ns, self._part.frame_id
+        self._map.publish(grid_message(last_ns, frame_id, self._stage.grid()))
 
     def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         name = self.parameters.own.map_file
-        if not self._frame_id or not name:
+        if not self._part.frame_id or not name:
             response.message = (
                 'there is no map yet: no keyframe has arrived'
                 if name

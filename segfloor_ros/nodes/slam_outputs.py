@@ -23,6 +23,7 @@ from segfloor_ros.messages.poses import (
     at_least,
     body_twist,
     odometry_message,
+    pose_with_covariance_message,
     transform_message,
     twist_covariance,
 )
@@ -53,6 +54,7 @@ class SlamOutputs:
     def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
         self._own = own
         self._odometry = node.output('odometry')
+        self._map_pose = node.output('pose')
         self._mount = node.output('camera_mount')
         self._pose = node.output('keyframe/odometry')
         self._images = {s: node.output(f'keyframe/{s}/image_rect') for s in SIDES}
@@ -67,11 +69,13 @@ class SlamOutputs:
         self._map_start = node.output(MAP_START)
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
+        self._is_loaded = False
 
-    def reset(self, map_start_ns: int) -> None:
-        """Publish about a new map from now on; velocities are not known across a reset."""
+    def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
+        """Publish about another map from now on; velocities are not known across a reset."""
         # The time of a recording that is played again may be the same twice.
         self.map_start_ns = map_start_ns + (map_start_ns == self.map_start_ns)
+        self._is_loaded = is_loaded
         self._last: FrameResult | None = None
         self._path_messages = PathMessages(self._own.map_frame)
 
@@ -120,6 +124,11 @@ class SlamOutputs:
             before = at_least(last.covariance, LEAST_VARIANCE)
             of_twist = twist_covariance(before, result.T_odom_base, covariance, duration_s)
         own = self._own
+        if self._map_pose.get_subscription_count():
+            T_map_base = result.T_map_odom @ result.T_odom_base
+            self._map_pose.publish(
+                pose_with_covariance_message(result.stamp_ns, own.map_frame, T_map_base, covariance)
+            )
         self._odometry.publish(
             odometry_message(
                 result.stamp_ns,
@@ -160,7 +169,9 @@ class SlamOutputs:
         features = features_message(stamp_ns, own.map_frame, keyframe.features)
         self._features.publish(features)
         self._path.publish(self._path_messages.next(stamp_ns, keyframe.path))
-        self._map_start.publish(map_start_message(stamp_ns, own.map_frame, self.map_start_ns))
+        self._map_start.publish(
+            map_start_message(stamp_ns, own.map_frame, self.map_start_ns, self._is_loaded)
+        )
         self._map_points.publish(sparse_cloud_message(stamp_ns, own.map_frame, keyframe.cloud))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -15,6 +16,7 @@ from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.errors import SegfloorError
+from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.node_settings import NodeSettings
@@ -76,8 +78,10 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
         """Begin with an empty map, first of all after `set_up`. The topics stay."""
         raise NotImplementedError
 
-    def restore(self, state: Any) -> None:
-        """Resume with the state that a killed node has left in `kept_state`."""
+    def restore(self, saved: MapFile) -> None:
+        """Go on with a map, first of all after `reset_stage`: what a killed node has left in
+        `kept_state`, or what SLAM has loaded.
+        """
 
     def on_inputs_opened(self) -> None:
         """Prepare for messages, at first and after a pause."""
@@ -115,8 +119,10 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
         return made
 
     def offer(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
-        """Offer a service until the node is cleaned up."""
-        made = self.create_service(kind, name, answer)
+        """Offer a service until the node is cleaned up. answer: may be a coroutine; the node works
+        on while it waits.
+        """
+        made = self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
         self.at_clean_up(lambda: self.destroy_service(made))
 
     def at_clean_up(self, step: Callable[[], Any]) -> None:
@@ -209,6 +215,7 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
             kept = self.kept_state.take()
             if kept is not None:
                 self.restore(kept)
+                self.get_logger().warning('resumed with the map of a node that was killed')
         except Exception:
             self._clean_up()
             raise

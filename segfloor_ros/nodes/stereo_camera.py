@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Header
 
 from segfloor_ros.camera.images import Grey
 from segfloor_ros.camera.settings import SENSORS, StereoCameraSettings
@@ -21,7 +20,7 @@ from segfloor_ros.measurements import Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
-from segfloor_ros.messages.headers import to_ns, to_time
+from segfloor_ros.messages.headers import stamp_of, to_time
 from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
@@ -102,8 +101,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         def follow(name: str, note: Callable[[ChainPace, int], None]) -> None:
             def take(message: Any) -> None:
                 if self._chain_pace is not None:
-                    header = message if isinstance(message, Header) else message.header
-                    note(self._chain_pace, to_ns(header.stamp))
+                    note(self._chain_pace, stamp_of(message))
                 if self.inputs.is_open:
                     self._advance()
 

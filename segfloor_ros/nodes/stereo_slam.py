@@ -5,29 +5,35 @@ from __future__ import annotations
 import math
 import time
 
-from segfloor_ros.camera.model import Mount, StereoFrame
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.errors import InputError
+from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.messages.topics import FRAME_DONE
 from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.initial_pose import InitialPose
+from segfloor_ros.nodes.lost_time import LostTime
 from segfloor_ros.nodes.mask_input import MaskInput
 from segfloor_ros.nodes.pair_queue import PairQueue
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.sensor_input import SensorInput
+from segfloor_ros.nodes.slam_maps import SlamMaps
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
-from segfloor_ros.nodes.slam_resumption import SlamResumption
 from segfloor_ros.nodes.stage_node import StageNode
 from segfloor_ros.nodes.stereo_input import Pair, StereoInput
 from segfloor_ros.nodes.transforms import Transforms
 from segfloor_ros.nodes.when_idle import WhenIdle
-from segfloor_ros.slam.continuation import LastState
 from segfloor_ros.slam.results import FrameResult
+from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, saved_camera
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 
 LOOK_AGAIN_S = 0.2
+PATIENCE_S = 5.0
+"""For how long the place where the node was killed is looked for before a new map begins."""
 
 
 class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
@@ -42,6 +48,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         """Make the topics."""
         own = self.parameters.own
         self._slam: StereoSlam | None = None
+        self._ready: tuple[StereoSlam, StereoCamera] | None = None
         self._waiting: PairQueue[tuple[int, Pair]] = PairQueue()
         self._outputs = SlamOutputs(self, own)
         self._frame_done = self.output(FRAME_DONE)
@@ -50,33 +57,46 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._work = WhenIdle(self, self._process_waiting)
         self._camera = StereoInput(self, own, self._take_pair, self._work.request)
         self._sensors = SensorInput(self, self._transforms, self._look_at_waiting)
+        self._maps = SlamMaps(self, self._known, lambda: self.reset('by ~/load_map'))
+        self._initial_pose = InitialPose(self, own)
         self.inputs.every(LOOK_AGAIN_S, self._look_again)
         self.at_clean_up(self._end_stage)
 
     def reset_stage(self) -> None:
-        """Begin with an empty map; the mount of the camera is found again, too."""
+        """Begin with the map of `load_map` or an empty one; the mount of the camera is found again,
+        too.
+        """
+        saved = self._maps.read()
         self._end_stage()
         self._waiting.reset()
-        self._outputs.reset(self.get_clock().now().nanoseconds)
+        self._outputs.reset(self.get_clock().now().nanoseconds, is_loaded=saved is not None)
         self._transforms.reset()
         self._camera.reset()
         self._sensors.reset()
         self._masks.reset()
+        self._initial_pose.reset()
+        self._lost = LostTime(self)
         self._last_stamp_ns: int | None = None
-        self._resumption = SlamResumption(self._keep)
+        self._is_resumed = False
         self._frames = CameraFrames('', '')
         self._mount: Mount | None = None
         self._provisional_ns = 0
         self._frame_count = 0
+        self._unannounced: tuple[MapFile, LoadedMap] | None = None
+        if saved is not None:
+            name, own = self.parameters.own.load_map, self.parameters.own
+            slam, camera = self._ready = self._make_slam(saved_camera(saved, name))
+            loaded = load_slam(slam, camera, saved, name, own.localize)
+            self._unannounced = saved, loaded
 
-    def restore(self, state: tuple[int, LastState]) -> None:
-        """Resume with the map of a killed node once the images come."""
-        self._outputs.map_start_ns, last = state
-        self._resumption = SlamResumption(self._keep, last)
-        count = len(last.keyframe.path.stamp_ns)
-        self.get_logger().warning(
-            f'resumed with the map of a node that was killed: {count} keyframes'
-        )
+    def restore(self, saved: MapFile) -> None:
+        """Go on with the map of a killed node: with its stamps, and where it ended."""
+        self._unannounced = None
+        self._outputs.reset(saved.header['start_ns'])
+        slam, camera = self._ready = self._make_slam(saved_camera(saved, 'kept map'))
+        load_slam(slam, camera, saved, 'kept map', ends_ns=None)
+        self._last_stamp_ns = slam.map.keyframes[-1].stamp_ns
+        self._is_resumed = True
 
     def is_needed_otherwise(self) -> bool:
         """Whether anybody listens to tf."""
@@ -105,6 +125,9 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._work.request()
 
     def _look_again(self) -> None:
+        if self._unannounced is not None:
+            self._maps.announce(*self._unannounced, self._outputs.map_start_ns)
+            self._unannounced = None
         self._camera.find_images()
         self._work.request()
 
@@ -133,7 +156,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             return True
         if self._camera.missing_calibrations:
             return False
-        if self._mount_is_given() or self._resumption.has_mount:
+        if self._mount_is_given() or self._ready is not None:
             return True
         return self._transforms.mount_is_settled(self._camera.frame_ids(pair)[0])
 
@@ -166,7 +189,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._frame_count += 1
             for measurement in self._sensors.take():
                 slam.add(measurement)
-            results = self._resumption.join(slam.process(frame))
+            self._initial_pose.apply(slam)
+            results = slam.process(frame)
         except Exception as error:
             self.reporter.report_fault(stamp_ns, error)
             return
@@ -175,8 +199,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._publish(result, slam, milliseconds / len(results))
             if result.stamp_ns == stamp_ns and result.tracked:
                 self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
-        if self._resumption.is_hopeless(stamp_ns):
+        if self._lost.lost_s(stamp_ns) > PATIENCE_S and self._is_resumed and not self._lost.found:
             self.reset('the place where the last SLAM was killed is not found')
+        elif self._mount is not None and not slam.is_adjusting:
+            self._maps.keep(slam)
         if not results:
             self._publish_provisional(stamp_ns, slam.provisional)
 
@@ -185,28 +211,38 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         camera = self._camera.rectifier.camera
         self._calibration = self._camera.calibration
         self._frames = CameraFrames(*self._camera.frame_ids(pair))
-        mount = None if self._mount_is_given() else self._transforms.mount(self._frames.left)
-        mount = self._resumption.mount_for(camera, stamp_ns) or mount
-        stage, background = self.parameters.stage, self.parameters.own.background
-        self._slam = make_slam(camera, stage, mount, background=background)
-        self._resumption.begin(self._slam)
+        if self._ready is not None and self._ready[1] != camera:
+            if not self._is_resumed:
+                raise InputError(
+                    f'{self.parameters.own.load_map}: was made with another camera or calibration; '
+                    'map anew'
+                )
+            self._ready = None
+        if self._ready is None:
+            mount = None if self._mount_is_given() else self._transforms.mount(self._frames.left)
+            self._ready = self._make_slam(camera, mount)
+        self._slam = self._ready[0]
         self._sensors.begin(self._frames.left, self._camera.rectifier.calibration.left.R)
         return self._slam
 
-    def _end_stage(self) -> None:
-        if self._slam is not None:
-            self._slam.close()
-        self._slam = None
+    def _make_slam(
+        self, camera: StereoCamera, mount: Mount | None = None
+    ) -> tuple[StereoSlam, StereoCamera]:
+        stage, background = self.parameters.stage, self.parameters.own.background
+        return make_slam(camera, stage, mount, background=background), camera
 
-    def _keep(self, state: LastState) -> None:
-        """Keep what a later node needs, should this one be killed."""
-        self.kept_state.save((self._outputs.map_start_ns, state), always=True)
+    def _end_stage(self) -> None:
+        if self._ready is not None:
+            self._ready[0].close()
+        self._slam = self._ready = None
+
+    def _known(self) -> tuple[StereoSlam, StereoCamera, int] | None:
+        """Return what can be saved."""
+        return self._ready and (*self._ready, self._outputs.map_start_ns)
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
-        if self._mount is None and result.keyframe is not None and slam.mount is not None:
+        if self._mount is None and result.tracked and slam.mount is not None:
             self._announce_mount(result.stamp_ns, slam.mount)
-        if self._mount is not None:
-            self._resumption.keep(self._calibration.camera, self._mount, result)
         # What a robot steers by comes first, the images of a keyframe later.
         if result.stamp_ns > self._provisional_ns:
             self._transforms.broadcast(result)
@@ -221,6 +257,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             keyframe=int(result.keyframe is not None),
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,
+            **self._lost.note(result.stamp_ns, result.tracked),
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
         )
 

@@ -17,6 +17,10 @@ PART = 'slam'
 BEFORE_ALL_NS = -1_000_000_000
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
+LOST_IDS = 1_000_000
+"""More than a drive gives to points after its map was kept for the last time: who goes on with that
+map does not give them again."""
+
 
 @dataclass(frozen=True)
 class LoadedMap:
@@ -56,21 +60,46 @@ def load_slam(
     Raises InputError for a map that is damaged or of another camera.
     """
     try:
-        if saved.header['camera'] != asdict(camera):
-            raise InputError(f'{name}: was made with another camera or calibration; map anew')
+        check_camera(saved, camera, name)
         mount, arrays = Mount(**saved.header['mount']), saved.parts[PART]
         stamp_ns = arrays['keyframe_stamp_ns']
         shift_ns = 0 if ends_ns is None else ends_ns - int(stamp_ns[-1])
         T_world_odom = np.array(saved.header['T_world_odom']) if ends_ns is None else None
-        moved = arrays | {'keyframe_stamp_ns': stamp_ns + shift_ns}
+        skipped = LOST_IDS if ends_ns is None else 0
+        moved = arrays | {
+            'keyframe_stamp_ns': stamp_ns + shift_ns,
+            'num_ever': arrays['num_ever'] + skipped,
+        }
         slam.load(moved, mount, localize, T_world_odom)
-        T_map_world = mount.T_base_left
-        T_map_base = T_map_world @ invert(arrays['keyframe_T_camera_world']) @ invert(T_map_world)
-        xyz = transform_points(T_map_world, arrays['point_xyz_world']).astype(np.float32)
-        return LoadedMap(
-            KeyframePath(stamp_ns + shift_ns, T_map_base),
-            SparseCloud(arrays['point_stable_id'], xyz),
-            shift_ns,
-        )
+        return loaded_map(saved, shift_ns)
     except (KeyError, ValueError, IndexError, TypeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
+
+
+def saved_camera(saved: MapFile, name: str) -> StereoCamera:
+    """Return the camera that a map was made with. Raises InputError, by the file's name."""
+    try:
+        return StereoCamera(**saved.header['camera'])
+    except (KeyError, TypeError):
+        raise InputError(f'{name}: does not tell its camera; save it anew') from None
+
+
+def check_camera(saved: MapFile, camera: StereoCamera, name: str) -> None:
+    """Raise InputError, by the file's name, for a map that was made with another camera."""
+    if saved_camera(saved, name) != camera:
+        raise InputError(f'{name}: was made with another camera or calibration; map anew')
+
+
+def loaded_map(saved: MapFile, shift_ns: int) -> LoadedMap:
+    """Return what a saved map holds for the stages behind SLAM."""
+    T_map_world, arrays = Mount(**saved.header['mount']).T_base_left, saved.parts[PART]
+    T_map_base = T_map_world @ invert(arrays['keyframe_T_camera_world']) @ invert(T_map_world)
+    xyz = transform_points(T_map_world, arrays['point_xyz_world']).astype(np.float32)
+    path = KeyframePath(arrays['keyframe_stamp_ns'] + shift_ns, T_map_base)
+    return LoadedMap(path, SparseCloud(arrays['point_stable_id'], xyz), shift_ns)
+
+
+def new_keyframes(path: KeyframePath) -> KeyframePath:
+    """Return the keyframes of the drive itself, without those of the map that was loaded."""
+    new = path.stamp_ns >= 0
+    return KeyframePath(path.stamp_ns[new], path.T_map_base[new])

@@ -117,6 +117,11 @@ class StereoSlam:
         return self._motion.T_world_odom
 
     @property
+    def is_adjusting(self) -> bool:
+        """Whether the map is being adjusted beside tracking."""
+        return not self._adjusting.idle
+
+    @property
     def sensors(self) -> BodyMotion:
         """What wheels and IMU told, and what was found to be wrong with them."""
         return self._body

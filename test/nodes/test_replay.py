@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti
 
@@ -19,6 +20,7 @@ from segfloor_ros.cli.replay_graph import unconnected
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE
+from segfloor_ros.map_file import read_map_file
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
 
 FRAMES, DAMAGED = 20, 7
@@ -97,6 +99,30 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     assert 'keyframes that failed: 0' in out
 
 
+def test_the_replay_saves_loads_and_localizes_as_the_run_does(drive, tmp_path) -> None:
+    maps = {kind: tmp_path / f'{kind}.map' for kind in ('run', 'replay')}
+    for kind, rate in (('run', ()), ('replay', ('--rate', 0))):
+        for name, options in (
+            ('saved', ('--save-map', maps[kind])),
+            ('localized', ('--load-map', maps['run'], '--localize')),
+        ):
+            out = tmp_path / kind / name
+            status, _, errors = segfloor(kind, drive, '--out', out, *options, *rate)
+            assert status == 0, errors
+    for name, files in (('saved', SAME_FILES), ('localized', SAME_FILES)):
+        for file in files:
+            run, replay = ((tmp_path / kind / name / file).read_bytes() for kind in maps)
+            assert run == replay, (name, file)
+    run, replay = (read_map_file(file) for file in maps.values())
+    assert run.header['camera'] == replay.header['camera']
+    for part, arrays in run.parts.items():
+        for name, array in arrays.items():
+            np.testing.assert_allclose(replay.parts[part][name], array, rtol=1e-6, atol=1e-6)
+    summary = json.loads((tmp_path / 'replay' / 'localized' / 'summary.json').read_text())
+    assert summary['keyframes'] == len(run.parts['slam']['keyframe_stamp_ns'])
+    assert summary['tracked_frames'] >= FRAMES - 2
+
+
 def test_a_node_that_dies_ends_the_replay_by_its_name(drive, tmp_path) -> None:
     out = tmp_path / 'out'
     replay = start('replay', drive, '--out', out, '--rate', 0.2)
@@ -155,6 +181,8 @@ def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None
         (['drive', '--set', 'occupancy_grid.resolution=1'], 'did you mean resolution_m'),
         (['drive', '--save-masks', 'all'], '--save-masks all'),
         (['drive', '--rate', '-1'], 'rate = -1'),
+        (['drive', '--localize'], '--load-map FILE'),
+        (['drive', '--load-map', 'missing.map'], 'missing.map: cannot be read'),
     ],
 )
 def test_bad_input_ends_with_one_line_before_anything_is_written(
