@@ -66,9 +66,20 @@ SERVICES = {
         (*PAUSE, PAUSING),
         (
             *RESET,
-            'Drop the map and begin with an empty one. The nodes behind it learn it from '
-            '`keyframe/map_start` and drop theirs. The same happens when the stamps of the images '
-            'go back by more than half a second, as when a recording is played again.',
+            'Drop the map and begin with that of `load_map`, or an empty one. The nodes behind it '
+            'learn it from `keyframe/map_start` and drop theirs. The same happens when the stamps '
+            'of the images go back by more than half a second, as when a recording is played '
+            'again.',
+        ),
+        (
+            '`~/load_map`',
+            '`std_srvs/srv/Trigger`',
+            'Go on with the map of the file `load_map`; one that is no map changes nothing.',
+        ),
+        (
+            '`~/save_map`',
+            '`std_srvs/srv/Trigger`',
+            'Write the whole map, with what the nodes behind know of it, to the file `save_map`.',
         ),
     ],
     FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
@@ -99,7 +110,8 @@ STATUS = {
     '(`frames`, `skipped`).',
     SLAM: 'One status per frame: OK while tracking, WARN while the mount is measured, ERROR while '
     'lost, with the reason. Values: `tracked`, `keyframe`, `matches`, `reference_keyframe_ns` (the '
-    'keyframe a pose is relative to), `processing_ms`, `rss_mb`.',
+    'keyframe a pose is relative to), `lost_s` (for how long), `recovered_after_s` (once), '
+    '`processing_ms`, `rss_mb`.',
     FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',
     CLOUD: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
