@@ -160,8 +160,9 @@ class LockstepRun:
             measurements = MeasurementLog(self._source.sensors)
             for frame in self._source.frames():
                 self._frames += 1
-                for measurement in measurements.until(frame.stamp_ns):
-                    self._pipeline.slam.add(measurement)
+                slam = self._pipeline.slam
+                for measurement in measurements.until(frame.stamp_ns + slam.sensors.lag_ns):
+                    slam.add(measurement)
                 if self._save_masks is SaveMasks.all:
                     self._unmasked.append(frame)
                 for result in self._pipeline.process(frame):

@@ -28,6 +28,14 @@ class ImuSample:
     accel_m_s2: Array
 
 
+@dataclass(frozen=True)
+class Up:
+    """A unit vector (3,) that points up, and the standard deviation of its tilt in radians."""
+
+    direction: Array
+    sigma_rad: float
+
+
 Measurement = WheelPose | ImuSample
 
 

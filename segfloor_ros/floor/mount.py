@@ -19,6 +19,7 @@ from segfloor_ros.floor.mount_view import MountViewer
 from segfloor_ros.floor.plane import PlaneFit, Samples, mean_climb, plausible, shares
 from segfloor_ros.floor.plane_search import PlaneSearch
 from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import Up
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""
@@ -106,13 +107,22 @@ class MountEstimator:
         pitch, roll, height = (float(value) for value in angles_height)
         return Mount(height, pitch, roll, *self._offset)
 
-    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
+    def add(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        T_world_left: Array,
+        up_world: Up | None = None,
+    ) -> None:
         """Use one more rectified grey pair (H, W) uint8.
 
         T_world_left: pose (4, 4) of the camera in a frame whose origin is the first camera's.
+        up_world: where an accelerometer has up in that frame.
         """
         if self._settled is not None:
             return
+        for search in (self._on_surfaces, self._on_feet):
+            search.expect(up_world)
         view = self._viewer.view(left, right, T_world_left)
         samples = view.surfaces.samples
         if len(samples.weight) < 50 or samples.weight.sum() < 1:

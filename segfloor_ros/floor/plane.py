@@ -28,8 +28,7 @@ _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SIGMA_PX = 0.5
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
-_PITCH_SIGMA_RAD = np.radians(20.0)
-_ROLL_SIGMA_RAD = np.radians(6.0)
+_LEVEL, _LEVEL_SIGMA_RAD = np.zeros(2), np.radians([20.0, 6.0])
 _CLIMB = 0.03
 _SWAY_M = 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
@@ -176,13 +175,18 @@ def on_and_below(
     return on, below, visible
 
 
-def preference(angles_height: Array, travel: Array) -> Array:
+def preference(
+    angles_height: Array,
+    travel: Array,
+    expected_rad: Array = _LEVEL,
+    sigma_rad: Array = _LEVEL_SIGMA_RAD,
+) -> Array:
     """Return how far each plane (M, 3) is what one expects, in (0, 1].
 
-    Cameras look roughly ahead, hardly roll, and travel (T, 3), in metres, parallel to the floor.
+    expected_rad, sigma_rad: (2,) of pitch and roll; by default cameras look roughly ahead and
+    hardly roll. They travel (T, 3), in metres, parallel to the floor.
     """
-    squares = (angles_height[:, 0] / _PITCH_SIGMA_RAD) ** 2
-    squares += (angles_height[:, 1] / _ROLL_SIGMA_RAD) ** 2
+    squares = (((angles_height[:, :2] - expected_rad) / sigma_rad) ** 2).sum(axis=1)
     squares += mean_climb(angles_height, travel) ** 2
     return np.exp(-0.5 * squares)
 

@@ -9,6 +9,7 @@ import numpy as np
 from segfloor_ros.floor.plane import (
     PlaneFit,
     Samples,
+    angles_height_of,
     on_and_below,
     plane_of,
     preference,
@@ -18,6 +19,7 @@ from segfloor_ros.floor.plane import (
     with_known,
 )
 from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import Up
 
 _KEPT = 60
 _SCORED_EVERY = 5
@@ -25,6 +27,8 @@ _SCORED = 200
 """A few samples of each frame tell which guess is best; all of them refine it."""
 _LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
 """Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
+_FLOOR_SLOPE = math.radians(1.5)
+"""Floors on which robots start are level, more or less."""
 
 
 class PlaneSearch:
@@ -36,6 +40,11 @@ class PlaneSearch:
         self._known = known
         self._rng = np.random.default_rng(0)
         self._guesses = np.zeros((0, 3))
+        self._up: Up | None = None
+
+    def expect(self, up_world: Up | None) -> None:
+        """Expect a floor that is level as an accelerometer feels it, in the world's axes."""
+        self._up = up_world
 
     def find(
         self, frames: list[Samples], travel: Array, proposals: int, contrary: list[Samples]
@@ -53,7 +62,7 @@ class PlaneSearch:
         total = np.sum([scores(_few(frame), guesses) for frame in frames], axis=0)
         for frame in map(_few, contrary):
             total -= frame.weight @ on_and_below(frame, plane_of(guesses))[1]
-        total = np.maximum(total, 0) * preference(guesses, travel)
+        total = np.maximum(total, 0) * self._preference(guesses, travel)
         order = np.argsort(-total, kind='stable')[:_KEPT]
         self._guesses = guesses[order]
         fit = self.refined(frames, self._guesses[0], travel)
@@ -62,10 +71,23 @@ class PlaneSearch:
 
     def refined(self, frames: list[Samples], start: Array, travel: Array) -> PlaneFit:
         """Return the plane near `start`, (3,), that fits all samples best."""
-        # Frames that show the same err together: the prior counts once per frame, too.
-        sigma = _LEVEL_SIGMA / math.sqrt(len(frames))
-        level = np.zeros(3)
-        return refine(frames, start, self._known, travel, prior_sigma=sigma, prior_mean=level)
+        mean, sigma = self._prior(len(frames))
+        return refine(frames, start, self._known, travel, prior_sigma=sigma, prior_mean=mean)
+
+    def _preference(self, guesses: Array, travel: Array) -> Array:
+        if self._up is None:
+            return preference(guesses, travel)
+        mean, sigma = self._prior(1)
+        return preference(guesses, travel, mean[:2], sigma[:2])
+
+    def _prior(self, count: int) -> tuple[Array, Array]:
+        """Return what pitch, roll and height (3,) are expected, and their standard deviations."""
+        if self._up is None:
+            # Frames that show the same err together: the prior counts once per frame, too.
+            return np.zeros(3), _LEVEL_SIGMA / math.sqrt(count)
+        pitch, roll, _ = angles_height_of(self._up.direction)
+        sigma = math.hypot(self._up.sigma_rad, _FLOOR_SLOPE)
+        return np.array([pitch, roll, 0.0]), np.array([sigma, sigma, np.inf])
 
 
 def _few(samples: Samples) -> Samples:

@@ -66,15 +66,17 @@ class SensorInput:
         self._measured.clear()
         return measured
 
-    def is_behind(self, stamp_ns: int) -> bool:
-        """Whether a sensor is about to tell what it measured up to the time of an image."""
+    def is_behind(self, stamp_ns: int, lag_ns: int = 0) -> bool:
+        """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
+        how much later its stamps are.
+        """
         now_s = time.monotonic()
         if self._asked[0] != stamp_ns:
             self._asked = stamp_ns, now_s
         if now_s > self._asked[1] + MAX_LATE_S:
             return False
         return any(
-            latest_ns < stamp_ns and now_s < heard_s + LIVE_S
+            latest_ns < stamp_ns + lag_ns and now_s < heard_s + LIVE_S
             for latest_ns, heard_s in self._latest.values()
         )
 

@@ -142,7 +142,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         for stamp_ns, _ in self._waiting.skip_overdue(is_ready, least):
             self._camera.watch.report_skipped(stamp_ns, is_ready)
             self._frame_done.publish(make_header(stamp_ns, self._frames.left))
-        if not is_ready or self._sensors.is_behind(self._waiting.first[0]):
+        lag_ns = self._slam.sensors.lag_ns if self._slam is not None else 0
+        if not is_ready or self._sensors.is_behind(self._waiting.first[0], lag_ns):
             return
         stamp_ns, pair = self._waiting.take()
         self._work.request()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, adjoint, invert, make_transform
 from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
+from segfloor_ros.slam.gravity import Gravity
 from segfloor_ros.slam.gyroscope import Gyroscope
 from segfloor_ros.slam.wheel_odometry import (
+    Stretch,
     WheelCalibrator,
     WheelOdometry,
     Window,
@@ -76,7 +79,7 @@ class BodyMotion:
 
     T_base_left: (4, 4), the mount; without it wheels cannot be used. messages: used, by sensor.
     slips: stretches in which the wheels did not agree with the images. remarks: what seems wrong
-    with the wheels, in words.
+    with wheels and IMU, in words.
     """
 
     def __init__(self) -> None:
@@ -85,6 +88,7 @@ class BodyMotion:
         self.slips = 0
         self.remarks: dict[str, str] = {}
         self.gyroscope = Gyroscope()
+        self.gravity = Gravity(self.gyroscope)
         self._wheels = WheelOdometry()
         self._calibrator = WheelCalibrator()
         self._window: tuple[int, Array] | None = None
@@ -104,27 +108,30 @@ class BodyMotion:
         deviation of its angles in radians.
         """
         turn = self.gyroscope.turn(before_ns, now_ns)
-        if turn is None:
-            return None
-        return turn.T, self.gyroscope.sigma_rad(turn, (now_ns - before_ns) * 1e-9)
+        return None if turn is None else (turn[0].T, turn[1])
+
+    @property
+    def lag_ns(self) -> int:
+        """How much later than that of an image the stamps of what is measured at its time are."""
+        return max(0, round(1e9 * max(self.gyroscope.lag_s, self._calibrator.current.lag_s)))
 
     def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
         """Return the motion of the camera between two times; None where wheels tell nothing."""
-        told = self._wheels.motion(before_ns, now_ns)
+        lag_ns = round(self._calibrator.current.lag_s * 1e9)
+        told = self._wheels.stretch(before_ns + lag_ns, now_ns + lag_ns)
         if told is None or self.T_base_left is None:
             return None
         R_base_left = self.T_base_left[:3, :3]
         seconds = (now_ns - before_ns) * 1e-9
         turn = self.gyroscope.turn(before_ns, now_ns)
-        sigma_turn = None if turn is None else self.gyroscope.sigma_rad(turn, seconds)
-        R = None if turn is None else R_base_left @ turn @ R_base_left.T
+        R = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
         way_m, turn_rad = self._calibrator.current.base_motion(
-            told, None if R is None else float(np.arctan2(R[1, 0], R[0, 0]))
+            told.T_before_now, None if R is None else yaw_of(R)
         )
         if R is None:
             R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
         T_before_now = make_transform(R, np.append(way_m, 0.0))
-        variance = self._variance(told, seconds, sigma_turn)
+        variance = self._variance(told, None if turn is None else turn[1])
         if self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS:
             variance[:2] += (SLIP_M_S * seconds) ** 2
         A = adjoint(invert(self.T_base_left))
@@ -133,20 +140,24 @@ class BodyMotion:
             A @ np.diag(variance) @ A.T,
         )
 
-    def _variance(self, told: Array, seconds: float, sigma_turn: float | None) -> Array:
+    def _variance(self, told: Stretch, sigma_turn: float | None) -> Array:
         """Return the variances (6,) of a motion in the base's axes."""
-        length_m = float(np.linalg.norm(told[:3, 3]))
-        scale_sigma = self._calibrator.current.sigma[0]
-        on_floor = (SIGMA_ROOT_M**2 + scale_sigma**2) * length_m
+        calibration = self._calibrator.current
+        length_m = float(np.linalg.norm(told.T_before_now[:3, 3]))
+        on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
         up = SIGMA_ROOT_UP_M**2 * length_m
         tilt = SIGMA_ROOT_TILT_RAD**2 * length_m
-        yaw = SIGMA_ROOT_TURN_RAD**2 * length_m + (SIGMA_TURN_SHARE * yaw_of(told)) ** 2
+        yaw = SIGMA_ROOT_TURN_RAD**2 * length_m
+        yaw += (SIGMA_TURN_SHARE * yaw_of(told.T_before_now)) ** 2
+        yaw += (calibration.lag_sigma_s * told.turning_up_rad_s) ** 2
+        on_floor += float(calibration.lag_sigma_s * np.linalg.norm(told.speeding_up_m_s)) ** 2
         if sigma_turn is not None:
             tilt = yaw = sigma_turn**2
         return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
 
-    def learn(self, stamp_ns: int, T_odom_camera: Array) -> None:
+    def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
         """Learn from the pose of a frame that the images tell well."""
+        self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
         if self._window is None:
             self._window = stamp_ns, T_odom_camera
             return
@@ -161,25 +172,30 @@ class BodyMotion:
             return
         self._window = stamp_ns, T_odom_camera
         self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
+        self._remark(self.gyroscope.remarks())
         self._learn_wheels(T_before_now, before_ns, stamp_ns)
 
     def stop_learning(self) -> None:
         """Note that there is a frame without a pose from the images."""
         self._window = None
+        self.gravity.stop()
 
     def _learn_wheels(self, T_before_now: Array, before_ns: int, now_ns: int) -> None:
-        told = self._wheels.motion(before_ns, now_ns)
+        told = self._wheels.stretch(before_ns, now_ns)
         if told is None or self.T_base_left is None:
             return
         seen = self.T_base_left @ T_before_now @ invert(self.T_base_left)
-        window = Window(seen[:2, 3], yaw_of(seen), told[:2, 3], yaw_of(told))
+        window = Window(seen[:2, 3], yaw_of(seen), told)
         if not self._calibrator.add(window):
             self.slips += 1
             self._slipped_ns = now_ns
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
-        if len(self._calibrator) < WINDOWS_TO_JUDGE:
-            return
-        for what, remark in self._calibrator.current.remarks().items():
+        if len(self._calibrator) >= WINDOWS_TO_JUDGE:
+            self._remark(self._calibrator.current.remarks())
+
+    def _remark(self, remarks: Mapping[str, str]) -> None:
+        """Say each thing that is wrong once."""
+        for what, remark in remarks.items():
             if what not in self.remarks:
                 logger.warning('%s', remark)
             self.remarks[what] = remark

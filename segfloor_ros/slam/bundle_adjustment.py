@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, se3_exp, transform_points
 from segfloor_ros.slam.disparity_offset import NO_OFFSET, OffsetEstimate
-from segfloor_ros.slam.motion_links import Link, with_links
+from segfloor_ros.slam.motion_links import Factor, cost, with_factors
 from segfloor_ros.slam.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.residuals import (
     MIN_DEPTH_M,
@@ -34,8 +34,8 @@ class BundleProblem:
 
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
-    most once. offset: what was known before of the error that all disparities share. links: motions
-    between keyframes that wheels measured.
+    most once. offset: what was known before of the error that all disparities share. factors: what
+    wheels and an accelerometer measured of keyframes.
     """
 
     T_camera_world: Array
@@ -45,7 +45,7 @@ class BundleProblem:
     point: NDArray[np.intp]
     observations: Observations
     offset: OffsetEstimate = NO_OFFSET
-    links: tuple[Link, ...] = ()
+    factors: tuple[Factor, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -130,10 +130,10 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimat
     residual = residuals(camera, points, problem.observations)
     residual[:, 2] += problem.offset.value_px * problem.observations.has_disparity
     chi2 = squared_norms(residual, problem.observations.information)
-    cost = huber_cost(chi2, problem.observations.chi2_limit)
-    cost += prior.information * (problem.offset.value_px - prior.value_px) ** 2
-    cost += sum(link.cost(problem.T_camera_world) for link in problem.links)
-    return _State(points, residual, chi2, front, cost)
+    total = huber_cost(chi2, problem.observations.chi2_limit)
+    total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
+    total += sum(cost(factor, problem.T_camera_world) for factor in problem.factors)
+    return _State(points, residual, chi2, front, total)
 
 
 def _linearise(
@@ -154,7 +154,7 @@ def _linearise(
     system = normal_equations(camera, at).with_prior(
         prior.information, problem.offset.value_px - prior.value_px
     )
-    return with_links(system, problem.T_camera_world, problem.links)
+    return with_factors(system, problem.T_camera_world, problem.factors)
 
 
 def _apply(problem: BundleProblem, step: Step) -> BundleProblem:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, rotation_angle
 from segfloor_ros.measurements import ImuSample
+from segfloor_ros.slam.stamp_lag import is_late, lag_in_words
 
 HISTORY = 8000
 MAX_GAP_NS = 100_000_000
@@ -26,18 +28,65 @@ FIRST_BIAS_SIGMA = 0.02
 BIAS_DRIFT = 1e-4
 """Bias of a cheap gyroscope, rad/s, and its drift, rad/s per root second."""
 
+FIRST_LAG_SIGMA_S, LAG_DRIFT, MAX_LAG_S = 0.02, 1e-5, 0.1
+"""By how much the stamps of an IMU are late: clocks of drivers differ by hundredths of a second."""
+
 SIGMA_SEEN_RAD = 2e-3
 """Error of a turn as the images tell it."""
 
 OUTLIER_SIGMAS = 4.0
 
 
+@dataclass(frozen=True)
+class Felt:
+    """What an IMU felt between two times, in the axes of the first: R_before_now (3, 3), and the
+    acceleration, gravity's included, integrated once (3,) in m/s and twice (3,) in m.
+    """
+
+    turn: Array
+    speed: Array
+    way: Array
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Seconds (N,), R_before_now (N, 3, 3) and acceleration (N, 3) in the axes of that moment.
+    speeding_up: (3,) by how much the rate of the turn grew, in rad/s, in the axes of the end.
+    """
+
+    seconds: Array
+    turns: Array
+    accel_m_s2: Array
+    speeding_up: Array
+
+    @property
+    def angle_rad(self) -> float:
+        """The angle of the whole turn."""
+        return rotation_angle(self.turns[-1])
+
+    def sigma_rad(self, sigma: Array) -> float:
+        """Return the standard deviation of the whole turn, about any axis; sigma: (4,) of bias and
+        lag.
+        """
+        seconds = float(self.seconds[-1])
+        parts = (
+            SIGMA_ROOT_S * np.sqrt(seconds),
+            sigma[:3].max() * seconds,
+            sigma[3] * np.linalg.norm(self.speeding_up),
+            SIGMA_SHARE * self.angle_rad,
+        )
+        return float(np.linalg.norm(parts))
+
+
 class Gyroscope:
-    """The latest samples of an IMU, and the bias of its gyroscope."""
+    """The latest samples of an IMU, the bias of its gyroscope (3,), and by how much its stamps are
+    later than those of the images.
+    """
 
     def __init__(self) -> None:
         self.bias_rad_s: Array = np.zeros(3)
-        self.bias_sigma = FIRST_BIAS_SIGMA
+        self.lag_s = 0.0
+        self._covariance: Array = np.diag([FIRST_BIAS_SIGMA**2] * 3 + [FIRST_LAG_SIGMA_S**2])
         self._samples: list[ImuSample] = []
 
     def add(self, sample: ImuSample) -> None:
@@ -48,10 +97,31 @@ class Gyroscope:
         if len(self._samples) > 2 * HISTORY:
             del self._samples[:-HISTORY]
 
-    def turn(self, before_ns: int, now_ns: int) -> Array | None:
-        """Return R_before_now (3, 3) of the left optical frame, freed of the bias; None where
-        samples are missing. The rate between two samples is their mean.
+    def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
+        """Return R_before_now (3, 3) of the left optical frame, freed of the bias, and the standard
+        deviation of its angles in radians; None where samples are missing.
         """
+        path = self._path(before_ns, now_ns)
+        return None if path is None else (path.turns[-1], path.sigma_rad(self._sigma))
+
+    def felt(self, before_ns: int, now_ns: int) -> Felt | None:
+        """Return what was felt between two times; None where samples are missing."""
+        path = self._path(before_ns, now_ns)
+        if path is None:
+            return None
+        accel = np.einsum('nij,nj->ni', path.turns, path.accel_m_s2)
+        step_s = np.diff(path.seconds)[:, None]
+        speed = np.cumsum((accel[1:] + accel[:-1]) / 2 * step_s, axis=0)
+        before = np.vstack([np.zeros(3), speed[:-1]])
+        way = ((before + speed) / 2 * step_s).sum(axis=0)
+        return Felt(path.turns[-1], speed[-1], way)
+
+    def _path(self, before_ns: int, now_ns: int) -> _Path | None:
+        """Return turn and acceleration at two times and at all samples between. The rate between
+        two samples is their mean.
+        """
+        lag_ns = round(self.lag_s * 1e9)
+        before_ns, now_ns = before_ns + lag_ns, now_ns + lag_ns
         first = bisect_right(self._samples, before_ns, key=_stamp) - 1
         last = bisect_left(self._samples, now_ns, key=_stamp)
         samples = self._samples[max(first, 0) : last + 1]
@@ -61,39 +131,49 @@ class Gyroscope:
         late_ns = now_ns - times_ns[-1]
         if late_ns > MAX_AHEAD_NS or np.diff(times_ns).max(initial=0) > MAX_GAP_NS:
             return None
-        rates = np.stack([sample.gyro_rad_s for sample in samples]) - self.bias_rad_s
+        measured = np.stack([[*sample.gyro_rad_s, *sample.accel_m_s2] for sample in samples])
         inner = times_ns[(times_ns > before_ns) & (times_ns < now_ns)]
         nodes = (np.concatenate([[before_ns], inner, [now_ns]]) - before_ns) * 1e-9
         seconds = (times_ns - before_ns) * 1e-9
-        at_nodes = np.stack([np.interp(nodes, seconds, axis) for axis in rates.T], axis=1)
-        steps = (at_nodes[1:] + at_nodes[:-1]) / 2 * np.diff(nodes)[:, None]
-        turn: Array = np.eye(3)
+        at_nodes = np.stack([np.interp(nodes, seconds, axis) for axis in measured.T], axis=1)
+        rates = at_nodes[:, :3] - self.bias_rad_s
+        steps = (rates[1:] + rates[:-1]) / 2 * np.diff(nodes)[:, None]
+        turns = [np.eye(3)]
         for R in Rotation.from_rotvec(steps).as_matrix():
-            turn = turn @ R
-        return turn
-
-    def sigma_rad(self, turn: Array, seconds: float) -> float:
-        """Return the standard deviation, about any axis, of a turn (3, 3) in so many seconds."""
-        angle = float(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
-        parts = (SIGMA_ROOT_S * np.sqrt(seconds), self.bias_sigma * seconds, SIGMA_SHARE * angle)
-        return float(np.linalg.norm(parts))
+            turns.append(turns[-1] @ R)
+        speeding_up = rates[-1] - turns[-1].T @ rates[0]
+        return _Path(nodes, np.stack(turns), at_nodes[:, 3:], speeding_up)
 
     def learn(self, seen: Array, before_ns: int, now_ns: int) -> None:
-        """Learn the bias from R_before_now (3, 3) as the images tell it (a Kalman filter)."""
-        told, seconds = self.turn(before_ns, now_ns), (now_ns - before_ns) * 1e-9
-        if told is None or seconds <= 0:
+        """Learn bias and lag from R_before_now (3, 3) as the images tell it (a Kalman filter)."""
+        path = self._path(before_ns, now_ns)
+        if path is None or now_ns <= before_ns:
             return
-        excess = Rotation.from_matrix(seen.T @ told).as_rotvec() / seconds
-        angle = float(np.linalg.norm(Rotation.from_matrix(told).as_rotvec()))
-        noise = SIGMA_SEEN_RAD + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * angle
-        variance = (noise / seconds) ** 2
-        before = self.bias_sigma**2 + BIAS_DRIFT**2 * seconds
-        self.bias_sigma = float(np.sqrt(before))
-        if np.abs(excess).max() > OUTLIER_SIGMAS * np.sqrt(before + variance):
+        seconds = float(path.seconds[-1])
+        excess = Rotation.from_matrix(seen.T @ path.turns[-1]).as_rotvec()
+        noise = SIGMA_SEEN_RAD + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
+        # What is told is late by what is left of the lag: by its rate of the turn at either end.
+        H = np.column_stack([seconds * np.eye(3), -path.speeding_up])
+        self._covariance += np.diag([BIAS_DRIFT**2] * 3 + [LAG_DRIFT**2]) * seconds
+        S = H @ self._covariance @ H.T + noise**2 * np.eye(3)
+        if (np.abs(excess) > OUTLIER_SIGMAS * np.sqrt(np.diag(S))).any():
             return
-        gain = before / (before + variance)
-        self.bias_rad_s = self.bias_rad_s + gain * excess
-        self.bias_sigma = float(np.sqrt((1 - gain) * before))
+        gain = self._covariance @ H.T @ np.linalg.inv(S)
+        change = gain @ excess
+        self.bias_rad_s = self.bias_rad_s + change[:3]
+        self.lag_s = float(np.clip(self.lag_s + change[3], -MAX_LAG_S, MAX_LAG_S))
+        self._covariance = self._covariance - gain @ S @ gain.T
+
+    def remarks(self) -> dict[str, str]:
+        """Return in words what is wrong enough, and known well enough, to be said."""
+        if not is_late(self.lag_s, float(self._sigma[3])):
+            return {}
+        return {'imu lag': lag_in_words('IMU', self.lag_s)}
+
+    @property
+    def _sigma(self) -> Array:
+        """The standard deviations (4,) of bias and lag."""
+        return np.sqrt(np.diag(self._covariance))
 
 
 def _stamp(sample: ImuSample) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.measurements import Up
 from segfloor_ros.slam.body_motion import RelativeMotion
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.residuals import Observations
@@ -37,8 +38,8 @@ class KeyframeRecord:
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
-    motion: since the keyframe before, as the wheels tell it. links: indices of earlier keyframes
-    that it shared many points with when it was made.
+    motion: since the keyframe before, as the wheels tell it. up: in the camera, as it was felt.
+    links: indices of earlier keyframes that it shared many points with when it was made.
     """
 
     index: int
@@ -49,6 +50,7 @@ class KeyframeRecord:
     observations: Observations
     point_id: NDArray[np.int32]
     motion: RelativeMotion | None = None
+    up: Up | None = None
     retired: Retirement | None = None
     links: tuple[int, ...] = ()
 

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.measurements import Up
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.coarse_disparity import guess_disparity
 from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
-from segfloor_ros.slam.motion_links import Link
+from segfloor_ros.slam.motion_links import factors_of
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
 from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
@@ -159,9 +160,11 @@ class LocalMapper:
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
-    def plan_adjustment(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> Adjustment | None:
+    def plan_adjustment(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord, up_world: Up | None = None
+    ) -> Adjustment | None:
         """Copy the neighbourhood of a keyframe, not the first one, out of the map; None where no
-        two keyframes share a point.
+        two keyframes share a point. up_world: where up is, if that is known.
         """
         free, fixed = self._choose_keyframes(sparse_map, keyframe)
         ids = sparse_map.points_of(free)
@@ -188,7 +191,7 @@ class LocalMapper:
             np.searchsorted(ids, edge_point),
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
-            _links(sparse_map, slot),
+            factors_of(sparse_map.keyframes, slot, up_world),
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 
@@ -266,17 +269,6 @@ def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]
         if keyframe.retired is None:
             linked.append(keyframe.index)
     return np.array(linked[::-1], np.intp)
-
-
-def _links(sparse_map: SparseMap, slot: NDArray[np.intp]) -> tuple[Link, ...]:
-    """Return the motions that wheels measured between keyframes of a problem; slot: (K,) their
-    place in it, -1 for others.
-    """
-    return tuple(
-        Link(int(slot[k - 1]), int(slot[k]), motion)
-        for k in np.flatnonzero(slot[1:] >= 0) + 1
-        if (motion := sparse_map.keyframes[k].motion) is not None and slot[k - 1] >= 0
-    )
 
 
 def _gather(

@@ -121,7 +121,7 @@ class CameraMotion:
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = self._seen_ns = stamp_ns
         self.is_lost, self.carried_by = False, ''
-        self._body.learn(stamp_ns, self.T_odom_camera)
+        self._body.learn(stamp_ns, self.T_odom_camera, self.T_world_odom[:3, :3])
 
     def bridge(self, stamp_ns: int) -> bool:
         """Go on without the images to where the sensors have the camera. Returns whether they tell

@@ -9,14 +9,21 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import Up
 
 
 class MountMeter(Protocol):
     """Measures the camera's mount from the floor it sees."""
 
-    def add(self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array) -> None:
+    def add(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        T_world_left: Array,
+        up_world: Up | None,
+    ) -> None:
         """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
-        frame.
+        frame, and where an accelerometer has up in that frame.
         """
 
     @property

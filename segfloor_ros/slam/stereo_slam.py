@@ -334,6 +334,7 @@ class StereoSlam:
             observed.observations,
             self.map.living(observed.point_id),
             self._motion.start_keyframe(),
+            self._body.gravity.up_camera(self._motion.T_odom_camera),
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self._mapper.insert(self.map, keyframe, patches)
@@ -384,7 +385,7 @@ class StereoSlam:
         """Adjust the neighbourhood of a new keyframe."""
         if keyframe.index == 0:
             return
-        adjustment = self._mapper.plan_adjustment(self.map, keyframe)
+        adjustment = self._mapper.plan_adjustment(self.map, keyframe, self._body.gravity.up_world)
         if adjustment is None:
             return
         self._adjusting.submit(
@@ -425,7 +426,8 @@ class StereoSlam:
 
     def _measure_mount(self, frame: StereoFrame, keyframe: KeyframeRecord) -> None:
         if self.mount is None and self._mount_meter is not None:
-            self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera)
+            up = self._body.gravity.up_world
+            self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera, up)
             self.mount = self._mount_meter.mount
 
     def _take_adjustment(self, wait: bool) -> None:

@@ -12,6 +12,7 @@ from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.slam.body_motion import BodyMotion, RelativeMotion
 from segfloor_ros.slam.gyroscope import Gyroscope
 from segfloor_ros.slam.wheel_odometry import (
+    Stretch,
     WheelCalibration,
     WheelCalibrator,
     WheelOdometry,
@@ -49,7 +50,7 @@ def gyroscope(rate, bias=(0.0, 0.0, 0.0), until=1000):
 
 def test_rates_integrate_to_the_turn_between_two_samples():
     # A rate that grows by 2 rad/s each second about x: from 0.2 to 0.7 s it turns by 0.7² - 0.2².
-    turn = gyroscope(lambda t: (2 * t, 0, 0)).turn(202 * MS, 698 * MS)
+    turn, _ = gyroscope(lambda t: (2 * t, 0, 0)).turn(202 * MS, 698 * MS)
     angle = Rotation.from_matrix(turn).as_rotvec()
     np.testing.assert_allclose(angle, [0.698**2 - 0.202**2, 0, 0], atol=1e-9)
 
@@ -58,7 +59,7 @@ def test_turns_about_changing_axes_are_put_one_after_the_other():
     # Half a second about x, then half a second about the camera's own y.
     gyro = gyroscope(lambda t: (1, 0, 0) if t < 0.5 else (0, 1, 0))
     expected = Rotation.from_rotvec([0.5, 0, 0]) * Rotation.from_rotvec([0, 0.5, 0])
-    np.testing.assert_allclose(gyro.turn(0, 1000 * MS), expected.as_matrix(), atol=5e-3)
+    np.testing.assert_allclose(gyro.turn(0, 1000 * MS)[0], expected.as_matrix(), atol=5e-3)
 
 
 def test_a_gap_in_the_samples_is_no_turn():
@@ -79,8 +80,13 @@ def test_the_bias_is_learnt_from_the_images_and_one_wrong_turn_is_not():
     gyro.learn(np.eye(3), 0, 1000 * MS)
     np.testing.assert_allclose(gyro.bias_rad_s, bias, atol=1e-3)
     np.testing.assert_allclose(
-        Rotation.from_matrix(gyro.turn(0, 1000 * MS)).as_rotvec(), [0, 0.3, 0], atol=2e-3
+        Rotation.from_matrix(gyro.turn(0, 1000 * MS)[0]).as_rotvec(), [0, 0.3, 0], atol=2e-3
     )
+
+
+def window(way, turn, told_way, told_turn, speeding_up=(0.0, 0.0), turning_up=0.0):
+    told = Stretch(base_pose(*told_way, told_turn), np.array(speeding_up), turning_up)
+    return Window(np.array(way), turn, told)
 
 
 def driven(calibration, motions):
@@ -90,7 +96,7 @@ def driven(calibration, motions):
     for way, turn in motions:
         seen = base_pose(*way, turn)
         told = T_wheels_base @ seen @ invert(T_wheels_base)
-        yield Window(np.array(way), turn, scale * told[:2, 3], turn_scale * turn)
+        yield window(way, turn, scale * told[:2, 3], turn_scale * turn)
 
 
 def some_motions(count):
@@ -101,8 +107,8 @@ def some_motions(count):
 
 def test_scale_yaw_and_offset_of_the_wheels_are_found():
     calibrator = WheelCalibrator()
-    for window in driven((1.05, 0.04, (0.15, -0.05), 0.96), some_motions(120)):
-        calibrator.add(window)
+    for one in driven((1.05, 0.04, (0.15, -0.05), 0.96), some_motions(120)):
+        calibrator.add(one)
     found = calibrator.current
     assert found.scale == pytest.approx(1.05, abs=2e-3)
     assert found.yaw_rad == pytest.approx(0.04, abs=2e-3)
@@ -111,10 +117,42 @@ def test_scale_yaw_and_offset_of_the_wheels_are_found():
     assert set(found.remarks()) == {'scale', 'turn_scale', 'yaw', 'offset'}
 
 
+def test_stamps_of_an_imu_that_are_late_are_found_out():
+    def rate(t):
+        return (0.0, 0.8 * np.sin(2 * t), 0.0)
+
+    lag_s, gyro = 0.03, Gyroscope()
+    for t in range(0, 20000, 5):
+        gyro.add(ImuSample(t * MS, np.array(rate(t / 1000 - lag_s)), np.zeros(3)))
+    for k in range(3, 190):
+        angle = 0.4 * (np.cos(0.2 * k) - np.cos(0.2 * (k + 1)))
+        seen = Rotation.from_rotvec([0, angle, 0]).as_matrix()
+        gyro.learn(seen, k * 100 * MS, (k + 1) * 100 * MS)
+    assert gyro.lag_s == pytest.approx(lag_s, abs=2e-3)
+    assert '30 ms later' in gyro.remarks()['imu lag']
+
+
+def test_stamps_of_wheels_that_are_late_are_found_out():
+    def base(t):
+        """A drive that speeds up, brakes and turns."""
+        yaw = 0.5 * np.sin(1.3 * t)
+        return base_pose(0.4 * t + 0.15 * np.sin(1.7 * t), 0.1 * np.cos(0.9 * t), yaw)
+
+    lag_s, wheels, calibrator = 0.04, WheelOdometry(), WheelCalibrator()
+    for t in range(0, 30000, 20):
+        wheels.add(WheelPose(t * MS, base(t / 1000 - lag_s)))
+    for k in range(2, 145):
+        seen = invert(base(0.2 * k)) @ base(0.2 * (k + 1))
+        told = wheels.stretch(k * 200 * MS, (k + 1) * 200 * MS)
+        calibrator.add(Window(seen[:2, 3], np.arctan2(seen[1, 0], seen[0, 0]), told))
+    assert calibrator.current.lag_s == pytest.approx(lag_s, abs=4e-3)
+    assert list(calibrator.current.remarks()) == ['lag']
+
+
 def test_what_was_found_turns_what_wheels_tell_into_the_motion_of_the_base():
     found = WheelCalibration(1.05, 0.04, (0.15, -0.05), 0.96)
-    (window,) = driven((1.05, 0.04, (0.15, -0.05), 0.96), [((0.2, 0.03), 0.3)])
-    told = base_pose(*window.told_m, window.told_rad)
+    (one,) = driven((1.05, 0.04, (0.15, -0.05), 0.96), [((0.2, 0.03), 0.3)])
+    told = base_pose(*one.told_m, one.told_rad)
     way_m, turn_rad = found.base_motion(told, None)
     assert turn_rad == pytest.approx(0.3)
     # The chord is that of the arc as told, turned by what the turn was wrong.
@@ -124,7 +162,7 @@ def test_what_was_found_turns_what_wheels_tell_into_the_motion_of_the_base():
 def test_wheels_that_are_right_are_not_remarked_upon_and_slip_is_noticed():
     calibrator = WheelCalibrator()
     windows = [*driven((1.0, 0.0, (0.0, 0.0), 1.0), some_motions(60))]
-    slipping = Window(windows[0].seen_m, windows[0].seen_rad, np.array([0.4, 0.0]), 0.0)
+    slipping = window(windows[0].seen_m, windows[0].seen_rad, (0.4, 0.0), 0.0)
     agreed = [calibrator.add(w) for w in [*windows[:40], slipping, slipping, *windows[40:]]]
     assert agreed == [True] * 40 + [False] * 2 + [True] * 20
     assert calibrator.current.remarks() == {}
