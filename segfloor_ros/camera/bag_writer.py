@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
@@ -14,15 +14,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.bag_messages import IMU, ODOMETRY, BagMessages
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.sources.bag_file import MISSING_LIBRARY
 from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.measurements import ImuSample, Measurement, MeasurementLog, WheelPose
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
 JPEG_QUALITY = 90
+WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
+WHEELS_FRAME = 'wheel_odom'
+END_NS = 2**62
 
 
 class ImageCoding(str, Enum):
@@ -38,20 +44,47 @@ def convert(
     out: Path,
     coding: ImageCoding = ImageCoding.raw,
     on_progress: Callable[[int], None] = lambda done: None,
+    depth: StereoSource | None = None,
 ) -> int:
     """Write every pair of a source to a new bag and return how many there were.
 
     The grey pairs are written as the camera saw them, with the calibration to rectify them, to
-    `/left/image_raw` and `/right/image_raw`, or `image_rect` where they are rectified already.
-    on_progress is told the number of pairs done. Raises InputError.
+    `/left/image_raw` and `/right/image_raw`, or `image_rect` where they are rectified already; what
+    wheels and IMU measured, to `/wheel_odometry` and `/imu`. Depth images go to `/depth/image_raw`
+    (32FC1, m): those of the source, or of `depth`, the same recording opened with them. on_progress
+    is told the number of pairs done. Raises InputError.
     """
-    done = 0
+    done, log = 0, MeasurementLog(source.sensors)
+    depths = _by_stamp(depth)
     with BagWriter(out, source.calibration, coding) as bag:
         for pair in source.raw_pairs():
+            for measurement in log.until(pair.stamp_ns):
+                bag.write_measurement(measurement)
             bag.write(pair)
+            other = depths(pair.stamp_ns)
+            if other is not None and depth is not None:
+                bag.write_depth(other, depth.camera.disparity_times_depth)
             done += 1
             on_progress(done)
+        for measurement in log.until(END_NS):
+            bag.write_measurement(measurement)
     return done
+
+
+def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
+    """Return a function that returns the pair of a source at a stamp, each later than the last."""
+    pairs = iter(()) if source is None else source.raw_pairs()
+    waiting: list[RawPair] = []
+
+    def take(stamp_ns: int) -> RawPair | None:
+        while not waiting or waiting[-1].stamp_ns < stamp_ns:
+            pair = next(pairs, None)
+            if pair is None:
+                return None
+            waiting[:] = [pair]
+        return waiting[-1] if waiting[-1].stamp_ns == stamp_ns else None
+
+    return take
 
 
 class BagWriter:
@@ -79,6 +112,7 @@ class BagWriter:
         self._writer: Any = None
         self._typestore: Any = None
         self._connections: dict[str, Any] = {}
+        self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
 
     def __enter__(self) -> BagWriter:
         if self._out.exists():
@@ -102,7 +136,7 @@ class BagWriter:
                 rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
             )
         self._writer.open()
-        self._add_image_topics()
+        self.messages = BagMessages(self._typestore.types)
         return self
 
     def __exit__(
@@ -123,51 +157,54 @@ class BagWriter:
         finally:
             shutil.rmtree(self._staging, ignore_errors=True)
 
-    @property
-    def types(self) -> Mapping[str, Any]:
-        """The classes of Jazzy's messages by name, e.g. `nav_msgs/msg/Odometry`."""
-        types: Mapping[str, Any] = self._typestore.types
-        return types
-
-    def add_topic(self, name: str, message_type: str) -> None:
-        """Add a topic to which `write_message` can write."""
-        self._connections[name] = self._writer.add_connection(
-            name, message_type, typestore=self._typestore
-        )
-
     def write(self, pair: RawPair) -> None:
-        """Append one pair, recorded at its own stamp."""
-        eyes = (self._calibration.left, self._calibration.right)
-        for side, frame_id, eye, image in zip(
-            SIDES, FRAME_IDS, eyes, (pair.left, pair.right), strict=True
-        ):
-            header = self.header(pair.stamp_ns, frame_id)
-            self.write_message(
-                f'/{side}/camera_info', pair.stamp_ns, self._info_message(header, eye)
-            )
-            self.write_message(
-                self._image_topic(side),
-                pair.stamp_ns,
-                self._picture_message(pair.stamp_ns, frame_id, image),
-            )
+        """Append one pair, recorded at its own stamp; of a depth camera, image and depth."""
+        left, right = self._calibration.left, self._calibration.right
+        self._write_image('left', pair.stamp_ns, FRAME_IDS[0], left, pair.left)
+        if is_disparity(pair.right):
+            self.write_depth(pair, self._calibration.camera.disparity_times_depth)
+        else:
+            self._write_image('right', pair.stamp_ns, FRAME_IDS[1], right, pair.right)
 
-    def write_message(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message of one of `types` to a topic, recorded at stamp_ns."""
-        connection = self._connections[topic]
-        data = self._typestore.serialize_cdr(message, connection.msgtype)
-        self._writer.write(connection, stamp_ns, data)
-
-    def header(self, stamp_ns: int, frame_id: str) -> Any:
-        """Return a std_msgs/Header."""
-        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-        stamp = self.types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
-        return self.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
-
-    def _add_image_topics(self) -> None:
+    def _write_image(
+        self,
+        side: str,
+        stamp_ns: int,
+        frame_id: str,
+        eye: EyeCalibration,
+        image: NDArray[np.uint8],
+    ) -> None:
+        info = self._info_message(self.messages.header(stamp_ns, frame_id), eye)
+        self.write_message(f'/{side}/camera_info', CAMERA_INFO, stamp_ns, info)
         kind = IMAGE if self._coding is ImageCoding.raw else COMPRESSED
-        for side in SIDES:
-            self.add_topic(self._image_topic(side), kind)
-            self.add_topic(f'/{side}/camera_info', CAMERA_INFO)
+        picture = self._picture_message(stamp_ns, frame_id, image)
+        self.write_message(self._image_topic(side), kind, stamp_ns, picture)
+
+    def write_depth(self, pair: RawPair, disparity_times_depth: float) -> None:
+        """Append the depths of a pair whose right image is a disparity (H, W)."""
+        with np.errstate(divide='ignore'):
+            depth_m = np.float32(disparity_times_depth) / pair.right
+        message = self.image_message(pair.stamp_ns, depth_m.astype(np.float32), '32FC1')
+        self.write_message(DEPTH_TOPIC, IMAGE, pair.stamp_ns, message)
+
+    def write_measurement(self, measurement: Measurement) -> None:
+        """Append what wheels told, or an IMU, which goes with the frame of the raw left images."""
+        stamp_ns = measurement.stamp_ns
+        if isinstance(measurement, WheelPose):
+            odometry = self.messages.odometry(stamp_ns, WHEELS_FRAME, measurement.T_wheels_base)
+            self.write_message(WHEELS_TOPIC, ODOMETRY, stamp_ns, odometry)
+        elif isinstance(measurement, ImuSample):
+            imu = self.messages.imu(measurement, FRAME_IDS[0], self._turn_imu)
+            self.write_message(IMU_TOPIC, IMU, stamp_ns, imu)
+
+    def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
+        """Append a message of a type to a topic, recorded at stamp_ns."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._typestore
+            )
+        data = self._typestore.serialize_cdr(message, kind)
+        self._writer.write(self._connections[topic], stamp_ns, data)
 
     def _image_topic(self, side: str) -> str:
         image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
@@ -180,8 +217,8 @@ class BagWriter:
         """Return a sensor_msgs/Image of an image (H, W) of one channel."""
         pixels = np.ascontiguousarray(image)
         height, width = pixels.shape
-        return self.types[IMAGE](
-            header=self.header(stamp_ns, frame_id),
+        return self.messages.types[IMAGE](
+            header=self.messages.header(stamp_ns, frame_id),
             height=height,
             width=width,
             encoding=encoding,
@@ -196,12 +233,12 @@ class BagWriter:
         suffix, options = self._encoders[self._coding]
         _, data = cv2.imencode(suffix, np.ascontiguousarray(image), options)
         words = f'mono8; {self._coding.value} compressed mono8'
-        header = self.header(stamp_ns, frame_id)
-        return self.types[COMPRESSED](header=header, format=words, data=data.ravel())
+        header = self.messages.header(stamp_ns, frame_id)
+        return self.messages.types[COMPRESSED](header=header, format=words, data=data.ravel())
 
     def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
-        whole_image = self.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
-        return self.types[CAMERA_INFO](
+        whole_image = self.messages.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        return self.messages.types[CAMERA_INFO](
             header=header,
             height=eye.height,
             width=eye.width,

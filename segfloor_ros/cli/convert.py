@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +12,9 @@ from rich.progress import TaskID
 from segfloor_ros.camera.bag_writer import ImageCoding
 from segfloor_ros.camera.bag_writer import convert as write_bag
 from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli.options import InputArgument, ParamsOption, SetOption
-from segfloor_ros.cli.output import console, progress_bar
+from segfloor_ros.cli.output import console, print_sensors, progress_bar
 from segfloor_ros.configuration import resolve
 
 
@@ -25,12 +27,15 @@ def convert(
     params: ParamsOption = None,
     assignments: SetOption = None,
 ) -> None:
-    """Convert a recording to a rosbag2 (mcap) with images and CameraInfo."""
-    configuration = resolve(params, assignments or (), stereo_camera={'input': input})
-    source = open_source(configuration.stereo_camera)
+    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured."""
+    settings = resolve(params, assignments or (), stereo_camera={'input': input}).stereo_camera
+    source = open_source(settings)
+    print_sensors(source.sensors)
+    has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)
+    depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
     with progress_bar('converting', source.frame_count) as progress:
         pairs = write_bag(
-            source, out, images, lambda done: progress.update(TaskID(0), completed=done)
+            source, out, images, lambda done: progress.update(TaskID(0), completed=done), depth
         )
     size_mb = sum(f.stat().st_size for f in [out, *out.rglob('*')] if f.is_file()) / 1e6
     console.print(f'{pairs} pairs, {size_mb:.1f} MB: {out}', highlight=False)

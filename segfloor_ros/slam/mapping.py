@@ -204,7 +204,8 @@ class LocalMapper:
         points. One that loses what the newest keyframe saw has followed something that moves, or a
         wrong match, and is left out.
         """
-        if result.inliers[adjustment.edge_keyframe == adjustment.newest].mean() < MIN_KEPT_RATIO:
+        kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
+        if len(kept) and kept.mean() < MIN_KEPT_RATIO:
             return
         self.offset.learn(result.offset)
         self._write_back(sparse_map, adjustment, result)

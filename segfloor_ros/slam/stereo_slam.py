@@ -17,6 +17,7 @@ from segfloor_ros.slam.body_motion import BodyMotion
 from segfloor_ros.slam.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
+from segfloor_ros.slam.firm_points import count_firm
 from segfloor_ros.slam.following import Follower
 from segfloor_ros.slam.held_results import HeldResults
 from segfloor_ros.slam.image_check import FrozenCheck, expected_shift, image_fault
@@ -51,8 +52,8 @@ CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
 FEW_POINTS, RESUMING_POINTS = 60, 100
-"""Wheels tell the pose better than fewer points: on blank walls they are edges, along which they
-slide. So many more end a blind stretch."""
+"""Wheels tell the pose better than fewer points that do not slide along edges. So many more end a
+blind stretch."""
 
 MAX_BLIND_SIGMA_M = 0.5
 """Uncertainty of the pose up to which keyframes are made of it."""
@@ -234,7 +235,7 @@ class StereoSlam:
         )
         if track is None:
             track = self._search(frame, images, predictions)
-        if track is None or not self._is_believable(track, frame.stamp_ns):
+        if track is None or not self._is_believable(track, images, frame.stamp_ns):
             self._follower.reset()
             return None
         self._motion.take(track.T_camera_world, track.covariance, frame.stamp_ns)
@@ -245,13 +246,13 @@ class StereoSlam:
         self._frames_since_keyframe += 1
         return track
 
-    def _is_believable(self, track: Track, stamp_ns: int) -> bool:
+    def _is_believable(self, track: Track, images: Images, stamp_ns: int) -> bool:
         """Whether the camera can have come to where the images have it."""
         motion, pose = self._motion, track.T_camera_world
         if motion.is_lost:
             return True
         few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
-        if motion.is_held and len(track.point_ids) < few:
+        if motion.is_held and count_firm(images.left, track.uv_px) < few:
             return False
         if motion.is_consistent(pose, track.covariance, stamp_ns):
             return motion.is_plausible(pose, stamp_ns)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from camera_recordings import grey_pairs, opened, write_folders, write_kitti
@@ -12,6 +14,7 @@ from rosbags.highlevel import AnyReader
 from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, convert
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.measurements import ImuSample, MeasurementLog
 
 
 def assert_same_recording(one: StereoSource, other: StereoSource) -> None:
@@ -104,3 +107,48 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     assert out.read_text() == 'precious'
     with pytest.raises(InputError, match=r'cannot be written'):
         convert(source, out / 'below' / 'drive.mcap')
+
+
+WHEELS = '0.00 2 0 0 0 0 0 1\n0.05 2.1 0 0 0 0 0.6 0.8\n0.2 3 0 0 0 0 0 1\n'
+IMU = ''.join(f'{t},0.1,0.2,0.3,0.4,-9.81,{t / 1e9}\n' for t in range(0, 210_000_000, 5_000_000))
+
+
+@pytest.mark.parametrize('distorted', [False, True])
+def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool) -> None:
+    """Also of images that are not rectified: the file's axes are those of the rectified ones."""
+    pairs = grey_pairs(3)
+    if distorted:
+        folder = write_folders(tmp_path / 'images', pairs, distorted=True)
+    else:
+        folder = write_kitti(tmp_path / 'images', pairs)
+    (folder / 'wheel_odometry.txt').write_text(WHEELS)
+    (folder / 'imu.csv').write_text(IMU)
+    (folder / 'depth').mkdir()
+    height, width = pairs[0][0].shape
+    depth_mm = np.arange(height * width, dtype=np.uint16).reshape(height, width)
+    for k in range(3):
+        cv2.imwrite(str(folder / 'depth' / f'{k:06d}.png'), depth_mm + k)
+    source = opened(folder)
+    convert(source, tmp_path / 'drive.mcap', depth=opened(folder, depth=True))
+    again = opened(tmp_path / 'drive.mcap')
+    assert {s.name: s.used for s in again.sensors} == {
+        'wheel_odometry': True,
+        'imu': True,
+        'depth': False,
+    }
+    for one, other in zip(measured(source), measured(again), strict=True):
+        for name, value in vars(one).items():
+            np.testing.assert_allclose(getattr(other, name), value, atol=1e-9)
+    by_folder, by_bag = opened(folder, depth=True), opened(tmp_path / 'drive.mcap', depth=True)
+    for frame, copy in zip(by_folder.frames(), by_bag.frames(), strict=True):
+        np.testing.assert_array_equal(frame.left, copy.left)
+        np.testing.assert_allclose(frame.right, copy.right, rtol=1e-6)
+    # A depth camera's images are not turned, those of the pair are: the IMU's axes follow.
+    for one, other in zip(measured(by_folder), measured(by_bag), strict=True):
+        if isinstance(one, ImuSample):
+            np.testing.assert_allclose(other.accel_m_s2, one.accel_m_s2, atol=1e-9)
+
+
+def measured(source: StereoSource) -> list[Any]:
+    """Everything measured, by stamp within each sensor."""
+    return list(MeasurementLog(source.sensors).until(10**19))

@@ -12,8 +12,10 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import ImuSample, WheelPose
+from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.slam.track import Track
 
 SETTINGS = StereoSlamSettings(num_features=800)
 FRAMES = 34
@@ -148,6 +150,22 @@ def test_a_wrong_scale_is_said_and_taken_into_account():
     motion = slam.sensors.between(round(4e9), round(5e9))
     expected = invert(path[250] @ MOUNT.T_base_left) @ path[200] @ MOUNT.T_base_left
     np.testing.assert_allclose(motion.T_now_before, expected, atol=0.005)
+
+
+def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_wheels):
+    slam, _ = on_wheels
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
+    rows = rng.integers(20, CAMERA.height - 20, 150)
+    on_edge = np.stack([edge_px[rows], rows], axis=1)
+    pose, sure = slam._motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
+    track = Track(pose, sure, np.arange(150, dtype=np.int32), on_edge, np.arange(150), None)
+    for texture, expected in ((0.0, False), (30.0, True)):
+        grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
+        picture = np.clip(grey, 0, 255).astype(np.uint8)
+        frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
+        images = Images.of(frame, CAMERA, 0)
+        assert slam._is_believable(track, images, frame.stamp_ns) == expected
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_tells_it(frames):

@@ -102,7 +102,8 @@ def with_depth(
         for pair, path in zip(pairs, partners, strict=True)
         if path is not None
     ]
-    sensors = folder_sensors(folder, settings.ignored_sensors)
+    # The images of a depth camera are not turned: `imu.csv` is in the axes of the rectified ones.
+    sensors = folder_sensors(folder, settings.ignored_sensors, left.R.T)
     return DepthSource(str(folder), found, depth_calibration(left), settings, sensors)
 
 

@@ -1,0 +1,31 @@
+"""Which points of an image hold in every direction: those on edges slide along them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array
+
+REACH_PX = 5
+MIN_RATIO = 0.15
+"""Smaller over larger eigenvalue of the structure tensor (Harris and Stephens 1988); of corners and
+textures it is more, of an edge with the noise of a camera less."""
+
+
+def count_firm(image: NDArray[np.uint8], uv_px: Array) -> int:
+    """Return how many pixels (N, 2) of an image (H, W) are on corners or in textures."""
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    height, width = image.shape
+    columns, rows = np.rint(uv_px).astype(np.intp).T
+    steps = np.arange(-REACH_PX, REACH_PX + 1)
+    patches = smooth[
+        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
+        np.clip(columns[:, None, None] + steps, 0, width - 1),
+    ].astype(np.float32)
+    by_x = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]
+    by_y = patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]
+    xx, xy, yy = ((a * b).sum(axis=(1, 2)) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
+    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    return int((middle - spread > MIN_RATIO * (middle + spread)).sum())
