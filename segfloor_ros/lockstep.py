@@ -244,6 +244,8 @@ class LockstepRun:
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
             sensors=self._sensors_used(),
+            blind_frames=sum(result.blind for result in self._results),
+            sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],
             stages=self._pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )

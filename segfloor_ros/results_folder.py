@@ -50,7 +50,8 @@ class RunSummary:
 
     lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
     the times in seconds at which tracking was lost and found again, lost_s and found_s. sensors:
-    messages used, by name. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
+    messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. sensor_remarks:
+    what seems wrong with sensors, in words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
     peak and slope_per_update in MB, and samples over the updates.
     """
 
@@ -68,6 +69,8 @@ class RunSummary:
     camera_pitch_rad: float
     camera_roll_rad: float
     sensors: dict[str, int]
+    blind_frames: int
+    sensor_remarks: list[str]
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
 
@@ -192,7 +195,9 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     rows: list[tuple[str, Any]] = [
         *([('sensors used (messages)', used)] if used else []),
         ('frames tracked', tracked),
+        *([('of them on sensors alone', summary.blind_frames)] if used else []),
         ('frames lost', lost),
+        *(('remark', remark) for remark in summary.sensor_remarks),
         ('frames skipped (unreadable)', summary.skipped_frames),
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),

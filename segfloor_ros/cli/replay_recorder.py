@@ -20,7 +20,14 @@ from segfloor_ros.cli.replay_graph import RECORDED
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages.clouds import labelled_arrays
-from segfloor_ros.messages.diagnostics import CONNECTIONS, RECORDING, Level, Status, statuses
+from segfloor_ros.messages.diagnostics import (
+    CONNECTIONS,
+    RECORDING,
+    REMARKS_APART,
+    Level,
+    Status,
+    statuses,
+)
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
@@ -82,6 +89,13 @@ class ReplayRecorder(Node):
         """How many loops SLAM has closed."""
         last = self.answers.get(max(self.answers, default=0))
         return int(last.values.get('loops', 0)) if last is not None else 0
+
+    @property
+    def remarks(self) -> list[str]:
+        """What seems wrong with sensors, in words."""
+        last = self.answers.get(max(self.answers, default=0))
+        text = last.values.get('remarks', '') if last is not None else ''
+        return text.split(REMARKS_APART) if text else []
 
     def unanswered(self) -> set[int]:
         """Return the stamps of frames that SLAM has not answered."""

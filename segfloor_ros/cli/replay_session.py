@@ -223,6 +223,8 @@ class ReplaySession:
             camera_pitch_rad=round(mount.pitch_rad, 5),
             camera_roll_rad=round(mount.roll_rad, 5),
             sensors=_sensors_sent(finished),
+            blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
+            sensor_remarks=recorder.remarks,
             stages=recorder.times.summary(),
             rss_mb=recorder.memory.summary(),
         )

@@ -13,6 +13,9 @@ from segfloor_ros.messages.headers import make_header, to_ns
 CONNECTIONS = 'connections'
 """Kind of the status that says how many subscribers each topic of a node has."""
 
+REMARKS_APART = ' | '
+"""Between what seems wrong with sensors, in the value `remarks` of SLAM's statuses."""
+
 HEALTH = 'health'
 """Kind of the status that says once a second how a node fares."""
 

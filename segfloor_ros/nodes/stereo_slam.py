@@ -8,7 +8,7 @@ import time
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.errors import InputError
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.messages.topics import FRAME_DONE
@@ -34,6 +34,7 @@ from segfloor_ros.stages import make_slam
 LOOK_AGAIN_S = 0.2
 PATIENCE_S = 5.0
 """For how long the place where the node was killed is looked for before a new map begins."""
+REMARK_AGAIN_S = 600.0
 
 
 class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
@@ -200,6 +201,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self._publish(result, slam, milliseconds / len(results))
             if result.stamp_ns == stamp_ns and result.tracked:
                 self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
+        for about, remark in slam.sensors.remarks.items():
+            self.reporter.diagnose(about, remark, repeat_s=REMARK_AGAIN_S)
         if self._lost.lost_s(stamp_ns) > PATIENCE_S and self._is_resumed and not self._lost.found:
             self.reset('the place where the last SLAM was killed is not found')
         elif self._mount is not None and not slam.is_adjusting:
@@ -248,9 +251,10 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if result.stamp_ns > self._provisional_ns:
             self._transforms.broadcast(result)
         self._outputs.publish(result, self._calibration, self._frames)
+        level = Level.WARN if result.blind else Level.OK if result.tracked else Level.ERROR
         self.reporter.report_processed(
             result.stamp_ns,
-            Level.OK if result.tracked else Level.ERROR,
+            level,
             result.state,
             milliseconds,
             tracked=int(result.tracked),
@@ -260,6 +264,8 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             reference_keyframe_ns=result.reference_keyframe_ns,
             **self._lost.note(result.stamp_ns, result.tracked),
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
+            blind=int(result.blind),
+            remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
 
     def _publish_provisional(self, stamp_ns: int, result: FrameResult | None) -> None:

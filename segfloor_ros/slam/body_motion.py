@@ -45,6 +45,8 @@ WINDOW_M, WINDOW_RAD, WINDOW_NS = 0.1, 0.1, 1_000_000_000
 WINDOWS_TO_JUDGE = 25
 """Stretches after which something is said of the wheels; the slip of a few of them is not it."""
 
+SLIP_REMARK = 'wheel odometry and images disagreed; the wheels slip, or the images show what moves'
+
 logger = logging.getLogger(__name__)
 
 
@@ -188,8 +190,11 @@ class BodyMotion:
         window = Window(seen[:2, 3], yaw_of(seen), told)
         if not self._calibrator.add(window):
             self.slips += 1
+            in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS
             self._slipped_ns = now_ns
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
+            if in_a_row:
+                self._remark({'slip': SLIP_REMARK})
         if len(self._calibrator) >= WINDOWS_TO_JUDGE:
             self._remark(self._calibrator.current.remarks())
 

@@ -82,7 +82,8 @@ class FrameResult:
     T_odom_base is the base in `map` (REP-105). Both are the last known ones while lost.
     covariance: (6, 6) of the base pose, order x y z roll pitch yaw (m², rad²), in the odom
     frame. reference_keyframe: stamp of the keyframe the pose is expressed against, for
-    correcting it later. state: words for people ('tracking', or why not). keyframe: set when
+    correcting it later. state: words for people ('tracking', or why not). blind: whether the pose
+    is that of wheels or a gyroscope alone. keyframe: set when
     this frame became one. moving: what moves, where this frame was searched for it.
     """
 
@@ -97,3 +98,4 @@ class FrameResult:
     reference_keyframe_ns: int
     keyframe: Keyframe | None = None
     moving: MovingPoints | None = None
+    blind: bool = False

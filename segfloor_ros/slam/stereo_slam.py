@@ -464,6 +464,7 @@ class StereoSlam:
             state if tracked else f'lost: {why}',
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
             keyframe,
+            blind=motion.is_blind,
         )
 
 
