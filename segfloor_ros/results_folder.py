@@ -51,8 +51,8 @@ class RunSummary:
     lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
     the times in seconds at which tracking was lost and found again, lost_s and found_s. sensors:
     messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. sensor_remarks:
-    what seems wrong with sensors, in words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
-    peak and slope_per_update in MB, and samples over the updates.
+    what seems wrong with sensors, in words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms.
+    rss_mb: start, peak and slope_per_update in MB, and samples over the updates.
     """
 
     frames: int

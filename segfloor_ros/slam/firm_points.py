@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,8 @@ MIN_RATIO = 0.15
 textures it is more, of an edge with the noise of a camera less."""
 
 
-def count_firm(image: NDArray[np.uint8], uv_px: Array) -> int:
-    """Return how many pixels (N, 2) of an image (H, W) are on corners or in textures."""
+def count_firm(image: NDArray[Any], uv_px: Array) -> int:
+    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures."""
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     height, width = image.shape
     columns, rows = np.rint(uv_px).astype(np.intp).T
