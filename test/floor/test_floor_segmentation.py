@@ -115,6 +115,22 @@ def test_a_blank_strip_between_floor_is_filled(floor_kind):
     assert np.mean(observation.mask[strip] == FLOOR) > 0.9
 
 
+@pytest.mark.parametrize(('seed', 'grey'), [(33, 100.0), (21, 85.0)])
+def test_blank_floor_is_filled_to_the_foot_of_what_stands_on_it(seed, grey):
+    """Across the edge of a light, beyond which no floor has texture."""
+    blank = [
+        floor_patch(near_m=near_m, far_m=far_m, contrast=0.0, grey=grey + lighter)
+        for near_m, far_m, lighter in ((1.0, 1.25, 20), (1.25, 2.0, 41))
+    ]
+    textured = floor_patch(far_m=1.0, seed=seed, grey=grey, contrast=9.0)
+    scene = Scene([textured, *blank, wall(1.6)], SMALL_CAMERA)
+    observation, floor, depth = segment(scene)
+    lit = floor & (points_of(scene, depth)[..., 0] > 1.3)
+    assert lit.sum() > 2000
+    assert np.mean(observation.mask[lit] == FLOOR) > 0.85
+    assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
+
+
 @pytest.mark.parametrize('floor_kind', FLOORS)
 def test_a_lone_bit_of_floor_is_left_open(floor_kind):
     """Seen through an opening above a low sill, beside floor that is much larger."""

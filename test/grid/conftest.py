@@ -65,7 +65,7 @@ class Drive:
         count = round(FIELD_OF_VIEW_RAD / step) + 1
         bearing = -FIELD_OF_VIEW_RAD / 2 + step * np.arange(count)
         depth = world.distance_m(pose[0], pose[1], pose[2] + bearing)
-        sigma = np.where(np.isfinite(depth), self.error_per_m * depth**2, 0)
+        sigma = self.error_per_m * np.where(np.isfinite(depth), depth, 0) ** 2
         seen = depth + self.noise.normal(0, 1, count) * sigma
         seen[self.noise.random(count) < self.miss_share] = np.inf
         leaks = self.noise.random(count) < self.leak_share

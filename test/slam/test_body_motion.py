@@ -169,6 +169,23 @@ def test_wheels_that_are_right_are_not_remarked_upon_and_slip_is_noticed():
     assert calibrator.current.scale == pytest.approx(1.0, abs=2e-3)
 
 
+def test_wheels_that_slipped_are_less_sure_for_a_second():
+    body = BodyMotion()
+    body.T_base_left = Mount(0.3, 0.2).T_base_left
+    for k in range(80):  # 5 cm each 100 ms; the wheels tell twice as much from 4 s on
+        body.add(WheelPose(100 * k * MS, base_pose(0.05 * (k + max(k - 40, 0)), 0, 0)))
+    sigmas_m = []
+    for k in range(60):
+        body.learn(100 * k * MS, invert(body.T_base_left) @ base_pose(0.05 * k, 0, 0)
+                   @ body.T_base_left)  # fmt: skip
+        ahead = body.between(100 * k * MS, 100 * (k + 1) * MS)
+        sigmas_m.append(np.sqrt(np.trace(ahead.covariance[:3, :3])))
+    assert body.slips > 3
+    assert max(sigmas_m[30:40]) < 0.02 < 0.04 < min(sigmas_m[45:])
+    later = body.between(7_500 * MS, 7_600 * MS)
+    assert np.sqrt(np.trace(later.covariance[:3, :3])) < 0.02
+
+
 def test_the_motion_of_the_base_moves_the_camera_on_its_mount():
     body = BodyMotion()
     body.T_base_left = Mount(0.3, 0.2, 0.0, forward_m=0.5).T_base_left

@@ -68,3 +68,16 @@ def test_an_adjustment_that_loses_what_the_newest_keyframe_saw_changes_nothing()
     np.testing.assert_array_equal(sparse_map.xyz_world, points)
     mapper.apply(sparse_map, adjustment, replace(astray, inliers=np.ones_like(newest)))
     assert not np.array_equal(second.T_camera_world, before)
+
+
+def test_an_adjustment_retires_views_of_what_others_have_seen_as_well():
+    sparse_map, mapper = mapped()
+    for index in range(1, 9):
+        view = seen(index, np.arange(len(POINTS)), 15.0, x=0.01 * index)
+        mapper.insert(sparse_map, view, patches())
+    adjustment = mapper.plan_adjustment(sparse_map, view)
+    mapper.apply(sparse_map, adjustment, mapper.solve(adjustment))
+    retired = [k.index for k in sparse_map.keyframes if k.retired]
+    # Neither the first nor the latest three; three others must go on seeing each point.
+    assert retired == [1, 2, 3, 4, 5]
+    assert sparse_map.alive.all()
