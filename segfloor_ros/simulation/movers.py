@@ -54,7 +54,7 @@ def part_solids(mover: Mover) -> list[list[Prism]]:
 def part_poses(mover: Mover, time_s: float) -> Array:
     """Return where the joint of each part is at a time: T_world_part (P, 4, 4)."""
     walked_m = _walked_m(mover, time_s)
-    x, y, yaw = _place(mover, walked_m)
+    x, y, yaw = place(mover, time_s)
     T_world_mover = make_transform(Rotation.from_euler('Z', yaw).as_matrix(), np.array([x, y, 0]))
     if isinstance(mover, Car):
         return T_world_mover[None]
@@ -127,15 +127,16 @@ def _lengths_m(mover: Mover) -> Array:
     return np.hypot(*np.diff(np.array(mover.points), axis=0).T)
 
 
-def _place(mover: Mover, walked_m: float) -> tuple[float, float, float]:
-    """Return x, y, yaw after a way walked, to and fro along the mover's points."""
+def place(mover: Mover, time_s: float) -> tuple[float, float, float]:
+    """Return x, y, yaw at a time, on the way to and fro along the mover's points."""
+    walked_m = _walked_m(mover, time_s)
     points, lengths = np.array(mover.points), _lengths_m(mover)
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     round_trip = walked_m % (2 * along[-1])
     back = round_trip > along[-1]
-    place = 2 * along[-1] - round_trip if back else round_trip
-    stretch = int(np.clip(np.searchsorted(along, place, side='right') - 1, 0, len(lengths) - 1))
+    reached = 2 * along[-1] - round_trip if back else round_trip
+    stretch = int(np.clip(np.searchsorted(along, reached, side='right') - 1, 0, len(lengths) - 1))
     direction = (points[stretch + 1] - points[stretch]) / lengths[stretch]
-    x, y = points[stretch] + direction * (place - along[stretch])
+    x, y = points[stretch] + direction * (reached - along[stretch])
     heading = -direction if back else direction
     return float(x), float(y), float(np.arctan2(heading[1], heading[0]))

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.consensus import MIN_AGREEMENT, Agreement, Consensus
 from segfloor_ros.slam.excluded import Region, is_inside
 from segfloor_ros.slam.features import spread
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.optical_flow import follow_pixels
 from segfloor_ros.slam.point_measurement import align_pixels, measure_disparity
-from segfloor_ros.slam.pose import PoseEstimate, refine_pose
 from segfloor_ros.slam.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import MIN_TRACKED, Track
@@ -33,8 +33,9 @@ MIN_FOUND = 0.15
 class Follower:
     """Finds the pose of a frame from the one before."""
 
-    def __init__(self, camera: StereoCamera, tracked_points: int) -> None:
+    def __init__(self, camera: StereoCamera, consensus: Consensus, tracked_points: int) -> None:
         self._camera = camera
+        self._consensus = consensus
         self._tracked_points = tracked_points
         self.reset()
 
@@ -75,10 +76,10 @@ class Follower:
 
         offset_px: the known error of all disparities, measured minus true.
         """
-        estimate = self._by_flow(images, sparse_map, T_predicted)
-        if estimate is None:
+        roughly = self._by_flow(images, sparse_map, T_predicted)
+        if roughly is None:
             return None
-        pose = estimate.T_camera_world
+        pose = roughly.estimate.T_camera_world
         seen = self._select(sparse_map, local_ids, pose, images.excluded)
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
@@ -88,14 +89,12 @@ class Follower:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
-        estimate = refine_pose(
-            self._camera, pose, sparse_map.xyz_world[ids], measured.without_offset(offset_px)
-        )
-        if not self._believable(estimate, len(seen.ids)):
+        found = self._consensus.refine(pose, sparse_map, ids, measured.without_offset(offset_px))
+        if not self._believable(found, len(seen.ids)):
             return None
+        estimate = found.estimate
         return Track(
-            estimate.T_camera_world,
-            estimate.covariance,
+            estimate,
             ids[estimate.inliers],
             measured.uvd_px[estimate.inliers, :2],
             seen.ids,
@@ -106,7 +105,7 @@ class Follower:
         images: Images,
         sparse_map: SparseMap,
         T_predicted: Array,
-    ) -> PoseEstimate | None:
+    ) -> Agreement | None:
         """Find the pose to about a pixel from where the last frame's points went."""
         if self._small is None or len(self._ids) < MIN_TRACKED:
             return None
@@ -125,10 +124,8 @@ class Follower:
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        estimate = refine_pose(
-            self._camera, T_predicted, sparse_map.xyz_world[ids[found]], observations
-        )
-        return estimate if self._believable(estimate, len(ids)) else None
+        agreement = self._consensus.refine(T_predicted, sparse_map, ids[found], observations)
+        return agreement if self._believable(agreement, len(ids)) else None
 
     def _select(
         self,
@@ -147,8 +144,7 @@ class Follower:
         reliability = sparse_map.reliability(seen.ids).astype(np.float32)
         return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, budget))
 
-    def _believable(self, estimate: PoseEstimate, looked_for: int) -> bool:
+    def _believable(self, found: Agreement, looked_for: int) -> bool:
         """Whether enough points agree: a wrong pose has followers too, but not most."""
-        agreeing = int(estimate.inliers.sum())
         enough = max(MIN_TRACKED, MIN_FOUND * looked_for)
-        return agreeing >= enough and 2 * agreeing >= len(estimate.inliers)
+        return found.agreeing >= enough and found.share >= MIN_AGREEMENT

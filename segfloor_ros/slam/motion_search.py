@@ -11,8 +11,9 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.excluded import Region
 from segfloor_ros.slam.moving_points import Look, MovingPointMeter
-from segfloor_ros.slam.moving_regions import Disparity, MovingRegions
+from segfloor_ros.slam.moving_regions import MovingRegions
 from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.small_camera import Disparity
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 
 SEARCH_EVERY = 3
@@ -43,10 +44,16 @@ class MotionSearch:
         self._frames_since += 1
         return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
 
-    def search(self, frame: StereoFrame, T_camera_world: Array, mount: Mount | None) -> Searched:
+    def search(
+        self,
+        frame: StereoFrame,
+        T_camera_world: Array,
+        T_odom_camera: Array,
+        mount: Mount | None,
+    ) -> Searched:
         """Find what moves in a frame whose pose is known."""
         self._frames_since = 0
-        scene = self._regions.search(frame, T_camera_world, mount)
+        scene = self._regions.search(frame, T_camera_world, T_odom_camera, mount)
         xyz_world = self._regions.positions(scene.disparity, T_camera_world)
         points = self._meter.measure(Look(frame.stamp_ns, scene.left, xyz_world), scene.moving)
         return Searched(scene.disparity, self._regions.enlarged(scene.moving), points)

@@ -22,9 +22,8 @@ from segfloor_ros.geometry import Array, invert, rotation_angle, transform_point
 from segfloor_ros.slam.excluded import Region
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.residuals import MIN_DEPTH_M
-
-WIDTH_PX = 160
-"""Images are shrunk to about this width: a person 4 m away is still eight pixels wide."""
+from segfloor_ros.slam.scene_flow import FlowView, FlowVotes, SceneFlow
+from segfloor_ros.slam.small_camera import TOLERANCE_PX, Disparity, SmallCamera
 
 DISPARITIES = 64
 BLOCK_PX = 5
@@ -32,9 +31,6 @@ P1, P2 = 100, 400
 """Of semi-global matching (Hirschmueller 2008), for the sum of differences over a block."""
 
 SPECKLE_PX = 40
-TOLERANCE_PX = 0.6
-"""Disparities of the shrunk images that differ by more do not show the same thing."""
-
 MAX_PARALLAX_RAD = float(np.radians(30.0))
 FAR_PERCENT = 80
 """What is farther than most of the image stands behind what moves."""
@@ -51,8 +47,6 @@ MISFIT_OF_TEXTURE = 0.7
 MIN_AREA_PX = BLOCK_PX**2
 SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
-
-Disparity = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -91,16 +85,8 @@ class MovingRegions:
     """Finds what moves in the images of keyframes."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        factor = max(1, round(camera.width / WIDTH_PX))
-        self._camera, self._factor = camera, factor
-        self._size = (camera.width // factor, camera.height // factor)
-        self._disparity_m = camera.disparity_times_depth / factor
-        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._size))
-        full_u, full_v = ((axis + 0.5) * factor - 0.5 for axis in (u, v))
-        rays = [(full_u - camera.cx) / camera.fx, (full_v - camera.cy) / camera.fy, np.ones_like(u)]
-        self._rays = np.stack(rays).reshape(3, -1).astype(np.float32)
-        self._focal = np.array([camera.fx, camera.fy]) / factor
-        self._centre = (np.array([camera.cx, camera.cy]) + 0.5) / factor - 0.5
+        self._camera, self._small = camera, SmallCamera(camera)
+        self._flow = SceneFlow(self._small)
         self._matcher = cv2.StereoSGBM_create(
             0, DISPARITIES, BLOCK_PX, P1, P2, disp12MaxDiff=1, uniquenessRatio=5,
             speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_HH4,
@@ -108,16 +94,25 @@ class MovingRegions:
         self._pair: tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
 
-    def search(self, frame: StereoFrame, T_camera_world: Array, mount: Mount | None) -> Scene:
+    def search(
+        self,
+        frame: StereoFrame,
+        T_camera_world: Array,
+        T_odom_camera: Array,
+        mount: Mount | None,
+    ) -> Scene:
         """Find what moves in a frame whose pose is known."""
         disparity = self.measure(frame.left, frame.right)
-        moving = self.find(disparity, T_camera_world, mount)
+        votes = self._flow.see(FlowView(frame.stamp_ns, self._pair[0], disparity, T_odom_camera))
+        moving = self.find(disparity, T_camera_world, mount, votes)
         return Scene(self._pair[0], disparity, moving)
 
     def positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
         """Return where each pixel is, (h, w, 3) in the world, NaN where there is no disparity."""
-        depth_m = np.where(disparity > 0, self._disparity_m / np.maximum(disparity, 1e-3), np.nan)
-        points = (self._rays * depth_m.ravel()).T.astype(np.float64)
+        depth_m = np.where(
+            disparity > 0, self._small.disparity_m / np.maximum(disparity, 1e-3), np.nan
+        )
+        points = (self._small.rays * depth_m.ravel()).T.astype(np.float64)
         return transform_points(invert(T_camera_world), points).reshape(*disparity.shape, 3)
 
     def seen_through(self, disparity: Disparity, points: Array) -> NDArray[np.bool_]:
@@ -126,22 +121,24 @@ class MovingRegions:
         """
         around = cv2.dilate(disparity, np.ones((5, 5), np.uint8))
         depth = np.maximum(points[:, 2], MIN_DEPTH_M)
-        uv = np.rint(self._focal * points[:, :2] / depth[:, None] + self._centre)
+        uv = np.rint(self._small.focal * points[:, :2] / depth[:, None] + self._small.centre)
         inside = (
-            (points[:, 2] > MIN_DEPTH_M) & (uv >= 0).all(axis=1) & (uv < self._size).all(axis=1)
+            (points[:, 2] > MIN_DEPTH_M)
+            & (uv >= 0).all(axis=1)
+            & (uv < self._small.size).all(axis=1)
         )
         u, v = np.where(inside[:, None], uv, 0).astype(np.intp).T
-        expected = self._disparity_m / depth
+        expected = self._small.disparity_m / depth
         behind = around[v, u] < expected - 2 * TOLERANCE_PX
         return np.asarray(inside & behind & (disparity[v, u] > 0))
 
     def measure(self, left: NDArray[np.uint8], right: NDArray[Any]) -> Disparity:
         """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
-        small_left = cv2.resize(left, self._size, interpolation=cv2.INTER_AREA)
+        small_left = cv2.resize(left, self._small.size, interpolation=cv2.INTER_AREA)
         if is_disparity(right):
             self._pair = small_left, None
-            return shrunk(right.astype(np.float32, copy=False), self._size)
-        small_right = cv2.resize(right, self._size, interpolation=cv2.INTER_AREA)
+            return shrunk(right.astype(np.float32, copy=False), self._small.size)
+        small_right = cv2.resize(right, self._small.size, interpolation=cv2.INTER_AREA)
         self._pair = small_left, small_right
         # Without a margin the matcher leaves the leftmost columns empty.
         wide = (
@@ -149,7 +146,7 @@ class MovingRegions:
             for i in (small_left, small_right)
         )
         found = self._matcher.compute(*wide)[:, DISPARITIES:].astype(np.float32) / 16
-        found[found > np.arange(self._size[0]) + 1] = 0.0
+        found[found > np.arange(self._small.size[0]) + 1] = 0.0
         return np.maximum(found, 0.0)
 
     def remember(self, keyframe: KeyframeRecord, disparity: Disparity) -> None:
@@ -157,13 +154,19 @@ class MovingRegions:
         self._views.append(DepthView.of(keyframe, disparity))
 
     def find(
-        self, disparity: Disparity, T_camera_world: Array, mount: Mount | None
+        self,
+        disparity: Disparity,
+        T_camera_world: Array,
+        mount: Mount | None,
+        votes: FlowVotes | None = None,
     ) -> NDArray[np.uint8]:
-        """Return what moves (h, w), 255, in an image with this disparity and pose."""
+        """Return what moves (h, w), 255, in an image with this disparity and pose. votes: of its
+        corners.
+        """
         rows = np.flatnonzero(disparity > 0)
-        if len(self._views) < 2 or len(rows) == 0:
+        if len(rows) == 0:
             return np.zeros(disparity.shape, np.uint8)
-        points = self._rays[:, rows] * (self._disparity_m / disparity.ravel()[rows])
+        points = self._small.rays[:, rows] * (self._small.disparity_m / disparity.ravel()[rows])
         through, solid, behind = self._compare(points, disparity.ravel()[rows], T_camera_world)
         high = np.ones(len(rows), bool)
         if mount is not None:
@@ -174,6 +177,9 @@ class MovingRegions:
         background.ravel()[rows] = behind
         seeds &= self._shown(disparity, background).ravel()
         doubtful[rows] = (solid <= through) & high
+        if votes is not None:
+            seeds[rows] |= votes.moving.ravel()[rows] & high
+            doubtful &= 1 - votes.still.ravel()
         return self._regions(
             seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
         )
@@ -182,7 +188,7 @@ class MovingRegions:
         """Return a region of the shrunk image in that of the camera (H, W), None for none."""
         if not region.any():
             return None
-        factor = self._factor
+        factor = self._small.factor
         whole = cv2.resize(region, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
         below, right = self._camera.height - whole.shape[0], self._camera.width - whole.shape[1]
         return np.asarray(
@@ -202,13 +208,13 @@ class MovingRegions:
             T = (view.keyframe.T_camera_world @ T_world_camera).astype(np.float32)
             x, y, z = T[:3, :3] @ points + T[:3, 3:]
             depth = np.maximum(z, 0.01)
-            u = np.rint(self._focal[0] * x / depth + self._centre[0])
-            v = np.rint(self._focal[1] * y / depth + self._centre[1])
-            inside = (z > MIN_DEPTH_M) & (u >= 0) & (u < self._size[0])
-            inside &= (v >= 0) & (v < self._size[1])
-            at = np.where(inside, v * self._size[0] + u, 0).astype(np.intp)
+            u = np.rint(self._small.focal[0] * x / depth + self._small.centre[0])
+            v = np.rint(self._small.focal[1] * y / depth + self._small.centre[1])
+            inside = (z > MIN_DEPTH_M) & (u >= 0) & (u < self._small.size[0])
+            inside &= (v >= 0) & (v < self._small.size[1])
+            at = np.where(inside, v * self._small.size[0] + u, 0).astype(np.intp)
             inside &= view.disparity.ravel()[at] > 0
-            expected = self._disparity_m / depth
+            expected = self._small.disparity_m / depth
             tolerance = TOLERANCE_PX * np.sqrt(1 + (expected / disparity) ** 4)
             nearest = view.nearest.ravel()[at]
             behind = nearest < expected - tolerance
@@ -227,7 +233,7 @@ class MovingRegions:
         if self._pair[1] is None:
             return np.ones(disparity.shape, np.uint8)
         left, right = (image.astype(np.float32) for image in self._pair if image is not None)
-        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._size))
+        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._small.size))
 
         def misfit(d: Disparity) -> Disparity:
             moved = cv2.remap(right, u - d, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -96,7 +96,7 @@ def refine_pose(
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
         pose = _minimise(camera, pose, points_world[inliers], observations.take(inliers))
-        chi2 = _chi2(camera, pose, points_world, observations)
+        chi2 = squared_distances(camera, pose, points_world, observations)
         excess = chi2 / observations.chi2_median
         factor = float(np.sqrt(np.clip(np.median(excess), 1.0, max_noise_factor**2)))
         before, inliers = inliers, chi2 <= factor**2 * observations.chi2_limit
@@ -107,9 +107,12 @@ def refine_pose(
     return PoseEstimate(pose, inliers, covariance, factor)
 
 
-def _chi2(
+def squared_distances(
     camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
 ) -> Array:
+    """Return the squared, normalised residuals (N,) of observations of points (N, 3) at a pose;
+    infinite for points behind the camera.
+    """
     points = transform_points(pose, points_world)
     front = points[:, 2] > MIN_DEPTH_M
     points[~front] = (0.0, 0.0, 1.0)

@@ -14,6 +14,7 @@ from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.body_motion import BodyMotion
+from segfloor_ros.slam.consensus import Consensus
 from segfloor_ros.slam.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
@@ -94,8 +95,9 @@ class StereoSlam:
         self._body = BodyMotion()
         self._motion = CameraMotion(settings.max_speed_mps, self._body)
         self._local = LocalMap(camera, settings, self.map)
-        self._follower = Follower(camera, settings.tracked_points)
-        self._tracker = Tracker(camera)
+        self._consensus = Consensus(camera)
+        self._follower = Follower(camera, self._consensus, settings.tracked_points)
+        self._tracker = Tracker(camera, self._consensus)
         self._mapper = LocalMapper(camera, settings)
         self._places = PlaceRecognition(camera, self._tracker, self.map)
         self._loops = LoopDetector(self.map, self._places)
@@ -145,6 +147,7 @@ class StereoSlam:
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
             self._body.T_base_left = self.mount.T_base_left if self.mount else None
+            self._consensus.mount = self.mount
             fault = self._fault(frame)
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = self._track(frame, images) if self.map.keyframes and not fault else None
@@ -154,7 +157,9 @@ class StereoSlam:
         searched = None
         if self._moving is not None and self._moving.is_due(is_wanted, track is not None):
             with self._times.measure('moving'):
-                searched = self._moving.search(frame, self._motion.T_camera_world, self.mount)
+                searched = self._moving.search(
+                    frame, self._motion.T_camera_world, self._motion.T_odom_camera, self.mount
+                )
                 images = self._exclude(images, searched.region)
         keyframe = None
         if is_wanted:
@@ -374,7 +379,13 @@ class StereoSlam:
             return ObservedFeatures(features, self._tracker.pixel_observations(features), none)
         pose = self._motion.T_camera_world
         matched = self._tracker.track_at(
-            images, features, self.map, self._local.point_ids, pose, self.disparity_offset_px
+            images,
+            features,
+            self.map,
+            self._local.point_ids,
+            pose,
+            self.disparity_offset_px,
+            track.estimate,
         )
         if matched is None:
             return None

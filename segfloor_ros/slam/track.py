@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.features import Features
+from segfloor_ros.slam.pose import PoseEstimate
 from segfloor_ros.slam.residuals import Observations
 
 MIN_TRACKED = 20
@@ -36,14 +37,22 @@ class ObservedFeatures:
 class Track:
     """A frame with a pose.
 
-    T_camera_world: (4, 4). covariance: (6, 6) of its twist. point_ids, uv_px: (N,), (N, 2) the map
-    points that were found and agree. visible_ids: those that were looked for. observed: set when
-    the pose was found by features.
+    point_ids, uv_px: (N,), (N, 2) the map points that were found and agree. visible_ids: those that
+    were looked for. observed: set when the pose was found by features.
     """
 
-    T_camera_world: Array
-    covariance: Array
+    estimate: PoseEstimate
     point_ids: NDArray[np.int32]
     uv_px: Array
     visible_ids: NDArray[np.int32]
     observed: ObservedFeatures | None = None
+
+    @property
+    def T_camera_world(self) -> Array:
+        """The pose (4, 4)."""
+        return self.estimate.T_camera_world
+
+    @property
+    def covariance(self) -> Array:
+        """The covariance (6, 6) of the pose's twist."""
+        return self.estimate.covariance

@@ -10,11 +10,16 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array
+from segfloor_ros.slam.consensus import (
+    MIN_AGREEMENT,
+    Agreement,
+    Consensus,
+)
 from segfloor_ros.slam.features import PYRAMID_SCALE, Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.matching import Matches, match_predicted, match_unguided
 from segfloor_ros.slam.point_measurement import align_pixels, measure_disparity
-from segfloor_ros.slam.pose import PoseEstimate, refine_pose, solve_pnp
+from segfloor_ros.slam.pose import PoseEstimate, solve_pnp
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -25,9 +30,6 @@ SIGMA_PIXEL = 0.6
 """Standard deviation of a corner's position at the finest pyramid level, px; grows with the
 level.
 """
-
-MIN_AGREEMENT = 0.5
-"""Share of the matches that must agree on a pose: a wrong one has followers too, but not most."""
 
 MAX_CORNER_NOISE_FACTOR = 2.0
 """Corners are not worse than this times `SIGMA_PIXEL`; beyond it the matches are wrong."""
@@ -48,8 +50,9 @@ NARROW_SEARCH = 0.4
 class Tracker:
     """Finds the pose of frames against the local map."""
 
-    def __init__(self, camera: StereoCamera) -> None:
+    def __init__(self, camera: StereoCamera, consensus: Consensus) -> None:
         self._camera = camera
+        self._consensus = consensus
 
     def pixel_observations(self, features: Features) -> Observations:
         """Return the observations of features (N) before any disparity is known."""
@@ -95,9 +98,10 @@ class Tracker:
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
         offset_px: float = 0.0,
+        known: PoseEstimate | None = None,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
-        `track` for the rest.
+        `track` for the rest. known: the pose as the same images told it before.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -111,20 +115,16 @@ class Tracker:
         align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
         guess_px = seen.uvd_px[points, 2] + offset_px
         measure_disparity(images, observations, rows, guess_px)
-        estimate = refine_pose(
-            self._camera,
-            T_camera_world,
-            sparse_map.xyz_world[ids],
-            observations.take(rows).without_offset(offset_px),
-        )
-        if not self._agree(estimate):
+        measured = observations.take(rows).without_offset(offset_px)
+        found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
+        if not self._agree(found):
             return None
+        estimate = found.estimate
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)
         point_id[rows] = ids
         return Track(
-            estimate.T_camera_world,
-            estimate.covariance,
+            estimate,
             ids,
             observations.uvd_px[rows, :2],
             seen.ids,
@@ -184,18 +184,13 @@ class Tracker:
         """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
         if len(rows) < MIN_TRACKED:
             return None
-        estimate = refine_pose(
-            self._camera,
-            T_start,
-            sparse_map.xyz_world[ids],
-            observations.take(rows),
-            MAX_CORNER_NOISE_FACTOR,
+        found = self._consensus.refine(
+            T_start, sparse_map, ids, observations.take(rows), MAX_CORNER_NOISE_FACTOR
         )
-        return estimate if self._agree(estimate) else None
+        return found.estimate if self._agree(found) else None
 
-    def _agree(self, estimate: PoseEstimate) -> bool:
-        agreeing = int(estimate.inliers.sum())
-        return agreeing >= max(MIN_TRACKED, MIN_AGREEMENT * len(estimate.inliers))
+    def _agree(self, found: Agreement) -> bool:
+        return found.agreeing >= MIN_TRACKED and found.share >= MIN_AGREEMENT
 
     def _predict(
         self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array

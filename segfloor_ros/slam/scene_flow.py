@@ -1,0 +1,180 @@
+"""Scene flow: which corners of an image moved since an earlier one, whatever was seen before there.
+
+A corner is followed back by optical flow. If it stands still, it was where its depth and the
+camera's own motion say, up to the error of the depth (Vedula et al., Three-Dimensional Scene Flow,
+ICCV 1999). Corners are judged together with their neighbours at the same depth.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.small_camera import TOLERANCE_PX, Disparity, SmallCamera
+
+AGES_NS = (300_000_000, 900_000_000)
+"""How long ago an image was that corners are followed back to: in the first someone who walks has
+moved by a hand, in the second someone who walks just ahead of the camera stands out."""
+
+CORNERS = 300
+QUALITY, APART_PX = 0.01, 3
+WINDOW, LEVELS = (9, 9), 3
+MAX_RETURN_PX = 0.5
+"""Distance up to which a corner that is followed back and forth comes to where it was."""
+
+MAX_ZOOM, MAX_SHIFT_PX = 1.3, 20.0
+"""What stands still and changes its size by more, or its place in the image, is not compared."""
+
+FLOW_TOLERANCE_PX = 1.0
+NEIGHBOUR_PX = 15.0
+MIN_MOVING = 3
+"""Fewest corners of a thing that moves."""
+
+MAX_MOVING_SHARE = 0.8
+"""Where more of all corners seem to move it is the pose that is wrong."""
+
+DISC_PX = 3
+
+
+@dataclass(frozen=True)
+class FlowView:
+    """An earlier image. left: shrunk (h, w). disparity: (h, w). T_odom_camera: (4, 4)."""
+
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    disparity: Disparity
+    T_odom_camera: Array
+
+
+@dataclass(frozen=True)
+class FlowVotes:
+    """Where (h, w) corners moved, and where they stood still: 1, else 0."""
+
+    moving: NDArray[np.uint8]
+    still: NDArray[np.uint8]
+
+
+class SceneFlow:
+    """Follows corners back to earlier images."""
+
+    def __init__(self, camera: SmallCamera) -> None:
+        self._camera = camera
+        self._views: deque[FlowView] = deque()
+
+    def see(self, view: FlowView) -> FlowVotes:
+        """Take in an image and return what moved in it."""
+        earlier = self._earlier(view.stamp_ns)
+        uv = self._corners(view)
+        moved, still = np.zeros(len(uv), bool), np.zeros(len(uv), bool)
+        for then in earlier if len(uv) else []:
+            found, differs = self._compare(view, then, uv)
+            moved |= found & differs
+            still |= found & ~differs
+        still &= ~moved
+        self._views.append(view)
+        if moved.sum() > MAX_MOVING_SHARE * (moved | still).sum():
+            moved[:] = False
+        disparity = self._camera.at(view.disparity, uv)
+        moved = _outvoting(uv, disparity, moved, still)
+        return FlowVotes(
+            _discs(view.disparity, uv[moved], disparity[moved]),
+            _discs(view.disparity, uv[still], disparity[still]),
+        )
+
+    def _earlier(self, now_ns: int) -> list[FlowView]:
+        """Return the images of about the ages wanted; older ones are dropped."""
+        while self._views and now_ns - self._views[0].stamp_ns > 1.5 * AGES_NS[-1]:
+            self._views.popleft()
+        chosen = {
+            min(range(len(self._views)), key=lambda i: abs(now_ns - age - self._views[i].stamp_ns))
+            for age in AGES_NS
+            if self._views
+        }
+        return [self._views[i] for i in sorted(chosen)]
+
+    def _corners(self, view: FlowView) -> Array:
+        """Return corners (N, 2) px at which the disparity is known and has no edge."""
+        found = cv2.goodFeaturesToTrack(view.left, CORNERS, QUALITY, APART_PX)
+        if found is None:
+            return np.zeros((0, 2))
+        uv = found.reshape(-1, 2).astype(np.float64)
+        around = np.ones((5, 5), np.uint8)
+        nearest = self._camera.at(cv2.dilate(view.disparity, around), uv)
+        farthest = self._camera.at(cv2.erode(view.disparity, around), uv)
+        return uv[(farthest > 0) & (nearest - farthest < 2 * TOLERANCE_PX)]
+
+    def _compare(
+        self, now: FlowView, then: FlowView, uv: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which corners (N, 2) are found in an earlier image, and which of them are not
+        where they would be if they stood still.
+        """
+        disparity = self._camera.at(now.disparity, uv)
+        T_then_now = invert(then.T_odom_camera) @ now.T_odom_camera
+        nominal, farther, nearer = (
+            self._camera.carried(uv, np.maximum(disparity + step, 0.1), T_then_now)
+            for step in (0.0, -TOLERANCE_PX, TOLERANCE_PX)
+        )
+        back, returned = _follow(now.left, then.left, uv, nominal[:, :2])
+        found = (np.hypot(*(returned - uv).T) < MAX_RETURN_PX) & (nominal[:, 2] > 0)
+        found &= self._camera.contains(back) & self._camera.contains(nominal[:, :2])
+        found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(MAX_ZOOM)
+        found &= np.hypot(*(nominal[:, :2] - uv).T) < MAX_SHIFT_PX
+        there = self._camera.at(then.disparity, back)
+        differs = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) > FLOW_TOLERANCE_PX
+        tolerance = TOLERANCE_PX * (1 + (nominal[:, 2] / np.maximum(disparity, 0.1)) ** 2)
+        differs |= (there > 0) & (np.abs(there - nominal[:, 2]) > tolerance)
+        return found, differs
+
+
+def _follow(
+    now: NDArray[np.uint8], then: NDArray[np.uint8], uv: Array, guess: Array
+) -> tuple[Array, Array]:
+    """Return where corners (N, 2) are in another image, and where they come to from there in the
+    first one.
+    """
+    start, target = (a.astype(np.float32).reshape(-1, 1, 2) for a in (uv, guess))
+    how = {'winSize': WINDOW, 'maxLevel': LEVELS, 'flags': cv2.OPTFLOW_USE_INITIAL_FLOW}
+    back, ok, _ = cv2.calcOpticalFlowPyrLK(now, then, start, target.copy(), **how)
+    again, ok_again, _ = cv2.calcOpticalFlowPyrLK(then, now, back, start.copy(), **how)
+    again[(ok.ravel() == 0) | (ok_again.ravel() == 0)] = np.inf
+    return back.reshape(-1, 2).astype(np.float64), again.reshape(-1, 2).astype(np.float64)
+
+
+def _distance_to_segment(p: Array, a: Array, b: Array) -> Array:
+    """Return the distances (N,) of points from the segments between others, (N, 2) each."""
+    along = b - a
+    t = ((p - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
+    return np.asarray(np.hypot(*(p - a - np.clip(t, 0, 1)[:, None] * along).T))
+
+
+def _outvoting(
+    uv: Array, disparity: Array, moved: NDArray[np.bool_], still: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the corners (N,) that moved and whose neighbours at the same depth mostly did, too."""
+    result = moved.copy()
+    if not moved.any():
+        return result
+    tree = cKDTree(uv)
+    for i in np.flatnonzero(moved):
+        near = np.array(tree.query_ball_point(uv[i], NEIGHBOUR_PX))
+        near = near[np.abs(disparity[near] - disparity[i]) < 2 * TOLERANCE_PX]
+        result[i] = moved[near].sum() >= MIN_MOVING and moved[near].sum() > still[near].sum()
+    return result
+
+
+def _discs(disparity: Disparity, uv: Array, of_corner: Array) -> NDArray[np.uint8]:
+    """Return the pixels (h, w) around corners that are at the same depth."""
+    height, width = disparity.shape
+    mask = np.zeros(disparity.shape, np.uint8)
+    for (u, v), d in zip(np.rint(uv).astype(int), of_corner, strict=True):
+        rows = slice(max(0, v - DISC_PX), min(height, v + DISC_PX + 1))
+        columns = slice(max(0, u - DISC_PX), min(width, u + DISC_PX + 1))
+        mask[rows, columns] |= np.abs(disparity[rows, columns] - d) < 2 * TOLERANCE_PX
+    return mask
