@@ -11,13 +11,13 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Imu
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.measurements import Measurement
+from segfloor_ros.measurements import Measurement, WheelPose
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.sensors import NOT_MEASURED, imu_sample, wheel_pose
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.nodes.transforms import Transforms
 
-WHEELS, IMU = 'wheel_odometry', 'imu'
+WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MAX_LATE_S = 0.05
 """So long an image waits for what sensors measured up to its time."""
 
@@ -25,6 +25,10 @@ LIVE_S = 0.5
 """A sensor that has said nothing for so long is not waited for."""
 
 MAX_WAITING = 500
+TF_AFTER_S = 3.0
+"""A topic is waited for so long before tf is taken for the wheels' odometry: it takes a while to
+connect."""
+
 UPRIGHT = 0.8
 """Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
 
@@ -32,8 +36,9 @@ UPRIGHT = 0.8
 class SensorInput:
     """Receives what wheels and IMU measure, in the axes of the rectified left camera.
 
-    on_message: called after each. Samples of an IMU are turned by tf; without it, one for which up
-    is up in the image is taken to be in the frame of the left images, others are not used.
+    on_message: called after each. Where nobody publishes `wheel_odometry` and another node owns
+    odom → base_link, that is taken for it. Samples of an IMU are turned by tf; without it, one for
+    which up is up in the image is taken to be in the frame of the left images, others are not used.
     """
 
     def __init__(
@@ -53,6 +58,8 @@ class SensorInput:
         self._measured: deque[Measurement] = deque(maxlen=MAX_WAITING)
         self._latest: dict[str, tuple[int, float]] = {}
         self._asked: tuple[int, float] = (0, 0.0)
+        self._began_s = time.monotonic()
+        self._has_tf_wheels = False
 
     def begin(self, left_frame: str, R_rectified_left: Array) -> None:
         """Take measurements from now on. R_rectified_left: (3, 3) turns the frame of the left
@@ -60,8 +67,9 @@ class SensorInput:
         """
         self._camera = left_frame, R_rectified_left
 
-    def take(self) -> list[Measurement]:
-        """Return what has been measured since the last call."""
+    def take(self, stamp_ns: int, lag_ns: int = 0) -> list[Measurement]:
+        """Return what has been measured since the last call, up to the time of an image."""
+        self._add_tf_wheels(stamp_ns + lag_ns)
         measured = [*self._measured]
         self._measured.clear()
         return measured
@@ -75,12 +83,29 @@ class SensorInput:
             self._asked = stamp_ns, now_s
         if now_s > self._asked[1] + MAX_LATE_S:
             return False
+        self._look_at_tf(now_s)
         return any(
             latest_ns < stamp_ns + lag_ns and now_s < heard_s + LIVE_S
             for latest_ns, heard_s in self._latest.values()
         )
 
+    def _look_at_tf(self, now_s: float) -> None:
+        """Note how far tf has the base, once it is clear that no topic tells it."""
+        until_ns = self._transforms.fused_until_ns()
+        if WHEELS in self._latest or until_ns is None or now_s < self._began_s + TF_AFTER_S:
+            return
+        self._has_tf_wheels = True
+        if until_ns != self._latest.get(TF_WHEELS, (0, 0.0))[0]:
+            self._latest[TF_WHEELS] = until_ns, now_s
+
+    def _add_tf_wheels(self, stamp_ns: int) -> None:
+        T_odom_base = self._transforms.fused_base(stamp_ns) if self._has_tf_wheels else None
+        if T_odom_base is not None:
+            self._measured.append(WheelPose(stamp_ns, T_odom_base))
+
     def _take_wheels(self, message: Odometry) -> None:
+        if self._has_tf_wheels:
+            return
         if self._camera is not None:
             self._measured.append(wheel_pose(message, WHEELS))
         self._note(WHEELS, message)

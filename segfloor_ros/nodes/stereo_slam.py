@@ -189,7 +189,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             mask = self._masks.mask_for(stamp_ns, self._camera.rectifier)
             frame = StereoFrame(self._frame_count, stamp_ns, *images, mask)
             self._frame_count += 1
-            for measurement in self._sensors.take():
+            for measurement in self._sensors.take(stamp_ns, slam.sensors.lag_ns):
                 slam.add(measurement)
             self._initial_pose.apply(slam)
             results = slam.process(frame)

@@ -99,6 +99,18 @@ class Transforms:
         T_base_camera = self._link.lookup(self._own.base_frame, camera_frame)
         return None if T_base_camera is None else Mount.from_transform(T_base_camera)
 
+    def fused_base(self, stamp_ns: int) -> Array | None:
+        """Return where another node that owns odom → base_link has the base (4, 4) at a time."""
+        if self._link is None or not self._is_fused:
+            return None
+        return self._link.lookup(self._own.odom_frame, self._own.base_frame, stamp_ns)
+
+    def fused_until_ns(self) -> int | None:
+        """Return up to when that is known, None where no other node owns it."""
+        if self._link is None or not self._is_fused:
+            return None
+        return self._link.latest_ns(self._own.odom_frame, self._own.base_frame)
+
     def rotation(self, target: str, source: str) -> Array | None:
         """Return the rotation (3, 3) that tf has from one frame to another, or None."""
         if source == target:

@@ -16,7 +16,7 @@ from segfloor_ros.geometry import invert, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, right_image
-from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.messages.poses import pose_array, transform_message
 from segfloor_ros.messages.sensors import imu_message, imu_sample, wheel_message, wheel_pose
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.sensor_input import MAX_LATE_S, SensorInput
@@ -59,6 +59,33 @@ def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive)
     assert min(sigma_m[k] for k in BLIND) > 2 * sigma_m[5]
 
 
+def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken(
+    make_graph, drive, monkeypatch
+) -> None:
+    folder, poses = drive
+    (folder / 'wheel_odometry.txt').unlink()
+    monkeypatch.setattr('segfloor_ros.nodes.sensor_input.TF_AFTER_S', 0.0)
+    arguments = [
+        *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
+        *('-p', 'publish_odom_tf:=false', '-p', f'camera_height_m:={MOUNT.height_m}'),
+        *('-p', f'camera_pitch_rad:={MOUNT.pitch_rad}', '-p', f'camera_roll_rad:={MOUNT.roll_rad}'),
+    ]
+    graph = make_graph(*arguments)
+    odometry = graph.collect('odometry')
+    slam = graph.add(StereoSlamNode())
+    link = slam._transforms._link
+    for k, pose in enumerate(poses):
+        stamp = transform_message(round(k * 1e8), 'odom', 'base_link', pose)
+        link._take_moving(link._type(transforms=[stamp]))
+    graph.add(StereoCameraNode())
+    graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
+    for message in odometry:
+        truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
+        error = invert(truth) @ pose_array(message.pose.pose)
+        assert np.linalg.norm(error[:3, 3]) < 0.02
+    assert slam._slam.sensors.messages['wheel_odometry'] >= FRAMES - 2
+
+
 def test_wheels_and_imu_survive_the_way_through_messages() -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1.0, 2.0, 0.0
@@ -76,6 +103,9 @@ def test_wheels_and_imu_survive_the_way_through_messages() -> None:
 
 class Tf:
     """Transforms that know one frame."""
+
+    def fused_until_ns(self):
+        return None
 
     def rotation(self, target: str, source: str):
         known = {('left', 'imu_link'): np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])}
@@ -99,13 +129,13 @@ def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
 def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
     sensors.begin('left', np.eye(3))
     sensors._take_imu(imu(1, 'imu_link'))
-    np.testing.assert_allclose(sensors.take()[0].accel_m_s2, [0, -9.81, 0])
+    np.testing.assert_allclose(sensors.take(0)[0].accel_m_s2, [0, -9.81, 0])
     sensors.reset()
     sensors.begin('left', np.eye(3))
     sensors._take_imu(imu(2, 'elsewhere'))
-    assert sensors.take() == []
+    assert sensors.take(0) == []
     sensors._take_imu(imu(3, '', (0.0, -9.81, 0.0)))
-    assert [m.stamp_ns for m in sensors.take()] == [3]
+    assert [m.stamp_ns for m in sensors.take(0)] == [3]
 
 
 def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monkeypatch) -> None:
