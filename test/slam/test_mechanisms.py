@@ -10,6 +10,7 @@ from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_po
 from test_places import row_of_views
 
 from segfloor_ros.geometry import invert
+from segfloor_ros.slam.consensus import Consensus
 from segfloor_ros.slam.features import FeatureExtractor
 from segfloor_ros.slam.fusion import find_duplicates
 from segfloor_ros.slam.images import Images
@@ -82,7 +83,9 @@ def test_patches_tell_the_pose_better_than_corners(seed):
     frame = room.frame(1, moved)
     features = FeatureExtractor(SETTINGS).extract(frame.left)
     ids = slam.map.points_of(np.array([0]))
-    track = Tracker(CAMERA).track(Images.of(frame, CAMERA), features, slam.map, ids, [np.eye(4)])
+    track = Tracker(CAMERA, Consensus(CAMERA)).track(
+        Images.of(frame, CAMERA), features, slam.map, ids, [np.eye(4)]
+    )
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015
