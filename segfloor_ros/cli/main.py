@@ -19,6 +19,7 @@ from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.cli.simulate import simulate
 from segfloor_ros.errors import MapError, SegfloorError
+from segfloor_ros.messages.ros_bag import use_rosbag2_py
 
 app = typer.Typer(
     help='Occupancy maps for ground robots from a stereo camera alone.',
@@ -39,6 +40,7 @@ def _options() -> None:
 
 def main() -> None:
     """Run the command line."""
+    use_rosbag2_py()
     run_app(app)
 
 

@@ -123,7 +123,9 @@ class ReplaySession:
         for name, file in (('load_map', self._maps.load), ('save_map', self._maps.save)):
             if file is not None:
                 parameters[SLAM]['ros__parameters'][name] = str(file.absolute())
-        parameters[SLAM]['ros__parameters']['localize'] = self._maps.localize
+        parameters[SLAM]['ros__parameters'].update(
+            localize=self._maps.localize, use_depth=self._configuration.stereo_camera.depth
+        )
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / 'map.yaml'))
         resolved = folder / 'parameters.yaml'
         resolved.write_text(yaml.safe_dump(parameters))

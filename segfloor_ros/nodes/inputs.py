@@ -147,14 +147,17 @@ class Inputs:
         self.update()
 
     def update(self) -> None:
-        """While the inputs are open, open those that are wanted by now, and close the others."""
-        for one in self._inputs:
-            is_wanted = self.is_open and one.is_wanted()
-            if is_wanted and one.entity is None:
-                one.entity = one.make()
-            elif not is_wanted and one.entity is not None:
+        """While the inputs are open, open those that are wanted by now, and close the others; first
+        close, since two may be of the same topic.
+        """
+        wanted = [self.is_open and one.is_wanted() for one in self._inputs]
+        for one, is_wanted in zip(self._inputs, wanted, strict=True):
+            if not is_wanted and one.entity is not None:
                 entity, one.entity = one.entity, None
                 one.destroy(entity)
+        for one, is_wanted in zip(self._inputs, wanted, strict=True):
+            if is_wanted and one.entity is None:
+                one.entity = one.make()
 
     def close(self) -> None:
         """Receive nothing any more, and give up what waits for a partner."""

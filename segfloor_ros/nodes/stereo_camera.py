@@ -22,6 +22,7 @@ from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.headers import stamp_of, to_time
 from segfloor_ros.messages.images import compressed_message, image_message
+from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
@@ -46,6 +47,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         if not self.parameters.stage.input:
             raise InputError('stereo_camera.input is empty; name a recording or a device')
         own = self.parameters.own
+        use_rosbag2_py()
         self._source: StereoSource = open_source(self.parameters.stage)
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
         self._compressed = own.image_transport == 'compressed'

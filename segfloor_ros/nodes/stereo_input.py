@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,8 @@ from segfloor_ros.nodes.stage_node import AnyStageNode
 INFOS = ('left/camera_info', 'right/camera_info')
 MAX_UNPAIRED = 30
 DEPTH = 'depth/image_raw'
+DISCOVERY_S = 4.0
+"""Publishers of one driver are seen one after the other, the last ones after so long."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ class StereoInput:
     def reset(self) -> None:
         """Take over the latest calibration with the next pair, and whatever images come."""
         self._is_settled = False
+        self._depth_seen_s = 0.0
         self._rectifier: StereoRectifier | None = None
         self._eight_bit = EightBitScale(self._own.bit_depth)
 
@@ -173,12 +177,18 @@ class StereoInput:
 
     def find_images(self) -> None:
         """Before the first pair, take the kind of images that is published, if the choice is left
-        to the node.
+        to the node; depth images only where the right ones stay away: they may be seen later.
         """
         if self._is_settled or not self._node.inputs.is_open:
             return
         published = [kind for kind in self._kinds if self._is_published(kind)]
-        if published and self._kind not in published:
+        if published and published[0].is_depth and not self._own.use_depth:
+            now_s = time.monotonic()
+            self._depth_seen_s = self._depth_seen_s or now_s
+            if now_s < self._depth_seen_s + DISCOVERY_S:
+                return
+        is_better = self._kind.is_depth and published and not published[0].is_depth
+        if published and (self._kind not in published or is_better):
             self._choose(published[0])
             self._node.get_logger().info(
                 f'receives {self.left} and {self.right}, which are published; set image_kind and '

@@ -332,3 +332,15 @@ def test_a_map_that_cannot_be_used_is_one_line(
     assert done.returncode == 2
     assert words in ' '.join(done.stderr.split())
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_report_on_a_cloud_that_cannot_be_read_ends_with_status_2(result, tmp_path):
+    run = tmp_path / 'run'
+    shutil.copytree(result[0], run)
+    cloud = run / 'labelled_cloud.ply'
+    for damage in (lambda: cloud.write_bytes(b'ply'), cloud.unlink, cloud.mkdir):
+        damage()
+        done = segfloor('evaluate', 'report', run)
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert 'labelled_cloud.ply' in done.stderr

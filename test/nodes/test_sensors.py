@@ -21,6 +21,7 @@ from segfloor_ros.messages.sensors import imu_message, imu_sample, wheel_message
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.sensor_input import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.stereo_input import DISCOVERY_S
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 FRAMES, BLIND = 14, range(6, 10)
@@ -206,3 +207,19 @@ def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
     # The floor fills the lowest rows of the picture.
     mask = grey8_image(masks[0], 'keyframe/floor_mask')
     assert (mask[-40:] == 255).mean() > 0.9
+
+
+def test_right_images_that_are_seen_late_are_taken_before_depth_images(make_graph) -> None:
+    graph = make_graph()
+    node = graph.add(StereoSlamNode())
+    graph.publisher('left/image_raw')
+    graph.publisher('depth/image_raw')
+    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), 1.0)
+    right = graph.publisher('right/image_raw')
+    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), DISCOVERY_S)
+    assert node.count_subscribers('right/image_raw') == 1
+    graph.tester.destroy_publisher(right)
+    graph.until(lambda: node.count_subscribers('depth/image_raw'), 'depth for want of right images')
+    graph.publisher('right/image_raw')
+    graph.until(lambda: node.count_subscribers('right/image_raw'), 'the right images again')
+    assert graph.comes(lambda: not node.count_subscribers('depth/image_raw'), 2.0)

@@ -1,8 +1,10 @@
-"""Messages of a bag file as Python objects, by `rosbags`, without a ROS install."""
+"""Messages of a bag file as Python objects: by `rosbags`, without a ROS install, or by the reader
+that a ROS install has.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +15,9 @@ BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
 TF_DEFINITION = 'geometry_msgs/TransformStamped[] transforms'
 MISSING_LIBRARY = (
-    'bags are read and written by the Python package rosbags: pip install rosbags, on Ubuntu 24.04 '
-    'with --break-system-packages or in a virtual environment; or let ROS play the bag: '
-    'ros2 launch segfloor_ros bag.launch.py bag:=BAG'
+    'bags are read by rosbag2_py of a ROS installation, or by the Python package rosbags, which '
+    'also writes them: pip install rosbags, on Ubuntu 24.04 with --break-system-packages or in a '
+    'virtual environment'
 )
 
 
@@ -26,26 +28,34 @@ class Topic(NamedTuple):
     num_messages: int
 
 
+ReadMessages = Callable[[Sequence[str]], Iterator[tuple[str, Any]]]
+"""Yields (topic, message) of some topics in the order of recording."""
+
+OpenBag = Callable[[Path], tuple[dict[str, Topic], ReadMessages]]
+
+_ros_reader: OpenBag | None = None
+
+
+def read_rosbag2_with(open_bag: OpenBag) -> None:
+    """Have rosbag2 files read by another library from now on. It may raise anything."""
+    global _ros_reader
+    _ros_reader = open_bag
+
+
 class BagFile:
     """An open bag. Message types are those of ROS 2 Jazzy or ROS 1 Noetic, so that other types
     in the bag do not matter.
     """
 
-    def __init__(self, path: Path, reader: Any, typestore: Any) -> None:
+    def __init__(self, path: Path, topics: dict[str, Topic], read: ReadMessages) -> None:
+        self.topics = topics
         self._path = path
-        self._reader = reader
-        is_ros1 = path.suffix == '.bag'
-        self._decode = typestore.deserialize_ros1 if is_ros1 else typestore.deserialize_cdr
-        self.topics = {
-            name: Topic(info.msgtype or '', info.msgcount) for name, info in reader.topics.items()
-        }
+        self._read = read
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
         """Yield (topic, message) of some topics in the order of recording."""
-        connections = [c for c in self._reader.connections if c.topic in topics]
         with _read_errors(self._path):
-            for connection, _, data in self._reader.messages(connections):
-                yield connection.topic, self._decode(data, connection.msgtype)
+            yield from self._read(topics)
 
 
 def is_bag(path: Path) -> bool:
@@ -58,22 +68,43 @@ def is_bag(path: Path) -> bool:
 @contextmanager
 def open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a rosbag2 folder, an mcap or sqlite3 file, or a ROS 1 bag. Raises InputError."""
+    path = _bag_path(path)
+    if _ros_reader is not None and path.suffix != '.bag':
+        with _read_errors(path):
+            found = _ros_reader(path)
+        yield BagFile(path, *found)
+        return
+    with _rosbags_reader(path) as (reader, decode):
+
+        def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
+            connections = [c for c in reader.connections if c.topic in names]
+            for connection, _, data in reader.messages(connections):
+                yield connection.topic, decode(data, connection.msgtype)
+
+        topics = {n: Topic(info.msgtype or '', info.msgcount) for n, info in reader.topics.items()}
+        yield BagFile(path, topics, read)
+
+
+@contextmanager
+def _rosbags_reader(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Open a bag with `rosbags`; yields its reader and what decodes a message."""
     try:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise InputError(f'{path}: {MISSING_LIBRARY}') from None
-    path = _bag_path(path)
     with _read_errors(path):
         if path.suffix == '.bag':
             reader: Any = rosbag1.Reader(path)
             typestore = get_typestore(Stores.ROS1_NOETIC)
             typestore.register(get_types_from_msg(TF_DEFINITION, 'tf2_msgs/msg/TFMessage'))
+            decode = typestore.deserialize_ros1
         else:
-            reader, typestore = rosbag2.Reader(path), get_typestore(Stores.ROS2_JAZZY)
+            reader = rosbag2.Reader(path)
+            decode = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
         reader.open()
     try:
-        yield BagFile(path, reader, typestore)
+        yield reader, decode
     finally:
         reader.close()
 
