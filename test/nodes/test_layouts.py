@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,30 @@ def nav2_node(monkeypatch):
     for node in made:
         node.destroy_node()
     rclpy.try_shutdown()
+
+
+def names_of(tree: dict[str, Any], prefix: str = '') -> Iterator[str]:
+    """Return the names of the parameters in a tree, levels separated by dots."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from names_of(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}'
+
+
+def test_every_name_of_a_parameter_is_one_that_nav2_knows() -> None:
+    """Key by key: a name that a node does not know is silently ignored there."""
+    known = yaml.safe_load((Path(__file__).parent / 'nav2_names.yaml').read_text())
+    ours = yaml.safe_load(NAV2.read_text())
+    ours |= {name: ours[name][name] for name in ('global_costmap', 'local_costmap')}
+    assert set(known['bringup']) - {'costmap'} == MANAGED_BY_NAV2
+    for node, sections in ours.items():
+        group = 'costmap' if node.endswith('costmap') else node
+        names = {name for kind in known.values() for name in kind.get(group, ())}
+        of_any = {name for name in names if '*' in name}
+        for name in names_of(sections['ros__parameters']):
+            any_name = re.sub(r'(?<=obstacle_layer\.)\w+(?=\.)', '*', name)
+            assert name in names or any_name in of_any, f'{node}: {name}'
 
 
 def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> None:
