@@ -357,3 +357,17 @@ def test_without_the_library_the_message_says_what_to_install(
     monkeypatch.setattr(builtins, '__import__', no_rosbags)
     with pytest.raises(InputError, match=r'pip install rosbags.*bag\.launch\.py'):
         opened(path)
+
+
+def test_stamps_may_differ_by_the_tolerance_that_is_set(tmp_path: Path) -> None:
+    pairs, late = grey_pairs(3), [stamp_ns + 15 * MS for stamp_ns in STAMPS[:3]]
+    messages = [
+        message
+        for stamps, side in ((STAMPS[:3], 'left'), (late, 'right'))
+        for message in stereo_messages(pairs, stamps)
+        if side in message.topic
+    ]
+    bag = mcap_file(tmp_path, messages)
+    with pytest.raises(InputError, match=r'raise stereo_camera\.pairing_tol'):
+        list(opened(bag).frames())
+    assert len(list(opened(bag, pairing_tolerance_s=0.02).frames())) == 3

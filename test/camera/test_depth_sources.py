@@ -32,6 +32,8 @@ from segfloor_ros.camera.depth import (
 )
 from segfloor_ros.camera.eye_calibration import EyeCalibration
 from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources.bag_topics import IMAGE, find_depth_topics
 from segfloor_ros.errors import InputError
 
 SCALE = FX * VIRTUAL_BASELINE_M
@@ -148,6 +150,15 @@ def test_depth_of_a_bag_is_that_of_its_registered_topic(tmp_path: Path, encoding
     frame = next(source.frames())
     np.testing.assert_allclose(frame.right[5:], SCALE / 1.5, rtol=1e-6)
     np.testing.assert_allclose(frame.left, grey_pairs(2)[0][0], atol=1)
+
+
+def test_of_two_depth_topics_the_one_that_is_set_is_taken() -> None:
+    types = dict.fromkeys(('/left/image_raw', '/a/depth', '/b/depth/image_raw'), IMAGE)
+    for topic in ('/a/depth', '/b/depth/image_raw'):
+        found = find_depth_topics('drive', types, StereoCameraSettings(depth_topic=topic))
+        assert found is not None and (found.right, found.right_is_depth) == (topic, True)
+    with pytest.raises(InputError, match='depth_topic to one of these: /a/depth, /b/depth/image'):
+        find_depth_topics('drive', types, StereoCameraSettings(depth_topic='/c/depth'))
 
 
 def test_a_stereo_bag_with_depth_stays_stereo_unless_asked(tmp_path: Path) -> None:

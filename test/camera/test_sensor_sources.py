@@ -187,6 +187,16 @@ def test_wheels_of_a_bag_are_found_by_type_and_truth_is_not_taken_for_them(tmp_p
     assert [m.T_wheels_base[0, 3] for m in measured(source)] == [1.0, 2.0]
 
 
+def test_of_two_topics_the_one_that_is_set_is_taken(tmp_path: Path) -> None:
+    wheels = [odometry_message(f'/{side}/odom', 100 * MS, x) for side, x in (('a', 1), ('b', 2))]
+    recording = bag(tmp_path, *wheels, imu_message(100 * MS, (0, -9.81, 0), ''))
+    source = opened(recording, wheel_odometry_topic='/b/odom', imu_topic='/imu/data')
+    assert [sensor.where for sensor in source.sensors] == ['/b/odom', '/imu/data']
+    assert measured(source)[0].T_wheels_base[0, 3] == 2.0
+    with pytest.raises(InputError, match='imu_topic'):
+        opened(recording, imu_topic='/imu/other')
+
+
 def test_the_imu_of_a_bag_is_turned_by_tf(tmp_path: Path) -> None:
     source = opened(bag(tmp_path, tf_message(), imu_message(100 * MS, (1, 2, 9.81), 'imu_link')))
     (sample,) = measured(source)

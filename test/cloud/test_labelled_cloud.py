@@ -127,6 +127,13 @@ def test_heights_of_far_points_count_less() -> None:
     assert label_of(distant) == {1: UNKNOWN}
 
 
+@pytest.mark.parametrize(('sigma_m', 'expected'), [(0.02, OBSTACLE), (0.08, UNKNOWN)])
+def test_heights_that_are_less_certain_count_less(sigma_m: float, expected: int) -> None:
+    labelling = CloudLabelling(CloudLabellingSettings(height_sigma_m=sigma_m))
+    points, seen = cloud({1: (1.0, 0.0, 0.07)}), features({1: NOWHERE})
+    assert label_of(labelling.update(points, seen, MASK, np.eye(4))) == {1: expected}
+
+
 def test_empty_cloud() -> None:
     labelled = CloudLabelling(CloudLabellingSettings()).update(cloud({}), features({}), MASK)
     assert labelled.label.shape == (0,)

@@ -183,6 +183,17 @@ def test_a_table_top_over_free_floor_is_occupied(make_drive: MakeDrive) -> None:
     assert (cells_at(drive.grid(), centres((2.0, 2.1), (0.0, 0.05))) == 100).any()
 
 
+@pytest.mark.parametrize(('use_points', 'expected'), [(True, 100), (False, 0)])
+def test_points_are_left_out_where_asked_for(
+    make_drive: MakeDrive, use_points: bool, expected: int
+) -> None:
+    drive = make_drive(OccupancyGridSettings(use_points=use_points))
+    edge = point_cloud([(2.02, 0.02, 0.7)], OBSTACLE)
+    for _ in range(10):
+        drive.look(ROOM, (0.0, 0.0, 0.0), edge)
+    assert cells_at(drive.grid(), np.array([[2.02, 0.02]])) == expected
+
+
 def test_one_outlier_marks_nothing(make_drive: MakeDrive) -> None:
     drive = make_drive(OccupancyGridSettings())
     drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.02, 0.02, 0.5)], OBSTACLE))

@@ -45,7 +45,7 @@ from segfloor_ros.messages.clouds import (
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.images import grey8_image, image_message
+from segfloor_ros.messages.images import compressed_message, grey8_image, image_message
 from segfloor_ros.messages.poses import (
     path_arrays,
     pose_array,
@@ -100,6 +100,20 @@ def test_the_camera_waits_for_somebody_who_listens(make_graph, tmp_path) -> None
     graph.until(lambda: len(received) == 2, 'both images')
     # The first frame was not sent before somebody listened.
     assert [to_ns(m.header.stamp) for m in received] == [f.stamp_ns for f in frames]
+
+
+def test_the_camera_compresses_as_it_is_told(make_graph, tmp_path) -> None:
+    (frame,), _ = room_drive(1)
+    folder = write_kitti(tmp_path / 'drive', [frame])
+    arguments = {'input': folder, 'image_transport': 'compressed', 'jpeg_quality': 30}
+    graph = make_graph(*(part for k, v in arguments.items() for part in ('-p', f'{k}:={v}')))
+    received = graph.collect('left/image_raw/compressed')
+    for name in ('right/image_raw/compressed', 'left/camera_info', 'right/camera_info'):
+        graph.collect(name)
+    graph.add(StereoCameraNode())
+    graph.until(lambda: received, 'the image')
+    expected = compressed_message(frame.stamp_ns, '', frame.left, 30)
+    assert bytes(received[0].data) == bytes(expected.data)
 
 
 class TestStereoSlam:

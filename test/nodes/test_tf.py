@@ -128,6 +128,15 @@ def test_the_chain_of_frames_leads_to_the_camera(start, drive) -> None:
         np.testing.assert_allclose(found, T_map_base, atol=0.005)
 
 
+def test_without_publish_tf_nothing_is_broadcast(start, drive) -> None:
+    frames, _ = drive
+    chain = start(publish_tf='false')
+    tf, odometry = Listener(chain.graph), chain.graph.collect('odometry')
+    chain.drive(frames[:3])
+    chain.graph.until(lambda: len(odometry) == 3, 'odometry')
+    assert not chain.graph.comes(lambda: tf.moving or tf.fixed, 0.3)
+
+
 def test_a_mount_on_tf_is_that_of_the_parameters(start, drive) -> None:
     """Over two links, as a camera's body stands between the base and its optical frame."""
     frames, _ = drive

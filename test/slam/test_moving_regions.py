@@ -50,6 +50,14 @@ def test_what_stands_in_front_of_what_was_seen_moves(regions):
     assert inside > 0.95 and outside == 0
 
 
+def test_what_a_single_view_saw_through_does_not_move():
+    made = MovingRegions(CAMERA)
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    for disparity in (wall, np.zeros_like(wall)):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), disparity)
+    assert found_share(made, noise(600), NEARER_PX) == (0.0, 0.0)
+
+
 def test_a_pattern_that_repeats_does_not_move(regions):
     tile = noise(round(FACTOR * (NEARER_PX - WALL_PX)))
     inside, _ = found_share(regions, np.tile(tile, 40)[:, :600], NEARER_PX)
