@@ -30,6 +30,7 @@ class PointTable:
     def __init__(self) -> None:
         self.point_id = np.zeros(0, np.int32)
         self._columns = _empty(0)
+        self._aside: dict[str, NDArray[Any]] | None = None
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return a column (N,), to be read and written."""
@@ -45,10 +46,15 @@ class PointTable:
         self._columns = {name: arrays[name].astype(kind) for name, (kind, _) in _COLUMNS.items()}
 
     def follow(self, point_id: NDArray[np.int32]) -> None:
-        """Make the rows those of the ids (N,), ascending."""
+        """Make the rows those of the ids (N,), ascending. What is known of a cloud waits for its
+        return where another one that shares no point takes its place.
+        """
+        self._bring_back(point_id)
         known, count = len(self.point_id), len(point_id)
         if not np.array_equal(point_id[:known], self.point_id):
             at, row = self.rows_of(point_id)
+            if known and not len(at):
+                self._aside = self.to_arrays()
             kept = _empty(count)
             for name, column in kept.items():
                 column[at] = self._columns[name][row]
@@ -58,6 +64,14 @@ class PointTable:
             for name, column in _empty(count - known + known // 4).items():
                 self._columns[name] = np.concatenate([self[name], column])
         self.point_id = point_id
+
+    def _bring_back(self, point_id: NDArray[np.int32]) -> None:
+        """Put what is known of an older cloud before the rest, once its points are there again."""
+        if self._aside is None or not np.isin(self._aside['point_id'], point_id).any():
+            return
+        latest, older = self.to_arrays(), self._aside
+        self.from_arrays({name: np.concatenate([older[name], latest[name]]) for name in latest})
+        self._aside = None
 
     def rows_of(self, ids: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return which of the ids (N,) are in the table, as indices (M,), and their rows (M,)."""

@@ -34,6 +34,7 @@ class OccupancyGridMapper:
         self._settings = settings
         self._history = EvidenceHistory(EvidenceFolder(settings))
         self._stamp_ns = np.zeros(0, np.int64)
+        self._aside: tuple[NDArray[np.int64], EvidenceHistory] | None = None
 
     def change_settings(self, settings: OccupancyGridSettings) -> None:
         """Map with changed live settings from now on, old evidence included."""
@@ -51,7 +52,8 @@ class OccupancyGridMapper:
         """Take in one keyframe, by its stamp; keyframes come in the order of their stamps.
 
         path: all keyframes as now optimised, this one among them; evidence of keyframes that are
-        no longer in it is forgotten. Raises MapError when the keyframe is not in the path.
+        no longer in it is forgotten, or where it is all there was, waits for their return. Raises
+        MapError when the keyframe is not in the path.
         """
         poses = _planar(path.T_map_base)
         self._follow(path.stamp_ns, poses)
@@ -82,9 +84,14 @@ class OccupancyGridMapper:
 
     def _follow(self, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
         """Move the evidence to the keyframes' poses (K, 3), where they moved enough to matter."""
+        self._bring_back(stamp_ns)
         row = np.minimum(np.searchsorted(stamp_ns, self._stamp_ns), len(stamp_ns) - 1)
         gone = stamp_ns[row] != self._stamp_ns
-        if gone.any():
+        if len(gone) and gone.all():
+            self._aside = self._stamp_ns, self._history
+            self._history = EvidenceHistory(EvidenceFolder(self._settings))
+            self._stamp_ns, row = self._stamp_ns[:0], row[:0]
+        elif gone.any():
             self._history.remove(gone)
             self._stamp_ns, row = self._stamp_ns[~gone], row[~gone]
         now, then = poses[row], self._history.poses
@@ -95,6 +102,19 @@ class OccupancyGridMapper:
         moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
         if len(moved):
             self._history.move(int(moved[0]), now[moved[0] :])
+
+    def _bring_back(self, stamp_ns: NDArray[np.int64]) -> None:
+        """Take in what was put aside, once its keyframes, which are older, are in the path again:
+        a drive with a map of its own has recognised the one that was loaded.
+        """
+        if self._aside is None or not np.isin(self._aside[0], stamp_ns).any():
+            return
+        (earlier, before), latest = self._aside, self._history
+        self._history, self._aside = EvidenceHistory(EvidenceFolder(self._settings)), None
+        for history in (before, latest):
+            for evidence, (x, y, yaw) in zip(history.evidence, history.poses.tolist(), strict=True):
+                self._history.append(evidence, (x, y, yaw))
+        self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
 
 
 def _planar(T_map_base: Array) -> NDArray[np.float64]:

@@ -18,11 +18,27 @@ class AdjustmentRunner:
         self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
         self._apply: Callable[[Any], None] | None = None
         self._result: Future[Any] = Future()
+        self._dropped = 0
 
     @property
     def idle(self) -> bool:
         """Whether nothing is being solved now."""
         return self._apply is None or self._result.done()
+
+    @property
+    def holds_one(self) -> bool:
+        """Whether there is an adjustment that was not collected yet."""
+        return self._apply is not None
+
+    def is_wanted(self) -> Callable[[], bool]:
+        """Return what tells the next adjustment whether it was dropped."""
+        number = self._dropped
+        return lambda: self._dropped == number
+
+    def drop(self) -> None:
+        """Forget an adjustment; one that is running is asked to end."""
+        self._dropped += 1
+        self._apply = None
 
     def submit(self, solve: Callable[[], Any], apply: Callable[[Any], None]) -> None:
         """Begin an adjustment; the one before must have been collected. solve: works on a copy and

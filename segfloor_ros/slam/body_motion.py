@@ -177,6 +177,10 @@ class BodyMotion:
         self._remark(self.gyroscope.remarks())
         self._learn_wheels(T_before_now, before_ns, stamp_ns)
 
+    def reset_world(self) -> None:
+        """Forget where up is: the world is another one."""
+        self.gravity = Gravity(self.gyroscope)
+
     def stop_learning(self) -> None:
         """Note that there is a frame without a pose from the images."""
         self._window = None

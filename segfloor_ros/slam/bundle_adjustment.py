@@ -5,6 +5,7 @@ Levenberg-Marquardt, Huber cost. One pose per stereo pair: the baseline is fixed
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, se3_exp, transform_points
 from segfloor_ros.slam.disparity_offset import NO_OFFSET, OffsetEstimate
+from segfloor_ros.slam.level_ground import LevelGround
 from segfloor_ros.slam.motion_links import Factor, cost, with_factors
 from segfloor_ros.slam.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.residuals import (
@@ -35,7 +37,7 @@ class BundleProblem:
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
     most once. offset: what was known before of the error that all disparities share. factors: what
-    wheels and an accelerometer measured of keyframes.
+    wheels and an accelerometer measured of keyframes. ground: what the base is known to stay on.
     """
 
     T_camera_world: Array
@@ -46,6 +48,7 @@ class BundleProblem:
     observations: Observations
     offset: OffsetEstimate = NO_OFFSET
     factors: tuple[Factor, ...] = ()
+    ground: LevelGround | None = None
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,15 @@ class BundleResult:
     offset: OffsetEstimate
 
 
-def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> BundleResult:
+def adjust(
+    camera: StereoCamera,
+    problem: BundleProblem,
+    iterations: int,
+    is_wanted: Callable[[], bool] = lambda: True,
+) -> BundleResult:
     """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
-    al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16).
+    al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16). It ends early when
+    the result is no longer wanted.
     """
     prior, order = problem.offset, np.argsort(problem.keyframe, kind='stable')
     problem = _take_observations(problem, order)
@@ -72,6 +81,8 @@ def adjust(camera: StereoCamera, problem: BundleProblem, iterations: int) -> Bun
     cost_before = state.cost
     damping, growth = 1e-4, 2.0
     for _ in range(iterations):
+        if not is_wanted():
+            break
         system = _linearise(camera, problem, state, prior)
         step = system.solve(damping)
         candidate = _apply(problem, step)
@@ -133,6 +144,8 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimat
     total = huber_cost(chi2, problem.observations.chi2_limit)
     total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
     total += sum(cost(factor, problem.T_camera_world) for factor in problem.factors)
+    if problem.ground is not None:
+        total += problem.ground.cost(problem.T_camera_world)
     return _State(points, residual, chi2, front, total)
 
 
@@ -154,6 +167,8 @@ def _linearise(
     system = normal_equations(camera, at).with_prior(
         prior.information, problem.offset.value_px - prior.value_px
     )
+    if problem.ground is not None:
+        system = problem.ground.added_to(system, problem.T_camera_world)
     return with_factors(system, problem.T_camera_world, problem.factors)
 
 

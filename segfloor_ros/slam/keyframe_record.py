@@ -31,6 +31,21 @@ class LoopEdge:
     T_i_j: Array
 
 
+@dataclass(frozen=True)
+class Match:
+    """A keyframe that sees a place of the map again. place: the keyframe that knows it best, both
+    by index. T_camera_world: (4, 4) the keyframe's camera as seen from there. rows, ids: (N,)
+    features and the place's points they show, stable_ids: (N,) of these.
+    """
+
+    keyframe: int
+    place: int
+    T_camera_world: Array
+    rows: NDArray[np.intp]
+    ids: NDArray[np.int32]
+    stable_ids: NDArray[np.int32]
+
+
 @dataclass
 class KeyframeRecord:
     """One keyframe of the map.

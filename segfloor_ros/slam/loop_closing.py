@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.fusion import fuse_duplicates
-from segfloor_ros.slam.keyframe_record import LoopEdge
-from segfloor_ros.slam.loops import Match
+from segfloor_ros.slam.keyframe_record import LoopEdge, Match
+from segfloor_ros.slam.level_ground import LevelGround
 from segfloor_ros.slam.pose_graph import PoseGraph, optimise
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -37,7 +37,9 @@ class Closing:
     graph: PoseGraph
 
 
-def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
+def plan_closing(
+    sparse_map: SparseMap, matches: list[Match], ground: LevelGround | None = None
+) -> Closing:
     """Copy the pose graph out of the map, with a loop from each keyframe that sees the place."""
     keyframes = sparse_map.keyframes
     poses = np.stack([k.T_camera_world for k in keyframes])
@@ -62,6 +64,7 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
         sigma,
         # What is new is expected to pull; what was found before must go on to fit.
         (np.arange(len(sigma)) >= len(i)) & (np.arange(len(sigma)) < len(sigma) - len(new)),
+        ground,
     )
     return Closing(matches, new, graph)
 
@@ -92,11 +95,15 @@ def apply_closing(
     sparse_map.loops += closing.edges
     for match in closing.matches:
         _merge(sparse_map, match)
-    latest = closing.matches[-1].keyframe
+    fuse_latest(camera, sparse_map, closing.matches[-1].keyframe)
+    return True
+
+
+def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> None:
+    """Merge what the keyframes up to the latest know twice, now that both ends are one map."""
     for keyframe in sparse_map.keyframes[max(0, latest - FUSED_KEYFRAMES) : latest + 1]:
         if keyframe.retired is None:
             fuse_duplicates(camera, sparse_map, keyframe)
-    return True
 
 
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
@@ -125,8 +132,13 @@ def _merge(sparse_map: SparseMap, match: Match) -> None:
     if keyframe.retired is not None:
         return
     same = sparse_map.alive[match.ids] & (sparse_map.stable_id[match.ids] == match.stable_ids)
-    own, old = keyframe.point_id[match.rows], match.ids
-    pairs = same & (own != NO_POINT) & (own != old)
+    own = np.where(same, keyframe.point_id[match.rows], NO_POINT)
+    merge_pairs(sparse_map, own, match.ids)
+
+
+def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np.integer]) -> None:
+    """Make one of each pair (own[i], old[i]), (N,), of point rows; -1 is no point."""
+    pairs = (own >= 0) & (old >= 0) & (own != old)
     own, old = own[pairs], old[pairs]
     _, first = np.unique(own, return_index=True)
     own, old = own[first], old[first]

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.geometry import Array
-from segfloor_ros.map_file import Arrays, check_lengths, joined, split
+from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.keyframe_record import KeyframeRecord, LoopEdge, Retirement
 from segfloor_ros.slam.residuals import Observations
@@ -24,10 +24,6 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
     """Return a map as arrays; points are numbered anew in the order of their ids."""
     alive = np.flatnonzero(sparse_map.alive)
     alive = alive[np.argsort(sparse_map.stable_id[alive])]
-    arrays: Arrays = {
-        f'point_{name}': column.rows[alive].astype(kind)
-        for name, (column, kind) in sparse_map.point_columns().items()
-    }
     new_row = np.full(len(sparse_map.alive) + 1, NO_POINT, np.int32)
     new_row[alive] = np.arange(len(alive), dtype=np.int32)
     keyframes = sparse_map.keyframes
@@ -42,8 +38,7 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
     )
     retired = [_followed(sparse_map, k) for k in keyframes]
     loops = sparse_map.loops
-    return arrays | {
-        'num_ever': np.array([sparse_map.num_ever]),
+    return sparse_map.points.to_arrays(alive) | {
         'keyframe_frame_index': np.array([k.frame_index for k in keyframes], np.int64),
         'keyframe_stamp_ns': np.array([k.stamp_ns for k in keyframes], np.int64),
         'keyframe_T_camera_world': _stack([k.T_camera_world for k in keyframes]),
@@ -62,21 +57,32 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
 
 
 def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
-    """Fill an empty map. Raises KeyError or ValueError for arrays that are no map."""
-    columns = sparse_map.point_columns()
-    check_lengths({name: arrays[f'point_{name}'] for name in columns})
-    for name, (column, _) in columns.items():
-        column.extend(arrays[f'point_{name}'])
-    sparse_map.count_points(int(arrays['num_ever'][0]))
-    for index, record in enumerate(_keyframes(arrays, sparse_map.descriptor)):
+    """Add a map, whose stable ids come later, to one without gaps: an empty one, or one that was
+    filled like this. Raises KeyError or ValueError for arrays that are no map.
+    """
+    first, first_row = len(sparse_map.keyframes), len(sparse_map.alive)
+    sparse_map.points.from_arrays(arrays, first)
+    descriptor = sparse_map.descriptor[first_row:]
+    for index, record in enumerate(_keyframes(arrays, descriptor, first, first_row), first):
         if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
             raise ValueError('features of points that are not there')
         sparse_map.restore(record)
-    ends = zip(arrays['loop_ends'].tolist(), arrays['loop_T_i_j'], strict=True)
+    ends = zip((arrays['loop_ends'] + first).tolist(), arrays['loop_T_i_j'], strict=True)
     sparse_map.loops += [LoopEdge(i, j, T) for (i, j), T in ends]
 
 
-def _keyframes(arrays: Arrays, descriptor: NDArray[np.uint8]) -> list[KeyframeRecord]:
+def moved(arrays: Arrays, T_new_old: Array) -> Arrays:
+    """Return a map seen from another world frame."""
+    return arrays | {
+        'point_xyz_world': transform_points(T_new_old, arrays['point_xyz_world']),
+        'point_viewing_direction': arrays['point_viewing_direction'] @ T_new_old[:3, :3].T,
+        'keyframe_T_camera_world': arrays['keyframe_T_camera_world'] @ invert(T_new_old),
+    }
+
+
+def _keyframes(
+    arrays: Arrays, descriptor: NDArray[np.uint8], first: int, first_row: int
+) -> list[KeyframeRecord]:
     length = arrays['keyframe_features']
     uvd, sigma, octave, point = (
         split(arrays[f'feature_{name}'], length)
@@ -89,18 +95,18 @@ def _keyframes(arrays: Arrays, descriptor: NDArray[np.uint8]) -> list[KeyframeRe
         features = Features(uvd[k][:, :2].copy(), octave[k], descriptor[point[k]])
         observations = Observations(uvd[k].astype(np.float64), sigma[k].astype(np.float64))
         follows = int(arrays['keyframe_follows'][k])
-        retired = Retirement(follows, arrays['keyframe_T_camera_followed'][k])
+        retired = Retirement(first + follows, arrays['keyframe_T_camera_followed'][k])
         records.append(
             KeyframeRecord(
-                k,
+                first + k,
                 int(arrays['keyframe_frame_index'][k]),
                 stamp_ns,
                 arrays['keyframe_T_camera_world'][k],
                 features,
                 observations,
-                point[k].copy(),
+                (first_row + point[k]).astype(np.int32),
                 retired=retired if follows != NO_POINT else None,
-                links=tuple(links[k].tolist()),
+                links=tuple((first + links[k]).tolist()),
             )
         )
     return records

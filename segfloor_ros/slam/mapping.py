@@ -16,6 +16,7 @@ from segfloor_ros.slam.disparity_offset import DisparityOffset
 from segfloor_ros.slam.fusion import fuse_duplicates
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.level_ground import LevelGround
 from segfloor_ros.slam.motion_links import factors_of
 from segfloor_ros.slam.point_measurement import measure_disparity
 from segfloor_ros.slam.redundancy import retire_redundant
@@ -75,6 +76,7 @@ class LocalMapper:
 
     def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
         self._camera = camera
+        self.ground: LevelGround | None = None
         self.offset = DisparityOffset(settings.disparity_offset_sigma_px, 1.0 / LOCAL_KEYFRAMES)
 
     def measure_stereo(
@@ -192,6 +194,7 @@ class LocalMapper:
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
             factors_of(sparse_map.keyframes, slot, up_world),
+            self.ground,
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 

@@ -41,13 +41,17 @@ class CameraMotion:
     """
 
     def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
+        self._body = body
+        self._max_speed_mps = max_speed_mps
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at the origin."""
         self.T_camera_world: Array = np.eye(4)
         self.covariance: Array = np.zeros((6, 6))
         self.T_world_odom: Array = np.eye(4)
         self.is_lost = False
         self.carried_by = ''
-        self._body = body
-        self._max_speed_mps = max_speed_mps
         self._velocity: Array = np.zeros(6)
         self._last_stamp_ns = 0
         self._seen_ns = 0

@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.residuals import weighted_jacobian, with_moment
+from segfloor_ros.slam.sparse_solution import solve_complement
 
 SMALLEST_PIVOT = 1e-12
+
+DENSE_KEYFRAMES = 60
+"""More of them, most of which share no point, are solved as a sparse system."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class System:
         diagonal = np.einsum('aap->ap', self.V)
         V = self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9)
         L_inverse = inverse_cholesky(V)
+        if len(self.U) > DENSE_KEYFRAMES:
+            return self._solve_sparse(damping, L_inverse)
         Y = self._reduced(L_inverse)
         y_offset = _times_lower(L_inverse, self.offset_point).ravel()
         y_rhs = _times_lower(L_inverse, self.point_rhs).ravel()
@@ -93,12 +99,36 @@ class System:
         twists = solution[:-1].reshape(-1, 6)
         return Step(twists, shifts, float(solution[-1]), 1.0 / float(variances[-1]))
 
+    def _solve_sparse(self, damping: float, L_inverse: Array) -> Step:
+        diagonal = np.einsum('kaa->ka', self.U)
+        U = self.U + np.eye(6) * (damping * diagonal + 1e-9)[:, None]
+        y = [_times_lower(L_inverse, of_point) for of_point in (self.point_rhs, self.offset_point)]
+        x, rhs, back = solve_complement(
+            U,
+            np.ascontiguousarray(self._blocks(L_inverse).transpose(2, 0, 1)),
+            self.starts,
+            self.point,
+            np.stack(y, axis=-1).swapaxes(0, 1),
+            np.stack([self.camera_rhs, self.offset_camera], axis=-1),
+            self.between,
+        )
+        information = self.offset_offset - float((y[1] ** 2).sum() + rhs[:, 1] @ x[:, 1])
+        offset = self.offset_rhs - float((y[0] * y[1]).sum() + rhs[:, 1] @ x[:, 0])
+        offset /= information
+        only = np.array([1.0, -offset])
+        shifts = np.einsum('bap,pb->pa', L_inverse, back @ only)
+        return Step((x @ only).reshape(-1, 6), shifts, offset, information)
+
+    def _blocks(self, L_inverse: Array) -> Array:
+        """Return the blocks (6, 3, M) of Y."""
+        of_observation = L_inverse[:, :, self.point]
+        blocks = _times_lower(of_observation[:, :, None], np.swapaxes(self.W, 0, 1))
+        return np.swapaxes(blocks, 0, 1)
+
     def _reduced(self, L_inverse: Array) -> Array:
         """Return Y (6 K, 3 P), zero where a camera does not see a point."""
         Y = np.zeros((len(self.U), 6, 3, self.V.shape[2]))
-        of_observation = L_inverse[:, :, self.point]
-        blocks = _times_lower(of_observation[:, :, None], np.swapaxes(self.W, 0, 1))
-        blocks = np.swapaxes(blocks, 0, 1)
+        blocks = self._blocks(L_inverse)
         for k, rows in enumerate(Y):
             mine = slice(self.starts[k], self.starts[k + 1])
             rows[:, :, self.point[mine]] = blocks[:, :, mine]

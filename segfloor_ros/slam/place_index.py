@@ -19,6 +19,10 @@ class PlaceIndex:
     """
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all keyframes."""
         self._keyframes = [array('i') for _ in range(NUM_WORDS)]
         self._words: dict[int, NDArray[np.int32]] = {}
 

@@ -19,7 +19,6 @@ from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.place_index import PlaceIndex
-from segfloor_ros.slam.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import Track
@@ -55,6 +54,10 @@ class PlaceRecognition:
         """Take in a keyframe."""
         self._index.add(keyframe.index, self._vocabulary.words(keyframe.features.descriptor))
 
+    def reset(self) -> None:
+        """Begin again with an empty map."""
+        self._index.reset()
+
     def to_arrays(self) -> Arrays:
         """Return the words of all keyframes."""
         words, length = joined(
@@ -63,9 +66,9 @@ class PlaceRecognition:
         return {'words': words.astype(np.uint16), 'word_count': length}
 
     def from_arrays(self, arrays: Arrays) -> None:
-        """Take in the words of all keyframes."""
-        for k, words in enumerate(split(arrays['words'], arrays['word_count'])):
-            self._index.add(k, words.astype(np.int32))
+        """Take in the words of the keyframes that come next."""
+        for words in split(arrays['words'], arrays['word_count']):
+            self._index.add(len(self._index), words.astype(np.int32))
 
     def score(self, features: Features) -> Array:
         """Return how much each keyframe (K,) looks like a view, in [0, 1]; those that are retired
@@ -131,12 +134,6 @@ class PlaceRecognition:
         full = there >= MIN_EXPECTED
         agree = seen >= 0.5 * MIN_FOUND_SHARE * there
         return bool(full.any() and agree[full].mean() >= MIN_CELLS_SHARE)
-
-    def project(self, points: Array) -> Array:
-        """Return the pixels (N, 2) of points (N, 3) of an optical frame; NaN behind the camera."""
-        front = points[:, 2] > MIN_DEPTH_M
-        uv = self._camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))[:, :2]
-        return np.where(front[:, None], uv, np.nan)
 
     def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
         """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""

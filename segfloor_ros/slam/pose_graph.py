@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
+from segfloor_ros.slam.level_ground import LevelGround
 
 STEPS = 20
 CONVERGED = 1e-4
@@ -28,7 +29,7 @@ six degrees of freedom."""
 class PoseGraph:
     """T_camera_world: (K, 4, 4). Edge m (M in total) says that camera i[m] sees camera j[m] at
     T_i_j[m] (M, 4, 4), to sigma (M, 6) in metres and radians. is_robust: (M,) which edges
-    may be wrong. fixed: (K,) which cameras stay.
+    may be wrong. fixed: (K,) which cameras stay. ground: what the base is known to stay on.
     """
 
     T_camera_world: Array
@@ -38,6 +39,7 @@ class PoseGraph:
     T_i_j: Array
     sigma: Array
     is_robust: NDArray[np.bool_]
+    ground: LevelGround | None = None
 
 
 def optimise(graph: PoseGraph) -> tuple[Array, Array]:
@@ -46,13 +48,13 @@ def optimise(graph: PoseGraph) -> tuple[Array, Array]:
     """
     poses = graph.T_camera_world
     error = _errors(graph, poses)
-    weight, cost = _robust(graph, error)
+    weight, cost = _robust(graph, error, poses)
     damping = 1e-6
     for _ in range(STEPS):
         step = _solve(graph, poses, error, weight, damping)
         candidate = se3_exp(step) @ poses
         trial = _errors(graph, candidate)
-        trial_weight, trial_cost = _robust(graph, trial)
+        trial_weight, trial_cost = _robust(graph, trial, candidate)
         if trial_cost > cost:
             damping *= 10.0
             continue
@@ -70,12 +72,13 @@ def _errors(graph: PoseGraph, poses: Array) -> Array:
     return se3_logs(T_i_j @ invert(graph.T_i_j)) / graph.sigma
 
 
-def _robust(graph: PoseGraph, error: Array) -> tuple[Array, float]:
+def _robust(graph: PoseGraph, error: Array, poses: Array) -> tuple[Array, float]:
     """Return the weights (M,) of the edges and the cost (Geman-McClure for the robust ones)."""
     chi2 = (error**2).sum(axis=1)
     share = LOOP_KERNEL / (LOOP_KERNEL + chi2)
     weight = np.where(graph.is_robust, share**2, 1.0)
-    return weight, float(np.where(graph.is_robust, share * chi2, chi2).sum())
+    cost = float(np.where(graph.is_robust, share * chi2, chi2).sum())
+    return weight, cost if graph.ground is None else cost + graph.ground.cost(poses)
 
 
 def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping: float) -> Array:
@@ -91,11 +94,19 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     J = sparse.bsr_array(
         (blocks, columns, 2 * np.arange(edges + 1)), shape=(6 * edges, 6 * count)
     ).tocsr()
+    residual = (np.sqrt(weight)[:, None] * error).ravel()
+    if graph.ground is not None:
+        of_ground, J_ground = graph.ground.errors(poses)
+        rows = sparse.bsr_array(
+            (J_ground, np.arange(count), np.arange(count + 1)), shape=(3 * count, 6 * count)
+        )
+        J = sparse.csr_array(sparse.vstack([J, rows]))
+        residual = np.append(residual, of_ground)
     moving = np.flatnonzero(np.repeat(~graph.fixed, 6))
     J = J[:, moving]
     H = (J.T @ J).tocsc()
     diagonal = H.diagonal()
-    g = J.T @ (np.sqrt(weight)[:, None] * error).ravel()
+    g = J.T @ residual
     step = np.zeros(6 * count)
     added = (damping * diagonal + 1e-12)[None]
     damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()

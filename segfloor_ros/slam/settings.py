@@ -71,6 +71,11 @@ class StereoSlamSettings(StageSettings):
         minimum=0.1,
         maximum=100.0,
     )
+    level_ground: bool = setting(
+        False,
+        'The base stays on one level plane: no ramps, no sills, no second floor. Takes away the '
+        'drift in height, pitch and roll.',
+    )
     detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
     mask_dilation_px: int = setting(
         5,

@@ -7,18 +7,26 @@ optical frame of the first frame.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.growing_array import GrowingArray
 from segfloor_ros.slam.keyframe_record import KeyframeRecord, LoopEdge, Retirement
-from segfloor_ros.slam.patch_alignment import SIDE_PX
+from segfloor_ros.slam.point_rows import PointRows
 from segfloor_ros.slam.results import NO_POINT
 
 GONE_AFTER = 3  # keyframes that have seen through a point since it was last found
+
+OF_POSITION = ('xyz_world', 'patch', 'patch_distance_m')
+OF_LOOK = (
+    'descriptor',
+    'viewing_distance_m',
+    'viewing_octave',
+    'viewing_direction',
+    'seen_last',
+)
+"""Columns that go together when two points are merged."""
 
 MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
@@ -28,25 +36,16 @@ class SparseMap:
     """Points, keyframes and who observes whom."""
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self, num_ever: int = 0) -> None:
+        """Begin again with an empty map. num_ever: the first stable id."""
         self.keyframes: list[KeyframeRecord] = []
         self.loops: list[LoopEdge] = []
         self._retired: list[KeyframeRecord] = []
-        self._xyz = GrowingArray((3,), np.float64)
-        self._descriptor = GrowingArray((32,), np.uint8)
-        self._patch = GrowingArray((SIDE_PX, SIDE_PX), np.uint8)
-        self._patch_distance = GrowingArray((), np.float64)
-        self._viewing_distance = GrowingArray((), np.float64)
-        self._viewing_octave = GrowingArray((), np.float64)
-        self._viewing_direction = GrowingArray((3,), np.float64)
-        self._num_ever = 0
-        self._stable_id = GrowingArray((), np.int32)
-        self._alive = GrowingArray((), np.bool_)
-        self._visible_count = GrowingArray((), np.int32)
-        self._found_count = GrowingArray((), np.int32)
-        self._observer_count = GrowingArray((), np.int32)
-        self._seen_through_count = GrowingArray((), np.int32)
-        self._born = GrowingArray((), np.int32)
-        self._seen_last = GrowingArray((), np.int32)
+        self._points = PointRows(num_ever)
+        self._links = GrowingArray((2,), np.intp)
+        self._linked = 0
         self._edge_point = GrowingArray((), np.int32)
         self._edge_keyframe = GrowingArray((), np.int32)
         self._edge_row = GrowingArray((), np.int32)
@@ -54,22 +53,22 @@ class SparseMap:
     @property
     def xyz_world(self) -> Array:
         """Positions (P, 3) of all points, a writable view indexed by row."""
-        return self._xyz.rows
+        return self._points['xyz_world']
 
     @property
     def stable_id(self) -> NDArray[np.int32]:
         """The id (P,) of each point, ascending with its age and never used again."""
-        return self._stable_id.rows
+        return self._points['stable_id']
 
     @property
     def alive(self) -> NDArray[np.bool_]:
         """Whether each point (P,) is part of the map."""
-        return self._alive.rows
+        return self._points['alive']
 
     @property
     def descriptor(self) -> NDArray[np.uint8]:
         """Descriptors (P, 32) as last seen by a keyframe."""
-        return self._descriptor.rows
+        return self._points['descriptor']
 
     @property
     def patch(self) -> NDArray[np.uint8]:
@@ -77,63 +76,44 @@ class SparseMap:
         image stays about the same: every change of patch adds an error to the point's
         position.
         """
-        return self._patch.rows
+        return self._points['patch']
 
     @property
     def patch_distance_m(self) -> Array:
         """Distance (P,) from which the patch was taken."""
-        return self._patch_distance.rows
+        return self._points['patch_distance_m']
 
     @property
     def viewing_distance_m(self) -> Array:
         """Distance (P,) from which the descriptor was taken."""
-        return self._viewing_distance.rows
+        return self._points['viewing_distance_m']
 
     @property
     def viewing_octave(self) -> Array:
         """Pyramid level (P,) at which the descriptor was taken."""
-        return self._viewing_octave.rows
+        return self._points['viewing_octave']
 
     @property
     def viewing_direction(self) -> Array:
         """Unit vectors (P, 3) from the camera to the point, in world axes, when the descriptor
         was taken.
         """
-        return self._viewing_direction.rows
+        return self._points['viewing_direction']
 
     @property
     def observer_count(self) -> NDArray[np.int32]:
         """Number of keyframes (P,) that observe each point."""
-        return self._observer_count.rows
+        return self._points['observer_count']
+
+    @property
+    def points(self) -> PointRows:
+        """All that is known of the points."""
+        return self._points
 
     @property
     def num_ever(self) -> int:
         """How many points there have been: the next stable id."""
-        return self._num_ever
-
-    def point_columns(self) -> dict[str, tuple[GrowingArray, type]]:
-        """Return what is known of points, by name, and the type that is exact enough for a file."""
-        return {
-            'xyz_world': (self._xyz, np.float64),
-            'stable_id': (self._stable_id, np.int32),
-            'descriptor': (self._descriptor, np.uint8),
-            'patch': (self._patch, np.uint8),
-            'patch_distance_m': (self._patch_distance, np.float32),
-            'viewing_distance_m': (self._viewing_distance, np.float32),
-            'viewing_octave': (self._viewing_octave, np.float32),
-            'viewing_direction': (self._viewing_direction, np.float32),
-            'visible_count': (self._visible_count, np.int32),
-            'found_count': (self._found_count, np.int32),
-            'seen_through_count': (self._seen_through_count, np.int32),
-            'born': (self._born, np.int32),
-            'seen_last': (self._seen_last, np.int32),
-        }
-
-    def count_points(self, num_ever: int) -> None:
-        """Take the points of the columns as they are, in a map that was empty."""
-        self._num_ever = num_ever
-        self._alive.extend(np.ones(len(self.stable_id), bool))
-        self._observer_count.lengthen(len(self.stable_id))
+        return self._points.num_ever
 
     def restore(self, keyframe: KeyframeRecord) -> None:
         """Add a keyframe whose points are there already."""
@@ -146,8 +126,11 @@ class SparseMap:
         """Return the pairs (M,), (M,) of keyframes, by index, that shared points when the later one
         was made.
         """
-        pairs = [(k.index, other) for k in self.keyframes for other in k.links]
-        i, j = np.array(pairs, np.intp).reshape(-1, 2).T
+        for keyframe in self.keyframes[self._linked :]:
+            others = np.array(keyframe.links, np.intp)
+            self._links.extend(np.column_stack([np.full(len(others), keyframe.index), others]))
+        self._linked = len(self.keyframes)
+        i, j = self._links.rows.T
         return i, j
 
     def living(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -169,7 +152,7 @@ class SparseMap:
         sees take on its view of them.
         """
         self.keyframes.append(keyframe)
-        keyframe.point_id[new_rows] = self._add_points(new_xyz_world, keyframe.index)
+        keyframe.point_id[new_rows] = self._new_points(new_xyz_world, keyframe.index)
         self._link(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT), patches)
 
     def add_points_between(
@@ -184,37 +167,13 @@ class SparseMap:
         """Add points (N, 3) that two keyframes of the map see with their features `rows`,
         `other_rows` (N,). patches: as in `add_keyframe`, of the first.
         """
-        ids = self._add_points(xyz_world, keyframe.index)
+        ids = self._new_points(xyz_world, keyframe.index)
         keyframe.point_id[rows] = other.point_id[other_rows] = ids
         self._link(keyframe, rows, patches)
         self._add_edges(other, other_rows)
 
-    def _add_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
-        count = len(xyz_world)
-        rows_free = np.flatnonzero(~self.alive)[:count]
-        fresh = count - len(rows_free)
-        new_rows = len(self.alive) + np.arange(fresh)
-        rows: NDArray[np.int32] = np.concatenate([rows_free, new_rows], dtype=np.int32)
-        initial: list[tuple[GrowingArray, Any]] = [
-            (self._xyz, xyz_world),
-            (self._stable_id, self._num_ever + np.arange(count)),
-            (self._patch_distance, 0.0),
-            (self._alive, True),
-            (self._visible_count, 1),
-            (self._found_count, 1),
-            (self._seen_through_count, 0),
-            (self._observer_count, 0),
-            (self._born, born),
-            (self._seen_last, born),
-        ]
-        seen = [self._descriptor, self._patch, self._viewing_distance]
-        seen += [self._viewing_octave, self._viewing_direction]
-        for array in [*seen, *(array for array, _ in initial)]:
-            array.lengthen(fresh)
-        for array, value in initial:
-            array.rows[rows] = value
-        self._num_ever += count
-        return rows
+    def _new_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
+        return self._points.add(len(xyz_world), xyz_world=xyz_world, born=born, seen_last=born)
 
     def _add_edges(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
         ids = keyframe.point_id[rows]
@@ -231,7 +190,7 @@ class SparseMap:
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
         self.descriptor[ids] = keyframe.features.descriptor[rows]
-        self._seen_last.rows[ids] = keyframe.index
+        self._points['seen_last'][ids] = keyframe.index
         self.viewing_distance_m[ids] = distance
         self.viewing_octave[ids] = keyframe.features.octave[rows]
         self.viewing_direction[ids] = sight / distance[:, None]
@@ -303,17 +262,14 @@ class SparseMap:
         of. The better known one gives the position and the patch, the one seen last the look.
         """
         better = self.observer_count[gone] > self.observer_count[kept]
-        later = self._seen_last.rows[gone] > self._seen_last.rows[kept]
-        view = (self._descriptor, self._viewing_distance, self._viewing_octave)
-        for arrays, chosen in (
-            ((self._xyz, self._patch, self._patch_distance), better),
-            ((*view, self._viewing_direction, self._seen_last), later),
-        ):
-            for array in arrays:
-                array.rows[kept[chosen]] = array.rows[gone[chosen]]
-        for counts in (self._visible_count, self._found_count, self._observer_count):
-            counts.rows[kept] += counts.rows[gone]
-        self._born.rows[kept] = np.minimum(self._born.rows[kept], self._born.rows[gone])
+        later = self._points['seen_last'][gone] > self._points['seen_last'][kept]
+        for names, chosen in ((OF_POSITION, better), (OF_LOOK, later)):
+            for name in names:
+                self._points[name][kept[chosen]] = self._points[name][gone[chosen]]
+        for name in ('visible_count', 'found_count', 'observer_count'):
+            self._points[name][kept] += self._points[name][gone]
+        born = self._points['born']
+        born[kept] = np.minimum(born[kept], born[gone])
         self._rename(kept, gone)
         self.alive[gone] = False
 
@@ -333,26 +289,26 @@ class SparseMap:
 
     def note_tracking(self, visible: NDArray[np.integer], found: NDArray[np.integer]) -> None:
         """Count that points should have been seen in a frame, and which of them were."""
-        self._visible_count.rows[visible] += 1
-        self._found_count.rows[found] += 1
-        self._seen_through_count.rows[found] = 0
+        self._points['visible_count'][visible] += 1
+        self._points['found_count'][found] += 1
+        self._points['seen_through_count'][found] = 0
 
     def note_seen_through(self, ids: NDArray[np.integer]) -> None:
         """Count that a keyframe saw what lies behind points."""
-        self._seen_through_count.rows[ids] += 1
+        self._points['seen_through_count'][ids] += 1
 
     def reliability(self, ids: NDArray[np.integer]) -> Array:
         """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
-        return self._found_count.rows[ids] / (self._visible_count.rows[ids] + 2.0)
+        return self._points['found_count'][ids] / (self._points['visible_count'][ids] + 2.0)
 
     def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
         saw although made before keyframe `settled_before`.
         """
-        found = self._found_count.rows
-        seldom = found < min_found_ratio * self._visible_count.rows
-        seldom |= self._seen_through_count.rows >= GONE_AFTER
-        lonely = (self._born.rows < settled_before) & (self.observer_count < 2)
+        found = self._points['found_count']
+        seldom = found < min_found_ratio * self._points['visible_count']
+        seldom |= self._points['seen_through_count'] >= GONE_AFTER
+        lonely = (self._points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
     def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -374,6 +330,10 @@ class SparseMap:
         for k in keyframe_indices:
             observed[self.keyframes[k].point_id] = True
         return np.flatnonzero(observed[:-1]).astype(np.int32)
+
+    def edges(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Return all observations as `edges_of`."""
+        return self._edge_point.rows, self._edge_keyframe.rows, self._edge_row.rows
 
     def edges_of(
         self, ids: NDArray[np.integer]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,10 +13,9 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement
-from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
+from segfloor_ros.slam.back_end import BackEnd
 from segfloor_ros.slam.body_motion import BodyMotion
 from segfloor_ros.slam.consensus import Consensus
-from segfloor_ros.slam.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.firm_points import count_firm
@@ -26,15 +26,12 @@ from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.local_map import LocalMap
-from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
-from segfloor_ros.slam.loops import LoopDetector
+from segfloor_ros.slam.loops import Candidate
 from segfloor_ros.slam.map_arrays import fill_map, map_to_arrays
-from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.motion import CameraMotion
 from segfloor_ros.slam.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.patch_alignment import sample_patches
-from segfloor_ros.slam.place_recognition import PlaceRecognition
 from segfloor_ros.slam.relocalisation import Relocaliser, is_within
 from segfloor_ros.slam.results import NO_POINT, FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -58,6 +55,9 @@ blind stretch."""
 
 MAX_BLIND_SIGMA_M = 0.5
 """Uncertainty of the pose up to which keyframes are made of it."""
+
+START_NS, RESUMING_NS = 1_000_000_000, 5_000_000_000
+"""For how long a drive, new or going on, is looked for in the map that was loaded."""
 
 UNKNOWN_COVARIANCE = 1e6
 NOTHING_SEEN = 'too few known points in view'
@@ -87,7 +87,6 @@ class StereoSlam:
         self._mount_meter = mount_meter
         self._camera = camera
         self._settings = settings
-        self._background = background
         self._times = times or StageTimes()
         self._extractor = FeatureExtractor(settings)
         self._frozen = FrozenCheck()
@@ -98,21 +97,30 @@ class StereoSlam:
         self._consensus = Consensus(camera)
         self._follower = Follower(camera, self._consensus, settings.tracked_points)
         self._tracker = Tracker(camera, self._consensus)
-        self._mapper = LocalMapper(camera, settings)
-        self._places = PlaceRecognition(camera, self._tracker, self.map)
-        self._loops = LoopDetector(self.map, self._places)
-        self._relocaliser = Relocaliser(self.map, self._places)
-        self.loop_count = 0
-        self._adjusting = AdjustmentRunner(background)
+        self._back_end = BackEnd(camera, settings, self.map, self._tracker, background)
+        self._relocaliser = Relocaliser(self.map, self._back_end.places)
         self._held = HeldResults()
         self._moving = MotionSearch(camera) if settings.detect_moving else None
         self._frames_since_keyframe = 0
-        self._is_fixed = self._is_closing = False
+        self._is_fixed = False
+        self._not_found_yet: Arrays | None = None
+        self._first_ns: int | None = None
+        self._patience_ns = START_NS
 
     @property
     def disparity_offset_px(self) -> float:
         """The error that all disparities share, measured minus true, as estimated so far."""
-        return self._mapper.offset.value_px
+        return self._back_end.offset_px
+
+    @property
+    def loop_count(self) -> int:
+        """How many loops were closed."""
+        return self._back_end.loop_count
+
+    @property
+    def loop_candidates(self) -> Sequence[Candidate]:
+        """What was taken for a place seen again lately, and what became of it."""
+        return self._back_end.loops.candidates
 
     @property
     def T_world_odom(self) -> Array:
@@ -122,7 +130,7 @@ class StereoSlam:
     @property
     def is_adjusting(self) -> bool:
         """Whether the map is being adjusted beside tracking."""
-        return not self._adjusting.idle
+        return not self._back_end.idle
 
     @property
     def sensors(self) -> BodyMotion:
@@ -153,6 +161,7 @@ class StereoSlam:
             track = self._track(frame, images) if self.map.keyframes and not fault else None
             if track is None and self.map.keyframes:
                 self._bridge(frame, fault)
+                self._map_apart(frame.stamp_ns)
         is_wanted = not fault and self._wants_keyframe(track)
         searched = None
         if self._moving is not None and self._moving.is_due(is_wanted, track is not None):
@@ -173,9 +182,7 @@ class StereoSlam:
     def to_arrays(self) -> Arrays:
         """Return the map, for a file."""
         self._take_adjustment(wait=True)
-        offset = self._mapper.offset.estimate
-        arrays = map_to_arrays(self.map) | self._places.to_arrays()
-        return arrays | {'disparity_offset': np.array([offset.value_px, offset.information])}
+        return map_to_arrays(self.map) | self._back_end.to_arrays()
 
     def load(
         self, arrays: Arrays, mount: Mount, localize: bool, T_world_odom: Array | None = None
@@ -185,10 +192,11 @@ class StereoSlam:
         KeyError or ValueError for arrays that are no map.
         """
         fill_map(self.map, arrays)
-        self._places.from_arrays(arrays)
-        self._mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+        self._back_end.from_arrays(arrays)
         self.mount, self._is_fixed = mount, localize
+        self._not_found_yet = None if localize else arrays
         if T_world_odom is not None:
+            self._patience_ns = RESUMING_NS
             last = self.map.keyframes[-1]
             self._motion.T_camera_world = last.T_camera_world
             self._motion.T_world_odom = T_world_odom
@@ -212,8 +220,8 @@ class StereoSlam:
         self._local.point_ids = np.zeros(0, np.int32)
 
     def close(self) -> None:
-        """End the background thread, if there is one."""
-        self._adjusting.close()
+        """End the background threads, if there are any."""
+        self._back_end.close()
 
     def _fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
@@ -243,6 +251,7 @@ class StereoSlam:
         if track is None or not self._is_believable(track, images, frame.stamp_ns):
             self._follower.reset()
             return None
+        self._not_found_yet = None
         self._motion.take(track.T_camera_world, track.covariance, frame.stamp_ns)
         self._follower.see(images, track.point_ids, track.uv_px)
         self._local.move_to(track.point_ids, track.T_camera_world)
@@ -271,6 +280,21 @@ class StereoSlam:
             self._frames_since_keyframe += 1
         elif not fault or self._motion.is_blind:
             self._motion.stop()
+
+    def _map_apart(self, stamp_ns: int) -> None:
+        """Map on its own where the camera is not found in the map that was loaded."""
+        known = self._not_found_yet
+        if known is None:
+            return
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        if stamp_ns - self._first_ns < self._patience_ns:
+            return
+        self._not_found_yet = None
+        self._back_end.map_apart(known)
+        self._motion.reset()
+        self._body.reset_world()
+        self._local.point_ids = np.zeros(0, np.int32)
+        self._follower.reset()
 
     def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
@@ -309,11 +333,11 @@ class StereoSlam:
         )
 
     def _wants_keyframe(self, track: Track | None) -> bool:
-        if self._is_fixed or (self._is_closing and not self._adjusting.idle):
+        if self._is_fixed or not self._back_end.takes_keyframes:
             return False
         if track is None:
             return not self.map.keyframes or self._wants_blind_keyframe()
-        return self._local.wants_keyframe(track, self._frames_since_keyframe, self._adjusting.idle)
+        return self._local.wants_keyframe(track, self._frames_since_keyframe, self._back_end.idle)
 
     def _wants_blind_keyframe(self) -> bool:
         """Whether the sensors have the camera somewhere new: the map goes on from there."""
@@ -330,7 +354,7 @@ class StereoSlam:
         if observed is None:
             return None
         self._take_adjustment(wait=True)
-        self._mapper.measure_stereo(frame, images, observed.observations)
+        self._back_end.mapper.measure_stereo(frame, images, observed.observations)
         keyframe = KeyframeRecord(
             len(self.map.keyframes),
             frame.index,
@@ -343,14 +367,17 @@ class StereoSlam:
             self._body.gravity.up_camera(self._motion.T_odom_camera),
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
-        self._mapper.insert(self.map, keyframe, patches)
+        self._back_end.mapper.insert(self.map, keyframe, patches)
         if self._moving is not None and searched is not None:
             self._moving.remember(keyframe, searched)
             gone = self._moving.seen_through(searched, self.map, self._local.point_ids, keyframe)
             self.map.note_seen_through(gone)
-        self._places.add(keyframe)
-        if not self._close_loop(keyframe, images):
-            self._adjust(keyframe)
+        up = self._body.gravity.up_world
+        self._follow_map(partial(self._back_end.take_in, keyframe, images, self.mount, up))
+        if self.map.keyframes[-1] is not keyframe:  # it has become part of the loaded map
+            keyframe = self.map.keyframes[-1]
+            self._moving = MotionSearch(self._camera) if self._moving is not None else None
+            self._body.reset_world()
         self._go_on_from(images, keyframe)
         self._measure_mount(frame, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
@@ -393,41 +420,6 @@ class StereoSlam:
         self.map.note_tracking(matched.visible_ids, matched.point_ids)
         return matched.observed
 
-    def _adjust(self, keyframe: KeyframeRecord) -> None:
-        """Adjust the neighbourhood of a new keyframe."""
-        if keyframe.index == 0:
-            return
-        adjustment = self._mapper.plan_adjustment(self.map, keyframe, self._body.gravity.up_world)
-        if adjustment is None:
-            return
-        self._adjusting.submit(
-            partial(self._mapper.solve, adjustment),
-            partial(self._mapper.apply, self.map, adjustment),
-        )
-        if not self._background:
-            self._take_adjustment(wait=True)
-
-    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
-        """Close a loop where a new keyframe sees a place again. False where the neighbourhood is
-        still to be adjusted.
-        """
-        matches = self._loops.detect(keyframe, images, self.disparity_offset_px, self.mount)
-        if not matches:
-            return False
-        closing = plan_closing(self.map, matches)
-        self._is_closing = True
-        self._adjusting.submit(
-            partial(solve_closing, closing), partial(self._apply_closing, closing)
-        )
-        if not self._background:
-            self._take_adjustment(wait=True)
-        return self._background
-
-    def _apply_closing(self, closing: Closing, result: tuple[Array, Array]) -> None:
-        self._is_closing = False
-        if apply_closing(self._camera, self.map, closing, result):
-            self.loop_count += 1
-
     def _go_on_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
@@ -443,18 +435,19 @@ class StereoSlam:
             self.mount = self._mount_meter.mount
 
     def _take_adjustment(self, wait: bool) -> None:
-        """Bring a finished adjustment into the map. The camera, and with it `odom`, moves along
-        with the latest keyframe.
+        """Bring a finished adjustment into the map."""
+        if self.map.keyframes:
+            self._follow_map(partial(self._back_end.collect, wait))
+
+    def _follow_map(self, change: Callable[[], bool]) -> None:
+        """Let the camera, and with it `odom`, move along with the latest keyframe. change: of the
+        map; returns whether there was any.
         """
-        finished = self._adjusting.collect(wait)
-        if finished is None:
-            return
-        reference = self.map.keyframes[-1]
-        before = reference.T_camera_world
-        finished()
-        self._motion.move_map(before, reference.T_camera_world)
-        self._local.drop_dead()
-        self._follower.drop_dead(self.map)
+        before = self.map.keyframes[-1].T_camera_world
+        if change():
+            self._motion.move_map(before, self.map.keyframes[-1].T_camera_world)
+            self._local.drop_dead()
+            self._follower.drop_dead(self.map)
 
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None
@@ -463,6 +456,7 @@ class StereoSlam:
         motion, why = self._motion, fault or NOTHING_SEEN
         tracked = track is not None or keyframe is not None or motion.is_blind
         state = f'on {motion.carried_by}: {why}' if motion.is_blind else 'tracking'
+        state += '' if self._back_end.is_joined else ', outside the loaded map'
         unknown: Array = np.eye(6) * UNKNOWN_COVARIANCE
         return FrameResult(
             frame.index,

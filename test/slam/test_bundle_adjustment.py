@@ -1,10 +1,16 @@
 """Bundle adjustment on synthetic problems with known answers."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import se3_exp, transform_points
+from segfloor_ros.slam import normal_equations
+from segfloor_ros.slam.body_motion import RelativeMotion
 from segfloor_ros.slam.bundle_adjustment import BundleProblem, adjust
+from segfloor_ros.slam.motion_links import Link
 from segfloor_ros.slam.normal_equations import inverse_cholesky
 from segfloor_ros.slam.residuals import Observations
 
@@ -123,6 +129,22 @@ def test_a_step_equals_the_solution_of_the_full_normal_equations():
         )
     else:
         raise AssertionError('the first step must lower the cost')
+
+
+def test_the_sparse_solution_is_the_dense_one(monkeypatch):
+    problem = disturbed(make_problem(num_keyframes=8, num_free=6, sigma=0.2))
+    motion = RelativeMotion(np.eye(4), 1e-3 * np.eye(6))
+    tied = replace(problem, factors=(Link(1, 2, motion), Link(4, 3, motion), Link(5, 6, motion)))
+    for given in (problem, tied):
+        dense = adjust(CAMERA, given, iterations=3)
+        monkeypatch.setattr(normal_equations, 'DENSE_KEYFRAMES', 0)
+        found = adjust(CAMERA, given, iterations=3)
+        monkeypatch.undo()
+        np.testing.assert_allclose(found.T_camera_world, dense.T_camera_world, atol=1e-9)
+        np.testing.assert_allclose(found.points_world, dense.points_world, atol=1e-8)
+        assert found.cost_after < 0.5 * found.cost_before
+        assert found.offset.value_px == pytest.approx(dense.offset.value_px, abs=1e-9)
+        assert found.offset.information == pytest.approx(dense.offset.information, rel=1e-6)
 
 
 def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_known():

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
+from segfloor_ros.slam.keyframe_record import Match
 from segfloor_ros.slam.loop_closing import move_keyframes
-from segfloor_ros.slam.loops import Match
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -89,4 +89,4 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     none = np.zeros(0, np.int32)
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
-    assert slam._loops._is_level(match, MOUNT) is expected
+    assert slam._back_end.loops._checks.is_level(match, MOUNT) is expected

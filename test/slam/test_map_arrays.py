@@ -131,3 +131,34 @@ def test_a_search_around_a_pose_finds_the_camera_there_alone(mapped):
     assert slam.process(ROOM.frame(4, here))[0].tracked
     slam.search_near(elsewhere, 1.0, 0.5)
     assert not slam.process(ROOM.frame(5, here))[0].tracked
+
+
+def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mapped):
+    slam = loaded(mapped, localize=False)
+    # It looks at the wall behind, then turns to what is known.
+    start = [planar_pose(0.0, 0.1 * min(k, 3), 2.6) for k in range(13)]
+    turn = [planar_pose(0.02 * k, 0.3, 2.6 - 0.11 * k) for k in range(25)]
+    on = [planar_pose(0.5 + 0.03 * k, 0.3 - 0.02 * k, -0.1 + 0.03 * k) for k in range(12)]
+    results, _ = drive(slam, start + turn + on)
+    apart = [r for r in results if 'outside the loaded map' in r.state]
+    assert len(apart) > 10
+    first = apart[0]
+    np.testing.assert_allclose(first.T_map_odom @ first.T_odom_base, np.eye(4), atol=1e-6)
+    last = [r.keyframe for r in results if r.keyframe][-1]
+    before = [r.keyframe for r in apart if r.keyframe]
+    assert len(before[0].path.stamp_ns) == 1
+    assert len(last.path.stamp_ns) > len(mapped.map.keyframes) + 3
+    assert results[-1].tracked and results[-1].state == 'tracking'
+    error = invert((start + turn + on)[-1]) @ results[-1].T_map_odom @ results[-1].T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.03
+    # What was mapped apart has moved along, with its ids.
+    own = before[-1].cloud.point_id
+    assert own.min() >= mapped.map.num_ever
+    assert np.isin(own, last.cloud.point_id).mean() > 0.5
+    at = np.searchsorted(last.path.stamp_ns, before[0].stamp_ns)
+    truth = start[[r.index for r in results].index(before[0].frame_index)]
+    np.testing.assert_allclose(last.path.T_map_base[at], truth, atol=0.05)
+    # odom goes on without a jump.
+    odom = np.stack([r.T_odom_base for r in results if r.tracked])
+    steps = np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.15

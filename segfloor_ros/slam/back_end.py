@@ -1,0 +1,189 @@
+"""The back end of SLAM: what is done with the map between frames (Cadena et al., Past, Present, and
+Future of SLAM, IEEE T-RO 2016, section II).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.geometry import Array
+from segfloor_ros.map_file import Arrays
+from segfloor_ros.measurements import Up
+from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
+from segfloor_ros.slam.disparity_offset import OffsetEstimate
+from segfloor_ros.slam.global_adjustment import apply_global, plan_global, solve_global
+from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.known_map import KnownMap
+from segfloor_ros.slam.level_ground import LevelGround
+from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
+from segfloor_ros.slam.loops import LoopDetector
+from segfloor_ros.slam.mapping import LocalMapper
+from segfloor_ros.slam.place_recognition import PlaceRecognition
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.tracking import Tracker
+
+
+class BackEnd:
+    """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after.
+
+    background: on threads beside tracking; else at once, so that the outcome does not depend on
+    timing. Tracking never waits for an adjustment of the whole map.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: StereoSlamSettings,
+        sparse_map: SparseMap,
+        tracker: Tracker,
+        background: bool,
+    ) -> None:
+        self.mapper = LocalMapper(camera, settings)
+        self.places = PlaceRecognition(camera, tracker, sparse_map)
+        self.loop_count = 0
+        self._known: KnownMap | None = None
+        self._camera = camera
+        self._tracker = tracker
+        self._map = sparse_map
+        self.loops = LoopDetector(camera, sparse_map, self.places)
+        self._local = AdjustmentRunner(background)
+        self._global = AdjustmentRunner(background)
+        self._background = background
+        self._is_level = settings.level_ground
+        self._is_closing = False
+        self._up_world: Up | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being solved that a new keyframe would have to wait for."""
+        return self._local.idle
+
+    @property
+    def takes_keyframes(self) -> bool:
+        """Whether the map may grow: not while a loop is being closed."""
+        return self.idle or not self._is_closing
+
+    @property
+    def offset_px(self) -> float:
+        """The error that all disparities share, measured minus true, as estimated so far."""
+        return self.mapper.offset.value_px
+
+    def take_in(
+        self, keyframe: KeyframeRecord, images: Images, mount: Mount | None, up_world: Up | None
+    ) -> bool:
+        """Adjust the map to a new keyframe: close a loop where it sees a place again, and fit its
+        neighbourhood. up_world: as an accelerometer has it. Returns whether the map has changed
+        already.
+        """
+        self._up_world = up_world
+        if self._is_level and mount is not None:
+            self.mapper.ground = LevelGround(mount.T_base_left)
+        self.places.add(keyframe)
+        if self._join_known(keyframe, images, mount):
+            return True
+        closed = self._close_loop(keyframe, images, mount)
+        if self._background:
+            if not closed:
+                self._adjust(keyframe)
+            return False
+        closed = closed and self.collect(wait=True)
+        self._adjust(keyframe)
+        return self.collect(wait=True) or closed
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether the drive is in the map that was loaded, or there is none."""
+        return self._known is None
+
+    def map_apart(self, known: Arrays) -> None:
+        """Begin again with an empty map, until the known one is recognised."""
+        self._map.reset(int(known['num_ever'][0]))
+        self.places.reset()
+        self.loops.reset()
+        self._known = KnownMap(self._camera, self._tracker, self._map, known)
+
+    def _join_known(self, keyframe: KeyframeRecord, images: Images, mount: Mount | None) -> bool:
+        """Make the drive's own map a part of the known one, where that is recognised."""
+        known = self._known
+        if known is None or not known.recognise(keyframe, images, self.offset_px, mount):
+            return False
+        self._global.drop()
+        words = known.join(self.places.to_arrays())
+        self.places.reset()
+        self.places.from_arrays(words)
+        self.loops.reset()
+        self._known = None
+        return True
+
+    def collect(self, wait: bool) -> bool:
+        """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
+        waited for. Returns whether there was anything.
+        """
+        finished = [self._local.collect(wait)]
+        if finished[0] is not None:
+            finished[0]()
+        if not self._local.holds_one:
+            finished.append(self._global.collect(wait=False))
+            if finished[1] is not None:
+                finished[1]()
+        return any(apply is not None for apply in finished)
+
+    def to_arrays(self) -> Arrays:
+        """Return what is known besides the map, for a file."""
+        offset = self.mapper.offset.estimate
+        known: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
+        return self.places.to_arrays() | known
+
+    def from_arrays(self, arrays: Arrays) -> None:
+        """Take in what `to_arrays` returned."""
+        self.places.from_arrays(arrays)
+        self.mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+
+    def close(self) -> None:
+        """End the background threads, if there are any."""
+        self._global.drop()
+        self._local.close()
+        self._global.close()
+
+    def _adjust(self, keyframe: KeyframeRecord) -> None:
+        """Adjust the neighbourhood of a new keyframe."""
+        if keyframe.index == 0:
+            return
+        adjustment = self.mapper.plan_adjustment(self._map, keyframe, self._up_world)
+        if adjustment is None:
+            return
+        self._local.submit(
+            partial(self.mapper.solve, adjustment),
+            partial(self.mapper.apply, self._map, adjustment),
+        )
+
+    def _close_loop(self, keyframe: KeyframeRecord, images: Images, mount: Mount | None) -> bool:
+        """Begin to close a loop where a keyframe sees a place again; returns whether it does."""
+        matches = self.loops.detect(keyframe, images, self.offset_px, mount)
+        if not matches:
+            return False
+        # It would bring back the map from before the loop.
+        self._global.drop()
+        closing = plan_closing(self._map, matches, self.mapper.ground)
+        self._is_closing = True
+        self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
+        return True
+
+    def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
+        self._is_closing = False
+        if not apply_closing(self._camera, self._map, closing, result):
+            return
+        self.loop_count += 1
+        adjustment = plan_global(
+            self._map, self.mapper.offset.estimate, self._up_world, self.mapper.ground
+        )
+        if adjustment is not None:
+            self._global.submit(
+                partial(solve_global, self._camera, adjustment, self._global.is_wanted()),
+                partial(apply_global, self._map, adjustment),
+            )
