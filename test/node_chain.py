@@ -35,7 +35,7 @@ PARAMETERS = {
     'publish_period_s': 0.0,
     'max_waiting_frames': 100,
 }
-STOP_S = 10.0
+STOP_S = 20.0
 ANSWER_S, WAKE_S = 2.0, 60.0
 CALIBRATION = rectified_calibration(CAMERA)
 
@@ -134,11 +134,13 @@ class NodeChain:
         self.graph.until(lambda: self._about(GRID, stamp_ns, 0), f'keyframe {stamp_ns} in the map')
 
     def stop(self) -> None:
-        """End all processes in order, so that they leave nothing behind."""
+        """End all processes in order, so that they leave nothing behind; one whose middleware
+        hangs as it goes, as happens on busy machines, is killed.
+        """
         for process in self._processes.values():
             process.send_signal(signal.SIGINT)
         for process in self._processes.values():
-            process.wait(timeout=STOP_S)
+            _end(process)
 
     def _about(self, node: str, stamp_ns: int, since: int) -> list[Status]:
         return [
@@ -160,3 +162,11 @@ class NodeChain:
         wanted = SLAM in running
         lacking += [n for n, p in self.inputs.items() if wanted and not p.get_subscription_count()]
         return lacking
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    try:
+        process.wait(timeout=STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

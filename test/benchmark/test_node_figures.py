@@ -40,6 +40,7 @@ def test_the_figures_are_of_the_quarters_after_the_first() -> None:
     assert rows['a: memory, 2nd and last quarter'] == '100.0 MB, 102.0 MB'
 
 
+@pytest.mark.slow
 def test_a_recording_is_played_through_the_nodes(tmp_path) -> None:
     recording = write_kitti(tmp_path / 'drive', room_drive(5, step_m=0.04)[0])
     command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'benchmark',

@@ -33,6 +33,7 @@ SAME_FILES = (
     'labelled_cloud.ply',
     'settings.yaml',
 )
+STOPS = [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope='module')
@@ -99,6 +100,7 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     assert 'keyframes that failed: 0' in out
 
 
+@pytest.mark.slow
 def test_the_replay_saves_loads_and_localizes_as_the_run_does(drive, tmp_path) -> None:
     maps = {kind: tmp_path / f'{kind}.map' for kind in ('run', 'replay')}
     for kind, rate in (('run', ()), ('replay', ('--rate', 0))):
@@ -139,7 +141,7 @@ def test_a_node_that_dies_ends_the_replay_by_its_name(drive, tmp_path) -> None:
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
 
 
-@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('stop', STOPS)
 def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
     replay = start('replay', drive, '--out', tmp_path / 'out', '--rate', 0.2)
     nodes = {}
@@ -147,8 +149,9 @@ def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
         nodes = node_processes(replay)
     stop_s = time.monotonic()
     replay.send_signal(stop)
-    replay.communicate(timeout=30)
-    assert time.monotonic() - stop_s < 5
+    replay.communicate(timeout=60)
+    # Where other programs compete for the processors, ending takes longer by their number.
+    assert time.monotonic() - stop_s < 5 * max(1.0, os.getloadavg()[0] / os.cpu_count())
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
     # On a busy machine a first keyframe may be in the map by then, which is kept.
     has_map = (tmp_path / 'out' / 'map.yaml').exists()
@@ -156,7 +159,7 @@ def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
     assert has_map or list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('stop', STOPS)
 def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None:
     out = tmp_path / 'out'
     replay = start('replay', drive, '--out', out, '--rate', 0.2)

@@ -89,6 +89,7 @@ def test_a_suite_is_checked_kept_and_resumed(room, tmp_path):
     assert 'good: ok (kept)' in resumed.stdout
 
 
+@pytest.mark.slow
 def test_what_became_worse_than_the_baseline_is_named(room, tmp_path):
     baseline, common = tmp_path / 'baseline.json', ('--out', tmp_path / 'out', '--no-cache')
     first = check(suite_of(tmp_path, room, good_alone()), *common, '--write-baseline', baseline)

@@ -67,6 +67,7 @@ def test_a_recording_without_its_true_path_is_refused(drive, tmp_path) -> None:
     assert 'corridor1' in str(result.exception)
 
 
+@pytest.mark.slow
 def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
     scene = tmp_path / 'short.yaml'
     scene.write_text(
