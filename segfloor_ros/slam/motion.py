@@ -67,10 +67,10 @@ class CameraMotion:
         """Whether the last pose was not seen in the images."""
         return bool(self.carried_by)
 
-    @property
-    def is_held(self) -> bool:
-        """Whether wheels tell where the camera is, too."""
-        return self._since_keyframe is not None and self._since_keyframe.with_way
+    def is_held(self, stamp_ns: int) -> bool:
+        """Whether wheels tell where the camera is, too, and did so since the last keyframe."""
+        measured, since = self._measured(stamp_ns), self._since_keyframe
+        return all(motion is not None and motion.with_way for motion in (measured, since))
 
     @property
     def sigma_m(self) -> float:

@@ -266,7 +266,7 @@ class StereoSlam:
         if motion.is_lost:
             return True
         few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
-        if motion.is_held and count_firm(images.left, track.uv_px) < few:
+        if motion.is_held(stamp_ns) and count_firm(images.left, track.uv_px) < few:
             return False
         if motion.is_consistent(pose, track.covariance, stamp_ns):
             return motion.is_plausible(pose, stamp_ns)

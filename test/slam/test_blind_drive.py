@@ -13,6 +13,7 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.slam.images import Images
+from segfloor_ros.slam.pose import PoseEstimate
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.track import Track
@@ -159,7 +160,8 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     rows = rng.integers(20, CAMERA.height - 20, 150)
     on_edge = np.stack([edge_px[rows], rows], axis=1)
     pose, sure = slam._motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
-    track = Track(pose, sure, np.arange(150, dtype=np.int32), on_edge, np.arange(150), None)
+    estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
+    track = Track(estimate, np.arange(150, dtype=np.int32), on_edge, np.arange(150), None)
     for texture, expected in ((0.0, False), (30.0, True)):
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
