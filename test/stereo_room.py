@@ -101,3 +101,15 @@ def planar_pose(x: float, y: float, yaw: float) -> np.ndarray:
     return make_transform(
         np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0])
     )
+
+
+def depth_of_room(T_world_camera: np.ndarray) -> np.ndarray:
+    """The depth (H, W) in mm of the walls, floor and ceiling of the room."""
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1
+    )
+    directions, origin = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    with np.errstate(divide='ignore'):
+        to_face = np.where(directions > 0, ROOM_MAX - origin, ROOM_MIN - origin) / directions
+    return np.rint(1000 * to_face.min(axis=-1)).astype(np.uint16)

@@ -7,7 +7,7 @@ import socket
 from collections.abc import Mapping
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS, published_by
+from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS
 
 # DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
 # into the ports that Linux hands out to clients.
@@ -70,22 +70,18 @@ def unconnected(counts: Mapping[str, Mapping[str, int]], is_paced: bool = True) 
         if node not in counts:
             missing.append(f'{node} (no sign of life)')
             continue
-        names = {
-            topic.instead_of or topic.name: topic.name
-            for topic in published_by(node, alternatives=True)
-            if not topic.instead_of or topic.name in counts[node]
-        }
-        needed = {topic: _listeners_of(topic, is_paced) for topic in names.values()}
-        needed[DIAGNOSTICS.name] = 1  # the replay itself
+        needed = {topic: _listeners_of(topic, is_paced) for topic in counts[node]}
         missing += [
-            f'{topic} ({counts[node].get(topic, 0)} of {number} subscribers)'
+            f'{topic} ({counts[node][topic]} of {number} subscribers)'
             for topic, number in needed.items()
-            if counts[node].get(topic, 0) < number
+            if counts[node][topic] < number
         ]
     return missing
 
 
 def _listeners_of(topic: str, is_paced: bool) -> int:
+    if topic == DIAGNOSTICS.name:
+        return 1  # the replay itself
     listeners = len(TOPICS[topic].subscribers) + (topic in RECORDED)
     return listeners + (is_paced and topic in PACED_BY)
 

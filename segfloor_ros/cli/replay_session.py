@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.camera.settings import SENSORS
+from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli.interrupts import first_interrupt_noted
 from segfloor_ros.cli.replay_graph import isolated_environment, unconnected
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
@@ -235,7 +236,7 @@ class ReplaySession:
 def _sensors_sent(finished: Status | None) -> dict[str, int]:
     """Return the messages of each sensor besides the images, as the camera says at the end."""
     values = {} if finished is None else finished.values
-    return {name: int(values[name]) for name in SENSORS if name in values}
+    return {name: int(values[name]) for name in (*SENSORS, DEPTH) if name in values}
 
 
 class ReplayGraph:

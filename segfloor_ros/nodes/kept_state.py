@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.map_file import MapFile, read_map_file, to_bytes
+from segfloor_ros.map_file import MapFile, read_map_file, write_to
 
 IN_MEMORY = Path('/dev/shm')
 LEAST_SHARE = 20
@@ -33,28 +34,43 @@ class KeptState:
         self._file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
         self._resume_within_s = resume_within_s
         self._next_save_s = -float('inf')
+        self._writing: threading.Thread | None = None
 
     @property
     def is_due(self) -> bool:
         """Whether a map would be kept now."""
-        return self._resume_within_s > 0 and time.monotonic() >= self._next_save_s
+        return (
+            self._resume_within_s > 0
+            and time.monotonic() >= self._next_save_s
+            and not (self._writing is not None and self._writing.is_alive())
+        )
 
     def save(self, make: Callable[[], MapFile]) -> None:
-        """Keep what `make` returns in place of the last map, unless that was kept only just now. A
-        full disk is no reason to stop: the older map stays.
+        """Keep what `make` returns in place of the last map, unless that was kept only just now; it
+        is written beside the work of the node. A full disk is no reason to stop: the older map
+        stays.
         """
-        if not self.is_due:
-            return
-        start_s = time.monotonic()
+        if self.is_due:
+            start_s = time.monotonic()
+            self._writing = threading.Thread(target=self._write, args=(make(), start_s))
+            self._writing.start()
+
+    def _write(self, saved: MapFile, start_s: float) -> None:
         with contextlib.suppress(OSError):
             self._file.parent.mkdir(mode=0o700, exist_ok=True)
             if not _is_private(self._file.parent):
                 return
             written = self._file.with_suffix('.new')
-            written.write_bytes(to_bytes(make(), compress=False))
+            with written.open('wb') as file:
+                write_to(file, saved, compress=False)
             written.replace(self._file)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
+
+    def finish(self) -> None:
+        """Wait until the map is written."""
+        if self._writing is not None:
+            self._writing.join()
 
     def take(self) -> MapFile | None:
         """Return the map that a killed node of this name left a short time ago, or None. It is
@@ -72,6 +88,7 @@ class KeptState:
 
     def remove(self) -> None:
         """Leave nothing to be taken up."""
+        self.finish()
         with contextlib.suppress(OSError):
             self._file.unlink()
 

@@ -221,6 +221,8 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             'skipped': self._source.skipped_frames,
             **self._measurements_sent,
         }
+        if self._has_depth:
+            values[DEPTH] = self._frames_sent
         self.reporter.publish(RECORDING, stamp_ns, level, message, values)
 
     def _log_waiting_for(self, what: str) -> None:

@@ -198,6 +198,11 @@ def some_map(value: int = 1) -> MapFile:
     return MapFile({'start_ns': 7}, {'grid': {'a': np.array([value])}})
 
 
+def keep(kept: KeptState, value: int = 1) -> None:
+    kept.save(lambda: some_map(value))
+    kept.finish()
+
+
 def kept_value(kept: KeptState) -> int | None:
     saved = kept.take()
     return None if saved is None else int(saved.parts['grid']['a'][0])
@@ -206,15 +211,15 @@ def kept_value(kept: KeptState) -> int | None:
 def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkeypatch) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
     kept = KeptState('/robot/stereo_slam', 30.0)
-    kept.save(some_map)
+    keep(kept)
     assert KeptState('/other/stereo_slam', 30.0).take() is None
     assert kept_value(KeptState('/robot/stereo_slam', 30.0)) == 1
     assert KeptState('/robot/stereo_slam', 30.0).take() is None
     again = KeptState('/robot/stereo_slam', 30.0)
-    again.save(lambda: some_map(2))
-    again.save(lambda: some_map(3))  # too soon after the last one
+    keep(again, 2)
+    keep(again, 3)  # too soon after the last one
     assert kept_value(again) == 2
-    KeptState('/robot/stereo_slam', 30.0).save(some_map)
+    keep(KeptState('/robot/stereo_slam', 30.0))
     file = Path(kept._file)
     long_ago = file.stat().st_mtime - 31
     os.utime(file, (long_ago, long_ago))
@@ -225,14 +230,14 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkey
 def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
     off = KeptState('/robot/damaged', 0.0)
-    off.save(some_map)
+    keep(off)
     kept = KeptState('/robot/damaged', 30.0)
     assert kept.take() is None
-    kept.save(some_map)
+    keep(kept)
     kept._file.write_bytes(kept._file.read_bytes()[:-3])
     assert kept.take() is None
     kept = KeptState('/robot/damaged', 30.0)
-    kept.save(some_map)
+    keep(kept)
     kept.remove()
     assert kept.take() is None
 
@@ -241,10 +246,10 @@ def test_a_folder_that_others_can_write_to_is_not_used(monkeypatch, tmp_path) ->
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
     monkeypatch.setattr('segfloor_ros.nodes.kept_state.IN_MEMORY', tmp_path)
     kept = KeptState('/robot/open', 30.0)
-    kept.save(some_map)
+    keep(kept)
     kept._file.parent.chmod(0o777)
     assert kept.take() is None
-    KeptState('/robot/open', 30.0).save(some_map)
+    keep(KeptState('/robot/open', 30.0))
     assert list(kept._file.parent.glob('*.new')) == []
     kept._file.parent.chmod(0o700)
     assert kept.take() is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
-from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN
+from stereo_room import MOUNT, depth_of_room
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert, quaternion_xyzw
@@ -168,18 +168,6 @@ def depth_drive(tmp_path):
 def make(folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     return folder
-
-
-def depth_of_room(T_world_camera: np.ndarray) -> np.ndarray:
-    """The depth (H, W) in mm of the walls, floor and ceiling of the room."""
-    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
-    rays = np.stack(
-        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1
-    )
-    directions, origin = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
-    with np.errstate(divide='ignore'):
-        to_face = np.where(directions > 0, ROOM_MAX - origin, ROOM_MIN - origin) / directions
-    return np.rint(1000 * to_face.min(axis=-1)).astype(np.uint16)
 
 
 def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
