@@ -90,7 +90,7 @@ def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
 class BagWriter:
     """A new bag of stereo pairs: one file where its name ends in `.mcap`, else a rosbag2 folder.
 
-    It appears when it is complete; after an error nothing is left. jpeg_quality: 1 to 100. Raises
+    It appears when it is complete; after an error nothing is left. Raises
     InputError when `out` exists or cannot be written.
     """
 
@@ -99,14 +99,13 @@ class BagWriter:
         out: Path,
         calibration: StereoCalibration,
         coding: ImageCoding = ImageCoding.raw,
-        jpeg_quality: int = JPEG_QUALITY,
     ) -> None:
         self._out = out
         self._calibration = calibration
         self._coding = coding
         self._encoders: dict[ImageCoding, tuple[str, list[int]]] = {
             ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
-            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]),
+            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
         }
         self._staging = Path()
         self._writer: Any = None

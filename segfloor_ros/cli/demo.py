@@ -18,8 +18,8 @@ from segfloor_ros.evaluation.truth import load_truth, read_map
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 """A drive through the shipped scene corridor1 with its truth, made by `segfloor simulate corridor1
---images bag-jpeg --jpeg-quality 75 --supersampling 2 --floor-every 0 --set camera.width=480
---set camera.height=360 --set camera.noise_sigma=1.0`.
+--supersampling 2 --floor-every 0 --set camera.width=480 --set camera.height=360
+--set camera.noise_sigma=1.0` and `segfloor convert` with JPEG images.
 """
 
 

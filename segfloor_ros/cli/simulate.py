@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from enum import Enum
-from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 from rich.progress import TaskID
 
-from segfloor_ros.camera.bag_writer import JPEG_QUALITY, ImageCoding
 from segfloor_ros.cli.options import OutOption
 from segfloor_ros.cli.output import console, progress_bar
 from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.bag import SimulatedBag
 from segfloor_ros.simulation.drive_files import RecordingOptions, record
 from segfloor_ros.simulation.simulation import Simulation
-
-
-class ImageFormat(str, Enum):
-    """Where the images go."""
-
-    folder = 'folder'
-    bag_raw = 'bag-raw'
-    bag_jpeg = 'bag-jpeg'
-    bag_png = 'bag-png'
 
 
 def simulate(
@@ -40,10 +26,6 @@ def simulate(
         Optional[list[str]],  # noqa: UP045  typer evaluates it, also on Python 3.10
         typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
     ] = None,
-    images: Annotated[
-        ImageFormat, typer.Option(help='PNG files, or a rosbag2 drive.mcap in the folder.')
-    ] = ImageFormat.folder,
-    jpeg_quality: Annotated[int, typer.Option(min=1, max=100, help='Of bag-jpeg.')] = JPEG_QUALITY,
     floor_every: Annotated[
         int, typer.Option(min=0, help='A true floor mask every so many frames; 0: none.')
     ] = 10,
@@ -56,7 +38,7 @@ def simulate(
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
     described = open_scene(scene, set_values or ())
-    options = RecordingOptions(floor_every, disparity, images is ImageFormat.folder)
+    options = RecordingOptions(floor_every, disparity)
     with (
         Simulation(described, supersampling) as simulation,
         progress_bar('rendering', simulation.frame_count) as progress,
@@ -66,20 +48,9 @@ def simulate(
             out,
             options,
             lambda done: progress.update(TaskID(0), completed=done),
-            _bag_opener(images, jpeg_quality, simulation),
         )
         seconds = simulation.drive.times_s[-1]
         facts = (
             f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
         )
     console.print(f'{facts}: {out}', highlight=False)
-
-
-def _bag_opener(
-    images: ImageFormat, jpeg_quality: int, simulation: Simulation
-) -> Callable[[Path], SimulatedBag] | None:
-    """Return what makes the bag in the folder, or None where images go to files."""
-    if images is ImageFormat.folder:
-        return None
-    coding = ImageCoding(images.value.removeprefix('bag-'))
-    return lambda folder: SimulatedBag(folder, simulation, coding, jpeg_quality)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -34,12 +32,11 @@ PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
 @dataclass(frozen=True)
 class RecordingOptions:
     """What to write. floor_every: every how many frames a floor mask, 0 for none. disparity: a true
-    disparity with each mask. images: write images in folders, as opposed to a bag.
+    disparity with each mask.
     """
 
     floor_every: int = 10
     disparity: bool = False
-    images: bool = True
 
 
 def record(
@@ -47,22 +44,19 @@ def record(
     out: Path,
     options: RecordingOptions,
     on_frame: Callable[[int], None] = lambda done: None,
-    open_sink: Callable[[Path], FrameSink] | None = None,
 ) -> None:
     """Write a drive to a new folder, complete or not at all.
 
     Rectified images go to image_0/ and image_1/ with calib.txt (KITTI odometry layout), others to
     left/ and right/ with ROS calibrations left.yaml and right.yaml; what wheels, IMU and depth
-    camera tell goes beside them. open_sink: makes a further receiver of the frames in the folder,
-    e.g. a bag. Raises InputError when `out` holds
-    something already.
+    camera tell goes beside them. Raises InputError when `out` holds something already.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: exists already; choose another --out or remove it')
     out.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
     try:
-        _record_into(staging, simulation, options, on_frame, open_sink)
+        _record_into(staging, simulation, options, on_frame)
         staging.chmod(0o755)
         if out.exists():
             out.rmdir()
@@ -71,43 +65,25 @@ def record(
         shutil.rmtree(staging, ignore_errors=True)
 
 
-class FrameSink(Protocol):
-    """Receives the frames of a drive besides the folder; entered before the first one."""
-
-    def add(self, frame: SimulatedFrame) -> None:
-        """Take one frame."""
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *error: Any) -> None: ...
-
-
 def _record_into(
     folder: Path,
     simulation: Simulation,
     options: RecordingOptions,
     on_frame: Callable[[int], None],
-    open_sink: Callable[[Path], FrameSink] | None,
 ) -> None:
     write_truth(folder, simulation)
-    if options.images:
-        _write_calibration(folder, simulation)
-        _write_sensors(folder, simulation)
+    _write_calibration(folder, simulation)
+    _write_sensors(folder, simulation)
     poses = []
-    with ExitStack() as stack:
-        sink = stack.enter_context(open_sink(folder)) if open_sink is not None else None
-        for frame in simulation.frames():
-            if options.images:
-                _write_images(folder, frame, simulation.scene.camera.rectified)
-            if sink is not None:
-                sink.add(frame)
-            if options.floor_every and frame.index % options.floor_every == 0:
-                _write_frame_truth(folder, simulation, frame.index, options)
-            if simulation.scene.movers:
-                moving = simulation.moving_mask(frame.index)
-                _write_png(folder / 'moving' / f'{frame.index:06d}.png', moving)
-            poses.append(frame.T_world_left)
-            on_frame(frame.index + 1)
+    for frame in simulation.frames():
+        _write_images(folder, frame, simulation.scene.camera.rectified)
+        if options.floor_every and frame.index % options.floor_every == 0:
+            _write_frame_truth(folder, simulation, frame.index, options)
+        if simulation.scene.movers:
+            moving = simulation.moving_mask(frame.index)
+            _write_png(folder / 'moving' / f'{frame.index:06d}.png', moving)
+        poses.append(frame.T_world_left)
+        on_frame(frame.index + 1)
     _write_poses(folder / 'poses.txt', np.array(poses))
 
 

@@ -15,7 +15,6 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.demo import DRIVE, demo
 from segfloor_ros.cli.simulate import simulate as simulate_command
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.simulation.bag import ODOMETRY, ODOMETRY_TOPIC
 from segfloor_ros.simulation.renderer import RenderingError
 
 app = typer.Typer()
@@ -83,29 +82,3 @@ def test_simulate_writes_a_folder_that_can_be_read(files):
     assert source.calibration.camera.fx == pytest.approx(80.0)
     frames = list(source.frames())
     assert len(frames) == len(load_truth(files).base_poses)
-
-
-@pytest.mark.parametrize('coding', ['bag-png', 'bag-jpeg'])
-def test_simulate_writes_a_bag_with_the_true_odometry(tmp_path, files, coding):
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    simulate(tmp_path / 'bag', '--images', coding)
-    pairs = [
-        list(open_source(StereoCameraSettings(input=str(path))).raw_pairs())
-        for path in (tmp_path / 'bag' / 'drive.mcap', files)
-    ]
-    assert len(pairs[0]) == len(pairs[1])
-    largest = 0 if coding == 'bag-png' else 30
-    for from_bag, from_files in zip(*pairs, strict=True):
-        assert from_bag.stamp_ns == from_files.stamp_ns
-        assert cv2.absdiff(from_bag.right, from_files.right).max() <= largest
-    base = np.loadtxt(files / 'base_poses.txt')
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with AnyReader([tmp_path / 'bag' / 'drive.mcap'], default_typestore=store) as reader:
-        wanted = [c for c in reader.connections if c.topic == ODOMETRY_TOPIC]
-        assert [c.msgtype for c in wanted] == [ODOMETRY]
-        poses = [reader.deserialize(raw, ODOMETRY) for _, _, raw in reader.messages(wanted)]
-    driven = [message.pose.pose.position.x for message in poses]
-    np.testing.assert_allclose(driven, base[:, 1] - base[0, 1], atol=1e-5)
-    assert (poses[0].header.frame_id, poses[0].child_frame_id) == ('map', 'base_link')
