@@ -73,6 +73,8 @@ _SLOPE_PROPOSALS = 100
 _SLOPE_SIGMA = np.array([math.radians(5.0), math.radians(1.0), 0.1])
 _PLAIN_SHARE = 0.4
 """So much of all that is seen must lie on a slope that nobody expects."""
+_BOARD = 2
+"""Table tops are thinner than what stands: so many times what is seen of them counts."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
 
@@ -376,7 +378,8 @@ class FloorSegmentation:
         border_px = np.float32(_BORDER_BLOCKS * BLOCK_PX)
         shared = u * view.step >= floor_px + border_px
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
-        upright_xy = np.hstack([upright_xy, np.repeat(overhead_xy, 2 // view.step, axis=1)])
+        overhead_xy = np.repeat(overhead_xy, _BOARD * 2 // view.step, axis=1)
+        upright_xy = np.hstack([upright_xy, overhead_xy])
         return self._scanner.scan(floor, shared, upright_xy, 1 / (2 * view.step))
 
 
