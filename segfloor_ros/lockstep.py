@@ -210,8 +210,8 @@ class LockstepRun:
             return self._map_options.why_not_found(name, self._frames)
         if self._pipeline.mount is None:
             return (
-                f'{name}: no floor was recognised in {self._frames} frames, so the height of the '
-                'camera is unknown; give stereo_slam.camera_height_m, camera_pitch_rad and '
+                f'{name}: no level floor was recognised in {self._frames} frames, so the height of '
+                'the camera is unknown; give stereo_slam.camera_height_m, camera_pitch_rad and '
                 'camera_roll_rad'
             )
         return f'{name}: none of {self._frames} frames could be tracked, so there is no map'

@@ -17,14 +17,20 @@ from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.options import ParamsOption, SetOption
 from segfloor_ros.cli.output import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
-from segfloor_ros.simulation.any_scene import open_scene
 from tools.disparity_choices import (
     DisparityScore,
     choices,
     read_pairs,
     score,
 )
-from tools.floor_masks import SCENES, SceneScore, mount_of, render_floor, score_recording
+from tools.floor_masks import (
+    SCENES,
+    SceneScore,
+    floor_scene,
+    mount_of,
+    render_floor,
+    score_recording,
+)
 from tools.floor_steps import (
     WITHOUT_DISPARITY,
     FloorTimes,
@@ -64,8 +70,8 @@ def benchmark_floor(
     """
     configuration = resolve(params, assignments or ())
     if simulated is not None:
-        names = SCENES if simulated == 'all' else simulated.split(',')
-        scenes = {name: open_scene(name) for name in names}
+        names = [*SCENES] if simulated == 'all' else simulated.split(',')
+        scenes = {name: floor_scene(name) for name in names}
         with tempfile.TemporaryDirectory(prefix='segfloor-') as temporary, announcing() as announce:
             found = []
             for name, scene in scenes.items():

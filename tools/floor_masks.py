@@ -17,25 +17,37 @@ from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOptions
 from segfloor_ros.simulation.render_once import render_once
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.simulation import FrameTruth
 from tools.driving import open_recording
 
-SCENES = (
-    'lane',
-    'rolled_left',
-    'rolled_right',
-    'ramp',
-    'steep_ramp',
-    'glossy_strip',
-    'glossy_floor',
-    'textureless_strip',
-    'low_box',
-    'door_sill',
-    'kerb',
-)
+SUN = ('ceiling.height_m=0', 'lighting.ambient=0.45', 'lighting.sun=0.9')
+SCENES: dict[str, tuple[str, ...]] = {
+    'lane': (),
+    'rolled_left': (),
+    'rolled_right': (),
+    'ramp': (),
+    'steep_ramp': (),
+    'glossy_strip': (),
+    'glossy_floor': (),
+    'textureless_strip': (),
+    'low_box': (),
+    'door_sill': (),
+    'kerb': (),
+    'asphalt': ('floor.texture=asphalt',),
+    'carpet': ('floor.texture=carpet',),
+    'parquet': ('floor.texture=parquet',),
+    'glossy_stone': ('floor.texture=marble', 'floor.reflectance=0.2'),
+    'grass': ('floor.texture=grass',),
+    'plain': ('floor.texture=plain',),
+    'sun_on_asphalt': ('floor.texture=asphalt', *SUN),
+    'sun_on_tiles': SUN,
+    'sun_on_plain': ('floor.texture=plain', *SUN),
+}
+"""By name, what is changed of `lane` where no scene of that name is shipped."""
 MASKS = 12
 KEYFRAME_S = 0.4
 NEAREST_M, FARTHEST_M, LOW_FARTHEST_M = 0.5, 6.0, 2.0
@@ -55,6 +67,12 @@ class SceneScore:
     recall: float
     low_called_floor: float
     sill_called_floor: float
+
+
+def floor_scene(name: str) -> Scene:
+    """Return one of `SCENES`, or any other scene by name or file. Raises InputError."""
+    changes = SCENES.get(name, ())
+    return open_scene('lane' if changes else name, changes)
 
 
 def mount_of(scene: Scene) -> Mount:

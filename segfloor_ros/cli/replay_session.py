@@ -170,8 +170,9 @@ class ReplaySession:
             return
         if recorder.mount is None:
             raise MapError(
-                f'{name}: no floor was recognised in {sent} frames, so the height of the camera is '
-                'unknown; give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad'
+                f'{name}: no level floor was recognised in {sent} frames, so the height of the '
+                'camera is unknown; give stereo_slam.camera_height_m, camera_pitch_rad and '
+                'camera_roll_rad'
             )
         if not recorder.updated:
             words = next((s.message for s in recorder.failed.values()), 'none could be tracked')

@@ -16,7 +16,14 @@ from segfloor_ros.floor.mirror import (
     mirrored_share,
 )
 from segfloor_ros.floor.mount_view import MountViewer
-from segfloor_ros.floor.plane import PlaneFit, Samples, mean_climb, plausible, shares
+from segfloor_ros.floor.plane import (
+    PlaneFit,
+    Samples,
+    angles_height_of,
+    plane_of,
+    plausible,
+    shares,
+)
 from segfloor_ros.floor.plane_search import PlaneSearch
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import Up
@@ -33,15 +40,19 @@ _REST = 5
 _LEAST_FEET, _ENOUGH_FEET = 20, 150
 """Feet of one keyframe that are worth a look, and those that a floor needs."""
 _FEET_SUPPORT = 0.4
-_FEET_REST = 3
+_FEET_REST, _AGAIN = 3, 3
+_SAME = (0.03, math.radians(1.0), math.radians(2.0))
+"""Planes whose height, as a share, pitch and roll differ by less are the same."""
 _CONTRADICTED = 0.3
 """A plane below which such a share of the feet stands is no floor."""
 _SIGMAS, _FEET_SIGMAS = (0.015, math.radians(0.2)), (0.025, math.radians(0.4))
 """How well height, as a share of it, and tilt must be known, one sigma."""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
-_MAX_CLIMB = 3.0
-"""Sigmas by which the path may leave the floor: a plane that the robot drives into is none."""
+_SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
+"""How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
+as standard deviations: robots sway, and where they are is known so well.
+"""
 _NEARER = 0.8
 """A mirror at so much of the height of what looks like the floor lies clearly above it."""
 
@@ -84,6 +95,8 @@ class MountEstimator:
         self._viewer = MountViewer(camera)
         self._views: list[MirrorView] = []
         self._feet: list[Samples] = []
+        self._rotations: list[Array] = []
+        self._positions: list[Array] = []
         self._mirror_rng = np.random.default_rng(1)
         self._on_surfaces, self._on_feet = PlaneSearch(known), PlaneSearch(known)
         self._fits: list[PlaneFit] = []
@@ -123,6 +136,8 @@ class MountEstimator:
             return
         for search in (self._on_surfaces, self._on_feet):
             search.expect(up_world)
+        self._rotations.append(T_world_left[:3, :3])
+        self._positions.append(T_world_left[:3, 3])
         view = self._viewer.view(left, right, T_world_left)
         samples = view.surfaces.samples
         if len(samples.weight) < 50 or samples.weight.sum() < 1:
@@ -177,9 +192,11 @@ class MountEstimator:
         return steps[np.linalg.norm(steps, axis=1) > 0.05]
 
     def _is_plain(self, fit: PlaneFit) -> bool:
-        """Tell whether the floor is plain to see."""
+        """Tell whether the floor is plain to see, and seen again where it was not at once."""
         plain = fit.support > _PLAIN_SUPPORT and _is_certain(fit, *_SIGMAS)
-        return plain and self._is_possible(fit) and fit.violations <= _MAX_VIOLATIONS
+        plain &= self._is_possible(fit) and fit.violations <= _MAX_VIOLATIONS
+        again = len(self._fits) == 1 or _rests(self._fits, _AGAIN, *_SAME)
+        return plain and again
 
     def _stood_on(self, textured: PlaneFit) -> PlaneFit | None:
         """Return the plane on which things stand, once it has come to rest, where the floor itself
@@ -212,9 +229,18 @@ class MountEstimator:
         return fit if rests else None
 
     def _is_possible(self, fit: PlaneFit) -> bool:
-        """Tell whether a robot can drive on the plane as it did."""
-        climb = float(mean_climb(fit.angles_height[None], self._travel())[0])
-        return climb <= _MAX_CLIMB and bool(plausible(fit.angles_height))
+        """Tell whether a robot drove on the plane: on its way the camera keeps its place above it.
+        A hand does not, and on uneven ground or with a wrong plane nothing does.
+        """
+        if not plausible(fit.angles_height):
+            return False
+        height_m = float(fit.angles_height[2])
+        normal = plane_of(fit.angles_height) * height_m
+        rotations, positions = np.array(self._rotations), np.array(self._positions)
+        heights_m = height_m + positions @ normal
+        seen = angles_height_of((normal @ rotations) / heights_m[:, None])
+        spread = seen.std(axis=0) / (1.0, 1.0, height_m)
+        return bool(heights_m.min() > 0 and (spread < _SWAY).all())
 
 
 def _is_certain(fit: PlaneFit, height: float, tilt_rad: float) -> bool:

@@ -125,10 +125,12 @@ class Ceiling:
 @dataclass(frozen=True)
 class Lighting:
     """Light. levels: pairs (time in s, brightness) between which the brightness is interpolated;
-    empty keeps it at 1. ambient: share of the light that comes from everywhere.
+    empty keeps it at 1. ambient: share of the light that comes from everywhere. sun: how bright a
+    sun shines, whose shadows are hard; it needs a scene without ceiling.
     """
 
     ambient: float = 0.65
+    sun: float = 0.0
     levels: tuple[Point, ...] = ()
 
 

@@ -96,6 +96,35 @@ def wood(size: int, rng: np.random.Generator) -> Image:
     return 122 + shade + 17 * grain / grain.std() + 5 * fractal_noise(size, 1.2, rng) - 60 * seams
 
 
+def parquet(size: int, rng: np.random.Generator) -> Image:
+    """Sealed blocks, laid crosswise: faint grain, each block of its own shade, fine joints."""
+    blocks = 8
+    shade = _per_cell(rng.normal(0, 9, (blocks, blocks)), size)
+    grain = fractal_noise(size, 0.4, rng, 20)
+    along = uniform_filter1d(grain, size // 24, axis=1, mode='wrap')
+    across = uniform_filter1d(grain, size // 24, axis=0, mode='wrap')
+    turned = _per_cell(np.indices((blocks, blocks)).sum(axis=0) % 2 * 1.0, size)
+    grain = np.where(turned > 0, along / along.std(), across / across.std())
+    return 128 + shade + 9 * grain - 34 * _grid_lines(size, blocks, blocks, size // 500 + 1)
+
+
+def asphalt(size: int, rng: np.random.Generator) -> Image:
+    """A road: dark, with grit of all sizes, stains and a few cracks."""
+    cracks = np.exp(-np.abs(fractal_noise(size, 1.5, rng, 2)) * 60)
+    grit = 11 * fractal_noise(size, 0.2, rng, 60) + 5 * fractal_noise(size, 1.3, rng, 2)
+    return 88 + grit - 34 * cracks
+
+
+def grass(size: int, rng: np.random.Generator) -> Image:
+    """A mown lawn: blades in all directions, lighter and darker patches."""
+    first, second = (
+        uniform_filter1d(fractal_noise(size, 0.1, rng, 80), 7, axis=axis, mode='wrap')
+        for axis in (0, 1)
+    )
+    blades = first + second
+    return 92 + 24 * blades / blades.std() + 10 * fractal_noise(size, 1.2, rng, 3)
+
+
 def tiles(size: int, rng: np.random.Generator) -> Image:
     """Floor tiles of a quarter of the picture's side: stone with dark joints."""
     shade = _per_cell(rng.normal(0, 11, (4, 4)), size)
@@ -182,6 +211,9 @@ GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, fl
     'marble': (marble, 2048, 4.0),
     'granite': (granite, 2048, 3.0),
     'wood': (wood, 1024, 1.2),
+    'parquet': (parquet, 2048, 2.4),
+    'asphalt': (asphalt, 2048, 3.0),
+    'grass': (grass, 2048, 2.0),
     'tiles': (tiles, 2048, 3.2),
     'dark_tiles': (dark_tiles, 1024, 2.4),
     'bricks': (bricks, 1024, 1.6),

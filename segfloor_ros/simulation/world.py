@@ -10,12 +10,14 @@ import numpy as np
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.mesh import Mesh, caps, merge, sides
 from segfloor_ros.simulation.movers import part_solids
-from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.scene import Lighting, Scene
 from segfloor_ros.simulation.solids import Prism, floors, obstacles
 from segfloor_ros.simulation.textures import Texture, make_texture
 
 NEAR_M, FAR_M = 0.02, 120.0
 GROUND_HALF_M = 60.0
+SHADOW_HALF_M, SHADOW_PX = 12, 4096
+"""Within so far of the origin the sun casts shadows, of so many pixels across."""
 RIG = 'rig'
 CAMERAS = ('left', 'right')
 
@@ -152,8 +154,8 @@ def _document(builder: WorldBuilder, width: int, height: int) -> str:
   <statistic extent="1" center="0 0 1"/>
   <visual>
     <global offwidth="{width}" offheight="{height}"/>
-    <map znear="{NEAR_M}" zfar="{FAR_M}"/>
-    <quality offsamples="4" shadowsize="0"/>
+    <map znear="{NEAR_M}" zfar="{FAR_M}" shadowclip="{SHADOW_HALF_M}"/>
+    <quality offsamples="4" shadowsize="{SHADOW_PX if scene.lighting.sun > 0 else 0}"/>
     <headlight active="0"/>
   </visual>
   <asset>
@@ -168,10 +170,20 @@ def _document(builder: WorldBuilder, width: int, height: int) -> str:
            ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
     <light directional="true" castshadow="false" pos="0 0 1" dir="0 0 1"
            ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
+    {_sun(scene.lighting)}
     {''.join(builder.bodies)}
     <body name="{RIG}" mocap="true">{cameras}</body>
   </worldbody>
 </mujoco>"""
+
+
+def _sun(lighting: Lighting) -> str:
+    if lighting.sun == 0:
+        return ''
+    return (
+        '<light directional="true" castshadow="true" pos="-4 -3 6" dir="0.55 0.4 -0.7" '
+        f'ambient="0 0 0" diffuse="{_grey(lighting.sun)}" specular="0 0 0"/>'
+    )
 
 
 def _grey(value: float) -> str:

@@ -12,7 +12,15 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.simulation.any_scene import open_scene
 from segfloor_ros.simulation.renderer import RenderingError
 from segfloor_ros.simulation.simulation import FrameTruth
-from tools.floor_masks import SCENES, count, mount_of, read_truth, render_floor, score_recording
+from tools.floor_masks import (
+    SCENES,
+    count,
+    floor_scene,
+    mount_of,
+    read_truth,
+    render_floor,
+    score_recording,
+)
 
 CAMERA = StereoCamera(4, 3, 100.0, 100.0, 1.5, 1.0, 0.1)
 
@@ -48,7 +56,7 @@ def test_low_things_are_counted():
 
 @pytest.mark.parametrize('name', SCENES)
 def test_scenes_can_be_opened(name):
-    scene = open_scene(name)
+    scene = floor_scene(name)
     mount = mount_of(scene)
     assert mount.height_m == scene.camera.height_m
     assert np.degrees(mount.roll_rad) == pytest.approx(scene.camera.roll_deg)
