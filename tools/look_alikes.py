@@ -52,7 +52,8 @@ def _scene(
         'camera': {'rate_hz': 5.0} | (SMALL if seed > 1 else {}),
         'path': {
             'waypoints': [[round(float(x), 3), round(float(y), 3)] for x, y in way],
-            'speed_m_s': 0.5,
+            'speed_m_s': 0.8,
+            'turn_rate_deg_s': 50.0,
         },
     }
 

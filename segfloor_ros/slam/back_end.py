@@ -14,6 +14,7 @@ from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.disparity_offset import OffsetEstimate
+from segfloor_ros.slam.front_end import FrontEnd
 from segfloor_ros.slam.global_adjustment import apply_global, plan_global, solve_global
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
@@ -22,10 +23,8 @@ from segfloor_ros.slam.level_ground import LevelGround
 from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
 from segfloor_ros.slam.loops import LoopDetector
 from segfloor_ros.slam.mapping import LocalMapper
-from segfloor_ros.slam.place_recognition import PlaceRecognition
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking import Tracker
 
 
 class BackEnd:
@@ -40,15 +39,15 @@ class BackEnd:
         camera: StereoCamera,
         settings: StereoSlamSettings,
         sparse_map: SparseMap,
-        tracker: Tracker,
+        front_end: FrontEnd,
         background: bool,
     ) -> None:
         self.mapper = LocalMapper(camera, settings)
-        self.places = PlaceRecognition(camera, tracker, sparse_map)
+        self.places = front_end.places
         self.loop_count = 0
         self._known: KnownMap | None = None
         self._camera = camera
-        self._tracker = tracker
+        self._tracker = front_end.tracker
         self._map = sparse_map
         self.loops = LoopDetector(camera, sparse_map, self.places)
         self._local = AdjustmentRunner(background)

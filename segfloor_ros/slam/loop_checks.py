@@ -43,7 +43,7 @@ IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by so much, and by this
 share."""
 
-MIN_COMPARED = 20
+MIN_COMPARED = 15
 MAX_SEEN_THROUGH = 0.2
 """Share of points that the other side may see through: edges hide what is behind by a few pixels.
 """

@@ -159,15 +159,15 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
     rows = rng.integers(20, CAMERA.height - 20, 150)
     on_edge = np.stack([edge_px[rows], rows], axis=1)
-    pose, sure = slam._motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
+    pose, sure = slam._front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
     estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
-    track = Track(estimate, np.arange(150, dtype=np.int32), on_edge, np.arange(150), None)
+    track = Track(estimate, np.arange(150, dtype=np.int32), on_edge, np.arange(150))
     for texture, expected in ((0.0, False), (30.0, True)):
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
         images = Images.of(frame, CAMERA, 0)
-        assert slam._is_believable(track, images, frame.stamp_ns) == expected
+        assert slam._front_end.is_believable(track, images, frame.stamp_ns) == expected
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_tells_it(frames):

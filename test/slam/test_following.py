@@ -45,8 +45,10 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
     truth = planar_pose(0.03, 0, 0.02) @ MOUNT.T_base_left
 
     def follow(frame):
-        ids = slam._local.point_ids
-        return slam._follower.follow(Images.of(frame, CAMERA), slam.map, ids, np.eye(4), 0.0)
+        ids = slam._front_end.local.point_ids
+        return slam._front_end.follower.follow(
+            Images.of(frame, CAMERA), slam.map, ids, np.eye(4), 0.0
+        )
 
     track = follow(frame)
     error = MOUNT.T_base_left @ invert(track.T_camera_world) @ invert(truth)
@@ -59,7 +61,7 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
 def test_points_that_are_gone_are_not_followed(room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
-    follower, ids = slam._follower, slam._follower.seen_ids
+    follower, ids = slam._front_end.follower, slam._front_end.follower.seen_ids
     slam.map.remove_points(ids[::2])
     follower.drop_dead(slam.map)
     np.testing.assert_array_equal(follower.seen_ids, ids[1::2])
@@ -70,10 +72,10 @@ def test_points_that_are_gone_are_not_followed(room):
 
 def test_only_keyframes_need_features(monkeypatch, room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    extract = slam._extractor.extract
+    extract = slam._front_end.extractor.extract
     calls = []
     monkeypatch.setattr(
-        slam._extractor, 'extract', lambda *given: calls.append(1) or extract(*given)
+        slam._front_end.extractor, 'extract', lambda *given: calls.append(1) or extract(*given)
     )
     for k in range(12):
         result = slam.process(room.frame(k, planar_pose(0.03 * k, 0, 0.01 * k)))[0]

@@ -10,25 +10,21 @@ from test_sparse_map import add, keyframe
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.loops import LoopDetector, Match
-from segfloor_ros.slam.place_recognition import PlaceRecognition
+from segfloor_ros.slam.keyframe_record import Match
+from segfloor_ros.slam.loop_checks import LoopChecks, are_certain
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking import Tracker
 
 MOUNT = Mount(0.4, 0.15)
 ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
 
 
-def detector_of(sparse_map):
-    return LoopDetector(sparse_map, PlaceRecognition(CAMERA, Tracker(CAMERA), sparse_map))
-
-
-def is_sound(centre, drift, own=ROWS):
-    """Tell whether a camera at `centre`, that the map has at centre + drift, is believed to see
-    keyframe 0's points again. own: which of its own points each feature shows.
+def objection(centre, drift, own=ROWS, apart=0.0):
+    """Return what speaks against a camera at `centre`, that the map has at centre + drift, seeing
+    keyframe 0's points again. own: which of its own points each feature shows; apart: how much
+    further away than these the place's points are.
     """
     sparse_map = SparseMap()
     add(sparse_map, seen(0, [NO_POINT] * len(POINTS), 15.0), ROWS, POINTS)
@@ -41,24 +37,37 @@ def is_sound(centre, drift, own=ROWS):
     add(sparse_map, now, ROWS, POINTS[own] + drift)
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
-    return detector_of(sparse_map)._is_sound(now, match, MOUNT)
+    sparse_map.xyz_world[ROWS] *= 1.0 - apart
+    checks = LoopChecks(CAMERA, sparse_map)
+    return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match, MOUNT)
 
 
 def test_a_place_seen_again_after_a_drift_is_sound():
-    assert is_sound((0.1, 0.0, 0.0), (0.2, 0.0, 0.1))
+    assert objection((0.1, 0.0, 0.0), (0.2, 0.0, 0.1)) == ''
 
 
 def test_what_is_no_drift_is_no_loop():
-    assert not is_sound((0.1, 0.0, 0.0), (0.01, 0.0, 0.0))
+    assert objection((0.1, 0.0, 0.0), (0.01, 0.0, 0.0)) == 'no drift'
+
+
+def test_more_drift_than_the_way_can_have_is_another_place():
+    assert objection((0.1, 0.0, 0.0), (0.6, 0.0, 0.1)) == 'more than drift'
 
 
 def test_a_camera_that_hangs_above_the_place_is_not_there():
     # Optical axes: y points down.
-    assert not is_sound((0.1, -0.25, 0.0), (0.0, 0.25, 0.0))
+    assert objection((0.1, -0.25, 0.0), (0.0, 0.25, 0.0)) == 'another floor'
 
 
 def test_own_points_must_lie_where_the_place_shows_what_they_match():
-    assert not is_sound((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), np.roll(ROWS, 5))
+    found = objection((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), np.roll(ROWS, 5))
+    assert found == 'not seen from the other side'
+
+
+def test_free_space_does_not_run_through_what_stands_there():
+    # Every pixel fits, but the place's points stand half way to what the keyframe sees.
+    found = objection((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), apart=0.5)
+    assert found == 'free space through obstacles'
 
 
 @pytest.mark.parametrize(
@@ -72,9 +81,9 @@ def test_own_points_must_lie_where_the_place_shows_what_they_match():
 )
 def test_three_keyframes_on_the_move_must_tell_the_same_drift(views, drifts_m, expected):
     sparse_map = row_of_views(26, list(range(10)), 0.1)
-    detector = detector_of(sparse_map)
+    matches = []
     for index, drift_m in zip(views, drifts_m, strict=True):
         drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
         pose = sparse_map.keyframes[index].T_camera_world @ drift
-        detector._matches.append(Match(index, 0, pose, NONE, NONE, NONE))
-    assert detector._is_certain() is expected
+        matches.append(Match(index, 0, pose, NONE, NONE, NONE))
+    assert are_certain(sparse_map, matches) is expected

@@ -33,7 +33,7 @@ def bend(slam, drift):
     share = np.clip((np.arange(len(keyframes)) - 10) / (len(keyframes) - 11), 0, 1)
     poses = np.stack([k.T_camera_world for k in keyframes])
     move_keyframes(slam.map, poses @ se3_exp(share[:, None] * drift))
-    slam._motion.move_map(before, keyframes[-1].T_camera_world)
+    slam._front_end.motion.move_map(before, keyframes[-1].T_camera_world)
 
 
 def drive(drift):

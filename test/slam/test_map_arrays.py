@@ -111,7 +111,7 @@ def test_another_room_is_not_this_one(mapped):
 
 
 def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
-    mapped._motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
+    mapped._front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
     slam = loaded(mapped, localize=False, ends_ns=None)
     stamps = [k.stamp_ns for k in slam.map.keyframes]
     assert stamps == [k.stamp_ns for k in mapped.map.keyframes]
