@@ -4,7 +4,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import yaml
+from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
 from segfloor_ros.camera.deblocking import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
@@ -99,3 +101,24 @@ def test_library(shared_data):
         missed += (~called & (floor > 0) & counted).sum()
     assert hit / (hit + false) > 0.93
     assert hit / (hit + missed) > 0.75
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_weak_texture_survives_compression(floor_kind):
+    """What a cheap camera sends: blocks of 8 by 8 pixels that hardly differ within."""
+
+    def compressed(image):
+        _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 30])
+        return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+
+    scene = Scene([floor_patch(**{**floor_kind, 'contrast': 4.0}), wall(3.0)], SMALL_CAMERA)
+    left, right, floor, depth = scene.render()
+    recall = {}
+    for name, treat in (('as it is', lambda image: image), ('deblocked', deblocked)):
+        pair = (treat(compressed(image)) for image in (left, right))
+        stage = FloorSegmentation(SMALL_CAMERA, FloorSegmentationSettings())
+        called = stage.process(*pair, MOUNT).mask == FLOOR
+        assert (called & floor).sum() / called.sum() > 0.99
+        near = floor & (depth > 0.5)
+        recall[name] = (called & near).sum() / near.sum()
+    assert recall['deblocked'] > max(0.92, recall['as it is'] + 0.04)

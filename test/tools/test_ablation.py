@@ -1,0 +1,65 @@
+"""`tools.ablation`: what is patched exists, and what is drawn, read and added is as said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
+from typer.testing import CliRunner
+
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.geometry import invert
+from tools.ablation import app, drawn
+from tools.driving import noisy
+from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
+from tools.mechanisms import GRID, RECORDED, SLAM
+
+ALL = {**SLAM, **FLOOR_MECHANISMS, **GRID, **RECORDED}
+
+
+@pytest.mark.parametrize('name', sorted(ALL))
+def test_what_is_left_out_is_part_of_the_package(name) -> None:
+    with ALL[name].left_out():
+        changed = ALL[name].configured(Configuration())
+    for setting, value in ALL[name].settings.items():
+        assert getattr(changed.stereo_slam, setting) == value
+    assert bool(ALL[name].patches or ALL[name].settings) is (name != 'nothing')
+
+
+def test_outlines_become_masks_with_unsure_borders() -> None:
+    outline = {'floor': [[[10, 10], [50, 10], [50, 40], [10, 40]]], 'unsure': [[[0, 50], [9, 50]]]}
+    mask = drawn(outline, (60, 80))
+    assert (mask[25, 30], mask[25, 70], mask[10, 30], mask[50, 5]) == (
+        FLOOR,
+        NOT_FLOOR,
+        NO_EVIDENCE,
+        NO_EVIDENCE,
+    )
+
+
+def test_noise_follows_its_seed() -> None:
+    grey = np.full((60, 80), 100, np.uint8)
+    frames = [StereoFrame(0, 0, grey, grey)]
+    (bare,), (first,), (again,), (other,) = (noisy(frames, seed) for seed in (0, 1, 1, 2))
+    assert bare.left is grey
+    np.testing.assert_array_equal(first.left, again.left)
+    assert (first.left != other.left).mean() > 0.3
+    assert first.right.astype(float).std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_error_of_a_path_without_a_mechanism_is_printed(tmp_path) -> None:
+    frames, T_world_base = room_drive(8)
+    drive = write_kitti(tmp_path / 'room', frames)
+    T_world_left = np.array(T_world_base) @ MOUNT.T_base_left
+    relative = invert(T_world_left[0]) @ T_world_left
+    np.savetxt(drive / 'poses.txt', relative[:, :3].reshape(-1, 12))
+    result = CliRunner().invoke(app, ['path', str(drive), '--only', 'fusion of points'])
+    assert result.exit_code == 0, result.exception
+    rows = [line.split(' | ') for line in result.output.splitlines()]
+    assert [row[:2] for row in rows] == [['room', 'nothing'], ['room', 'fusion of points']]
+    for _, _, error_m, tracked, keyframes, points in rows:
+        assert 0 < float(error_m) < 0.02
+        assert int(tracked) == 8 and int(keyframes) >= 2 and int(points) > 100
