@@ -68,7 +68,7 @@ SLAM: dict[str, Mechanism] = {
     'bad adjustments left out': Mechanism({'slam.mapping.MIN_KEPT_RATIO': 0.0}),
     'known views': Mechanism({'slam.places.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.retire_redundant': _none}),
-    'loops': Mechanism({'slam.stereo_slam.StereoSlam._close_loop': lambda *_: False}),
+    'loops': Mechanism({'slam.back_end.BackEnd._close_loop': lambda *_: False}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""
