@@ -10,10 +10,10 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 BOARD_M, WALL_M = 2.0, 4.0
 
 
-def board(bottom_m: float, width_m: float = 1.0) -> Patch:
-    """The front of a board, 8 cm high, across the way."""
+def board(bottom_m: float, width_m: float = 1.0, height_m: float = 0.08) -> Patch:
+    """The front of a board across the way."""
     corner = (BOARD_M, -width_m / 2, bottom_m)
-    return Patch(corner, (0.0, width_m, 0.0), (0.0, 0.0, 0.08), False, grey=90.0, seed=8)
+    return Patch(corner, (0.0, width_m, 0.0), (0.0, 0.0, height_m), False, grey=90.0, seed=8)
 
 
 def scan_of(scene: Scene, **settings: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -34,6 +34,13 @@ def test_a_board_at_the_robots_height_ends_the_scan(floor_kind):
     assert np.nanmedian(standing_m[below]) == pytest.approx(BOARD_M, abs=0.05)
     beside = (np.abs(bearing) > 17) & (np.abs(bearing) < 30)
     assert np.median(floor_m[beside]) > 3.4
+
+
+def test_a_table_top_of_six_centimetres_ends_the_scan():
+    scene = Scene([floor_patch(), wall(WALL_M), board(0.55, height_m=0.06)])
+    bearing, floor_m, _ = scan_of(scene)
+    below = np.abs(bearing) < 12
+    assert (np.abs(floor_m[below] - BOARD_M) < 0.1).mean() > 0.9
 
 
 def test_what_hangs_higher_than_the_robot_does_not():
