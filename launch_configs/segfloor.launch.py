@@ -46,6 +46,30 @@ CAMERAS = {
         'depth': '/camera/depth/image_raw',
         'imu': '/camera/gyro_accel/sample',
     },
+    'realsense_depth': {
+        'left_image': '/camera/camera/color/image_raw',
+        'left_camera_info': '/camera/camera/color/camera_info',
+        'depth': '/camera/camera/aligned_depth_to_color/image_raw',
+        'imu': '/camera/camera/imu',
+    },
+    'zed_depth': {
+        'left_image': '/zed/zed_node/left/color/rect/image',
+        'left_camera_info': '/zed/zed_node/left/color/rect/camera_info',
+        'depth': '/zed/zed_node/depth/depth_registered',
+        'imu': '/zed/zed_node/imu/data',
+    },
+    'oak_depth': {
+        'left_image': '/oak/rgb/image_raw',
+        'left_camera_info': '/oak/rgb/camera_info',
+        'depth': '/oak/stereo/image_raw',
+        'imu': '/oak/imu/data',
+    },
+    'orbbec_depth': {
+        'left_image': '/camera/color/image_raw',
+        'left_camera_info': '/camera/color/camera_info',
+        'depth': '/camera/depth/image_raw',
+        'imu': '/camera/gyro_accel/sample',
+    },
 }
 """Topics by the names that the drivers document; params/camera_NAME.yaml says what to ask of them.
 """
@@ -73,7 +97,8 @@ ARGUMENTS = {
     ),
     'camera': (
         'auto',
-        'A camera whose driver runs: realsense, zed, oak or orbbec, which names its topics. Or '
+        'A camera whose driver runs: realsense, zed, oak or orbbec, or one of these with _depth '
+        'behind its name for its depth images, which names its topics. Or '
         'whether to start the node stereo_camera: true, false, or auto, which does so where input '
         'is given; with true the input may stand in params_file.',
     ),

@@ -211,6 +211,37 @@ def test_a_camera_is_called_by_its_name(launched, camera, left, kind) -> None:
     assert mine['left/image_raw'] == '/mine/image_raw'
 
 
+@pytest.mark.parametrize(
+    ('camera', 'left', 'depth', 'kind'),
+    [
+        (
+            'realsense',
+            '/camera/camera/color/image_raw',
+            '/camera/camera/aligned_depth_to_color/image_raw',
+            'raw',
+        ),
+        (
+            'zed',
+            '/zed/zed_node/left/color/rect/image',
+            '/zed/zed_node/depth/depth_registered',
+            'rect',
+        ),
+        ('oak', '/oak/rgb/image_raw', '/oak/stereo/image_raw', 'raw'),
+        ('orbbec', '/camera/color/image_raw', '/camera/depth/image_raw', 'raw'),
+    ],
+)
+def test_the_depth_of_a_camera_is_called_by_its_name(launched, camera, left, depth, kind) -> None:
+    slam = launched(camera=f'{camera}_depth')['stereo_slam']
+    found = remappings(slam)
+    assert found[f'left/image_{kind}'] == left
+    assert found['depth/image_raw'] == depth
+    assert not any(name.startswith('right/') for name in found)
+    files = [Path(file) for file in after(slam.arguments, '--params-file')]
+    assert files[0].name == f'camera_{camera}_depth.yaml'
+    given = yaml.safe_load((REPOSITORY / 'params' / files[0].name).read_text())
+    assert given['/**/stereo_slam']['ros__parameters']['use_depth'] is True
+
+
 def test_a_camera_that_is_not_known_is_refused_with_those_that_are(launched) -> None:
     with pytest.raises(ValueError, match=r'camera:=kinect: .*realsense, zed, oak, orbbec'):
         launched(camera='kinect')
