@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from rich.progress import TaskID
 
 from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli.options import (
     DepthOption,
     IgnoreOption,
@@ -79,6 +81,9 @@ def replay(
     )
     # The camera node reads the recording; here it is opened so that bad input ends at once.
     source = open_source(configuration.stereo_camera)
+    if any(sensor.name == DEPTH and sensor.used for sensor in source.sensors):
+        camera = dataclasses.replace(configuration.stereo_camera, depth=True)
+        configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
     print_sensors(source.sensors)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -121,6 +121,7 @@ class ReplaySession:
         parameters[SLAM]['ros__parameters'].update(
             background=False, image_transport='raw', tf_wait_s=0.0
         )
+        parameters[SLAM]['ros__parameters']['use_depth'] = self._configuration.stereo_camera.depth
         for name, file in (('load_map', self._maps.load), ('save_map', self._maps.save)):
             if file is not None:
                 parameters[SLAM]['ros__parameters'][name] = str(file.absolute())

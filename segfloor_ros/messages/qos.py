@@ -32,7 +32,10 @@ IMAGES_BEST_EFFORT = QoSProfile(
 SENSORS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=400, reliability=ReliabilityPolicy.BEST_EFFORT
 )
-"""Wheel odometry and IMU of other drivers, of whatever reliability."""
+"""Wheel odometry and IMU of drivers that publish best effort."""
+
+SENSORS_RELIABLE = _reliable(400)
+"""Wheel odometry and IMU where that is offered."""
 
 FRAMES = _reliable(5)
 """Small images of every frame, of which only the latest count."""

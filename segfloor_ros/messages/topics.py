@@ -139,7 +139,7 @@ _ALL = [
     Topic(
         'wheel_odometry',
         Odometry,
-        qos.SENSORS,
+        qos.SENSORS_RELIABLE,
         OTHERS,
         (SLAM,),
         'Where the wheels have base_link, in any frame of their own. stereo_camera publishes that '
@@ -159,7 +159,7 @@ _ALL = [
     Topic(
         'imu',
         Imu,
-        qos.SENSORS,
+        qos.SENSORS_RELIABLE,
         OTHERS,
         (SLAM,),
         'Angular velocity and acceleration, in a frame that tf ties to the camera. stereo_camera '

@@ -8,12 +8,15 @@ from collections.abc import Callable
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Imu
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import Measurement, WheelPose
+from segfloor_ros.messages import qos
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.sensors import NOT_MEASURED, imu_sample, wheel_pose
+from segfloor_ros.nodes.qos_check import offered_best_effort
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.nodes.transforms import Transforms
 
@@ -47,9 +50,10 @@ class SensorInput:
         self._node = node
         self._transforms = transforms
         self._on_message = on_message
+        self._takes_best_effort = False
         self.reset()
-        node.inputs.subscribe(WHEELS, self._take_wheels)
-        node.inputs.subscribe(IMU, self._take_imu)
+        node.inputs.subscribe(WHEELS, self._take_wheels, self._choose_profile)
+        node.inputs.subscribe(IMU, self._take_imu, self._choose_profile)
 
     def reset(self) -> None:
         """Know no camera and no measurement."""
@@ -66,6 +70,15 @@ class SensorInput:
         images into the rectified one.
         """
         self._camera = left_frame, R_rectified_left
+
+    def adapt_reliability(self) -> None:
+        """Receive best effort where a driver offers no more."""
+        if not self._takes_best_effort and offered_best_effort(self._node, (WHEELS, IMU)):
+            self._takes_best_effort = True
+            self._node.inputs.reopen()
+
+    def _choose_profile(self) -> QoSProfile:
+        return qos.SENSORS if self._takes_best_effort else qos.SENSORS_RELIABLE
 
     def take(self, stamp_ns: int, lag_ns: int = 0) -> list[Measurement]:
         """Return what has been measured since the last call, up to the time of an image."""

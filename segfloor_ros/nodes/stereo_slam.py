@@ -114,6 +114,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def find_problems(self) -> None:
         """Follow what the driver offers, and report what is wrong with the camera."""
         self._camera.adapt_reliability()
+        self._sensors.adapt_reliability()
         missing = self._camera.missing_calibrations if self._waiting else []
         self._camera.watch.find_problems(missing)
 

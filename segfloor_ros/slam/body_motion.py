@@ -184,7 +184,6 @@ class BodyMotion:
     def stop_learning(self) -> None:
         """Note that there is a frame without a pose from the images."""
         self._window = None
-        self.gravity.stop()
 
     def _learn_wheels(self, T_before_now: Array, before_ns: int, now_ns: int) -> None:
         told = self._wheels.stretch(before_ns, now_ns)

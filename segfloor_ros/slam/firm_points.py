@@ -1,4 +1,6 @@
-"""Which points of an image hold in every direction: those on edges slide along them."""
+"""How many points of an image tell the pose: those on edges slide along them, and neighbours err
+together.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,21 @@ MIN_RATIO = 0.15
 textures it is more, of an edge with the noise of a camera less."""
 
 
+CELLS, PER_CELL = 80, 3
+"""Parts into which an image is divided, and points of each that count."""
+
+
 def count_firm(image: NDArray[Any], uv_px: Array) -> int:
-    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures."""
+    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures; of many
+    in one part of the image some.
+    """
+    firm = uv_px[_is_firm(image, uv_px)]
+    cell = (firm // np.sqrt(image.size / CELLS)).astype(np.intp)
+    _, counts = np.unique(cell, axis=0, return_counts=True)
+    return int(np.minimum(counts, PER_CELL).sum())
+
+
+def _is_firm(image: NDArray[Any], uv_px: Array) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     height, width = image.shape
     columns, rows = np.rint(uv_px).astype(np.intp).T
@@ -30,4 +45,4 @@ def count_firm(image: NDArray[Any], uv_px: Array) -> int:
     by_y = patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]
     xx, xy, yy = ((a * b).sum(axis=(1, 2)) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
     middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    return int((middle - spread > MIN_RATIO * (middle + spread)).sum())
+    return np.asarray(middle - spread > MIN_RATIO * (middle + spread))

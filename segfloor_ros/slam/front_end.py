@@ -38,9 +38,9 @@ CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 """Points, and their share of those expected, that must be found where the sensors have the camera
 somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
-FEW_POINTS, RESUMING_POINTS = 60, 100
-"""Wheels tell the pose better than fewer points that do not slide along edges. So many more end a
-blind stretch."""
+FEW_POINTS, RESUMING_POINTS = 50, 60
+"""Wheels tell the pose better than fewer points, spread over the image, that do not slide along
+edges. A few more end a blind stretch."""
 
 MAX_BLIND_SIGMA_M = 0.5
 """Uncertainty of the pose up to which keyframes are made of it."""

@@ -73,7 +73,7 @@ class Gravity:
         return _up(R_camera_odom @ lift_odom - self._state[3:], covariance)
 
     def see(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Take in the pose of a frame that the images tell."""
+        """Take in the pose of a frame that images or wheels tell."""
         if self._poses and stamp_ns - self._poses[-1][0] < STEP_NS:
             return
         if self._poses and stamp_ns - self._poses[-1][0] > MAX_STEP_NS:
@@ -87,7 +87,7 @@ class Gravity:
             self._latest = lift_odom, R_world_odom
 
     def stop(self) -> None:
-        """Note that there is a frame without a pose from the images."""
+        """Note that there is a frame without a pose."""
         self._poses.clear()
 
     def _lift(self) -> Array | None:

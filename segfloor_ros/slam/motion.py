@@ -142,6 +142,8 @@ class CameraMotion:
         self._last_stamp_ns = stamp_ns
         self.carried_by = 'wheels' if measured.with_way else 'gyroscope'
         self._body.stop_learning()
+        if measured.with_way:
+            self._body.gravity.see(stamp_ns, self.T_odom_camera, self.T_world_odom[:3, :3])
         return True
 
     def stop(self) -> None:
@@ -150,6 +152,7 @@ class CameraMotion:
         self.is_lost, self.carried_by = True, ''
         self._since_keyframe = None
         self._body.stop_learning()
+        self._body.gravity.stop()
 
     def start_keyframe(self) -> RelativeMotion | None:
         """Return the motion since the last keyframe as the wheels tell it; the next begins."""

@@ -24,7 +24,7 @@ from segfloor_ros.slam.normal_equations import System
 CHI2_95 = 12.59
 """The 95 % quantile of the chi-squared distribution with six degrees of freedom."""
 
-FLOOR_SIGMA = np.array([1e-3] * 3 + [5e-4] * 3)
+FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
 
 

@@ -177,7 +177,7 @@ def test_wheels_that_slipped_are_less_sure_for_a_second():
     sigmas_m = []
     for k in range(60):
         body.learn(100 * k * MS, invert(body.T_base_left) @ base_pose(0.05 * k, 0, 0)
-                   @ body.T_base_left)  # fmt: skip
+                   @ body.T_base_left, np.eye(3))  # fmt: skip
         ahead = body.between(100 * k * MS, 100 * (k + 1) * MS)
         sigmas_m.append(np.sqrt(np.trace(ahead.covariance[:3, :3])))
     assert body.slips > 3

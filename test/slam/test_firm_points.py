@@ -25,13 +25,19 @@ def test_points_on_an_edge_are_not_firm(contrast, slope):
 
 
 def test_corners_and_textures_are_firm():
-    v, u = np.mgrid[:120, :160]
-    image = noisy(100 + 40.0 * ((u // 20 + v // 20) % 2))
-    corners = np.array([(x - 0.5, y - 0.5) for x in range(20, 150, 20) for y in range(20, 110, 20)])
+    v, u = np.mgrid[:480, :640]
+    image = noisy(100 + 40.0 * ((u // 40 + v // 40) % 2))
+    corners = np.array([(x - 0.5, y - 0.5) for x in range(40, 630, 80) for y in range(40, 470, 80)])
     assert count_firm(image, corners) == len(corners)
     weak = noisy(100 + 6 * np.sin(u * 0.9) * np.sin(v * 1.1))
-    anywhere = RNG.uniform(10, 110, (100, 2))
+    anywhere = RNG.uniform(10, 460, (100, 2))
     assert count_firm(weak, anywhere) > 80
+
+
+def test_of_many_points_in_one_place_few_count():
+    texture = noisy(RNG.uniform(60, 160, (480, 640)))
+    together = RNG.uniform([200, 200], [240, 240], (200, 2))
+    assert count_firm(texture, together) <= 12
 
 
 def test_points_at_the_border_and_none_at_all():
