@@ -161,8 +161,10 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     on_edge = np.stack([edge_px[rows], rows], axis=1)
     pose, sure = slam._front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
     estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
-    track = Track(estimate, np.arange(150, dtype=np.int32), on_edge, np.arange(150))
-    for texture, expected in ((0.0, False), (30.0, True)):
+    anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
+    for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
+        ids = np.arange(150, dtype=np.int32)
+        track = Track(estimate, ids, uv_px, ids)
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
