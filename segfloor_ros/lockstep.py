@@ -195,6 +195,8 @@ class LockstepRun:
         self._memory.sample()
         if self._save_masks is not SaveMasks.none:
             self._folder.add_mask(keyframe.frame_index, floor.mask)
+            if keyframe.moving is not None:
+                self._folder.add_moving_mask(keyframe.frame_index, keyframe.moving)
         if self._save_debug:
             pictures = {
                 'overlay': mask_overlay(keyframe.left, floor.mask),
@@ -245,7 +247,12 @@ class LockstepRun:
             camera_roll_rad=round(mount.roll_rad, 5),
             sensors=self._sensors_used(),
             blind_frames=sum(result.blind for result in self._results),
+            moving_frames=sum(_shows_motion(result) for result in self._results),
             sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],
             stages=self._pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )
+
+
+def _shows_motion(result: FrameResult) -> bool:
+    return result.moving is not None and len(result.moving.xyz_map) > 0

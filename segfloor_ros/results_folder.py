@@ -38,6 +38,7 @@ OUTPUT_NAMES = (
     'camera_trajectory.txt',
     'labelled_cloud.ply',
     'floor_masks',
+    'moving_masks',
     'floor_debug',
     'summary.json',
     'settings.yaml',
@@ -50,9 +51,10 @@ class RunSummary:
 
     lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
     the times in seconds at which tracking was lost and found again, lost_s and found_s. sensors:
-    messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. sensor_remarks:
-    what seems wrong with sensors, in words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms.
-    rss_mb: start, peak and slope_per_update in MB, and samples over the updates.
+    messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. moving_frames:
+    in which something was found that moves. sensor_remarks: what seems wrong with sensors, in
+    words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and
+    slope_per_update in MB, and samples over the updates.
     """
 
     frames: int
@@ -70,6 +72,7 @@ class RunSummary:
     camera_roll_rad: float
     sensors: dict[str, int]
     blind_frames: int
+    moving_frames: int
     sensor_remarks: list[str]
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
@@ -139,7 +142,14 @@ class OutputFolder:
 
     def add_mask(self, frame_index: int, mask: NDArray[np.uint8]) -> None:
         """Keep the floor mask (H, W) of a frame."""
-        folder = self._open() / 'floor_masks'
+        self._add_mask('floor_masks', frame_index, mask)
+
+    def add_moving_mask(self, frame_index: int, mask: NDArray[np.uint8]) -> None:
+        """Keep the mask (H, W) of what moves in a frame."""
+        self._add_mask('moving_masks', frame_index, mask)
+
+    def _add_mask(self, name: str, frame_index: int, mask: NDArray[np.uint8]) -> None:
+        folder = self._open() / name
         folder.mkdir(exist_ok=True)
         cv2.imwrite(str(folder / f'{frame_index:06d}.png'), mask)
 
@@ -199,6 +209,7 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('frames lost', lost),
         *(('remark', remark) for remark in summary.sensor_remarks),
         ('frames skipped (unreadable)', summary.skipped_frames),
+        ('frames with something that moves', summary.moving_frames),
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),
         ('camera height', f'{summary.camera_height_m:.3f} m'),

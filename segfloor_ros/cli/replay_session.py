@@ -229,6 +229,7 @@ class ReplaySession:
             camera_roll_rad=round(mount.roll_rad, 5),
             sensors=_sensors_sent(finished),
             blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
+            moving_frames=sum(bool(s and int(s.values.get('moving', 0))) for s in answers),
             sensor_remarks=recorder.remarks,
             stages=recorder.times.summary(),
             rss_mb=recorder.memory.summary(),

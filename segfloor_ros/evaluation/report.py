@@ -15,9 +15,10 @@ from segfloor_ros.evaluation.overlay import draw_overlay
 from segfloor_ros.evaluation.report_data import ReportData, read_run
 from segfloor_ros.evaluation.report_pictures import (
     cloud_picture,
+    floor_pictures,
     map_picture,
     memory_picture,
-    strip_pictures,
+    moving_pictures,
     v_disparity_picture,
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
@@ -138,13 +139,16 @@ def _maps(data: ReportData) -> str:
 
 
 def _keyframes(data: ReportData) -> str:
-    figures = [_figure(picture, name, 'jpeg') for name, picture in strip_pictures(data)]
+    return _strip('Keyframes', 'green: floor; yellow: no evidence', floor_pictures(data)) + _strip(
+        'What moves', 'red: left out of the pose, the map and the floor', moving_pictures(data)
+    )
+
+
+def _strip(title: str, legend: str, pictures: list[tuple[str, bytes]]) -> str:
+    figures = [_figure(picture, name, 'jpeg') for name, picture in pictures]
     if not figures:
         return ''
-    return (
-        '<h2>Keyframes</h2><p class="sub">green: floor; yellow: no evidence</p>'
-        f'<div class="strip">{"".join(figures)}</div>'
-    )
+    return f'<h2>{title}</h2><p class="sub">{legend}</p><div class="strip">{"".join(figures)}</div>'
 
 
 def _v_disparity(data: ReportData) -> str:

@@ -30,7 +30,7 @@ STRIP_LENGTH = 6
 
 @dataclass(frozen=True)
 class MaskedFrame:
-    """A keyframe's rectified pair with the floor mask (H, W) uint8 that was found in it."""
+    """A keyframe's rectified pair with a mask (H, W) uint8 of what was found in it."""
 
     frame: StereoFrame
     mask: NDArray[np.uint8]
@@ -38,9 +38,9 @@ class MaskedFrame:
 
 @dataclass(frozen=True)
 class ReportData:
-    """A run as its files tell it. trajectory, keyframes: base poses (N, 4, 4) in `map`. strip:
-    keyframes evenly over the drive. settings_text: settings.yaml as it is. truth: None where
-    nobody knows it.
+    """A run as its files tell it. trajectory, keyframes: base poses (N, 4, 4) in `map`. strip,
+    moving: keyframes with their floor, and with what moves, evenly over the drive. settings_text:
+    settings.yaml as it is. truth: None where nobody knows it.
     """
 
     folder: Path
@@ -55,6 +55,7 @@ class ReportData:
     keyframes: Array
     cloud: LabelledPoints
     strip: list[MaskedFrame]
+    moving: list[MaskedFrame]
     truth: MapTruth | None
     truth_folder: Path | None
 
@@ -87,6 +88,7 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
         keyframes=read_trajectory(folder / 'keyframes.txt')[1],
         cloud=read_ply(folder / 'labelled_cloud.ply'),
         strip=_masked_frames(folder / 'floor_masks', source.frames()),
+        moving=_masked_frames(folder / 'moving_masks', source.frames()),
         truth=load_truth(truth) if truth is not None else None,
         truth_folder=truth if truth is not None and truth.is_dir() else None,
     )

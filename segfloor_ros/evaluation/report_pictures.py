@@ -23,7 +23,8 @@ from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
-FLOOR_TINT, NO_EVIDENCE_TINT = (80, 190, 60), (60, 200, 240)
+FLOOR_TINT, NO_EVIDENCE_TINT, MOVING_TINT = (80, 190, 60), (60, 200, 240), (60, 60, 230)
+MOVING = 255
 STRIP_WIDTH_PX = 480
 FREE_GREY, OCCUPIED_GREY, UNKNOWN_GREY = 1.0, 0.1, 0.8
 MAX_DRAWN_POINTS = 60000
@@ -56,9 +57,16 @@ def cloud_picture(data: ReportData) -> bytes:
     return _png(figure)
 
 
-def strip_pictures(data: ReportData) -> list[tuple[str, bytes]]:
+def floor_pictures(data: ReportData) -> list[tuple[str, bytes]]:
     """Return keyframes with their floor tinted, each with a caption."""
-    return [(f'frame {item.frame.index}', _tinted(item)) for item in data.strip]
+    tints = {FLOOR: FLOOR_TINT, NO_EVIDENCE: NO_EVIDENCE_TINT}
+    return [(f'frame {item.frame.index}', _tinted(item, tints)) for item in data.strip]
+
+
+def moving_pictures(data: ReportData) -> list[tuple[str, bytes]]:
+    """Return keyframes with what moves tinted, each with a caption."""
+    tints = {MOVING: MOVING_TINT}
+    return [(f'frame {item.frame.index}', _tinted(item, tints)) for item in data.moving]
 
 
 def v_disparity_picture(data: ReportData) -> bytes | None:
@@ -135,9 +143,9 @@ def _show_v_disparity(
     axes.set_facecolor('black')
 
 
-def _tinted(item: MaskedFrame) -> bytes:
+def _tinted(item: MaskedFrame, tints: dict[int, tuple[int, int, int]]) -> bytes:
     picture = cv2.cvtColor(item.frame.left, cv2.COLOR_GRAY2BGR).astype(np.float32)
-    for value, tint in ((FLOOR, FLOOR_TINT), (NO_EVIDENCE, NO_EVIDENCE_TINT)):
+    for value, tint in tints.items():
         pixels = item.mask == value
         picture[pixels] = 0.62 * picture[pixels] + 0.38 * np.array(tint, np.float32)
     scale = STRIP_WIDTH_PX / picture.shape[1]
