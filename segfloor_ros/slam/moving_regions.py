@@ -40,6 +40,12 @@ KEPT_VIEWS = 30
 MIN_HEIGHT_M = 0.05
 """What is lower may be floor, whose disparities repeat and mirror."""
 
+SHIN_M, FOOT_M = 0.3, 0.2
+"""Below what moves at less than the first height is a foot, up to the second in each direction."""
+
+FOOT_STEPS_PX = (1.5, 2.5, 4.0, 6.5, 10.0, 16.0, 26.0, 64.0)
+"""Disparities between which feet are taken to be of one size."""
+
 NOISE_GREY = 1.0
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
@@ -168,9 +174,10 @@ class MovingRegions:
             return np.zeros(disparity.shape, np.uint8)
         points = self._small.rays[:, rows] * (self._small.disparity_m / disparity.ravel()[rows])
         through, solid, behind = self._compare(points, disparity.ravel()[rows], T_camera_world)
-        high = np.ones(len(rows), bool)
+        height_m = np.full(len(rows), np.inf)
         if mount is not None:
-            high = mount.heights_m(points.T) > MIN_HEIGHT_M
+            height_m = mount.heights_m(points.T)
+        high = height_m > MIN_HEIGHT_M
         seeds, doubtful = (np.zeros(disparity.size, np.uint8) for _ in range(2))
         seeds[rows] = (through >= solid) & (through > 1) & high
         background = disparity.copy()
@@ -180,9 +187,12 @@ class MovingRegions:
         if votes is not None:
             seeds[rows] |= votes.moving.ravel()[rows] & high
             doubtful &= 1 - votes.still.ravel()
-        return self._regions(
+        moving = self._regions(
             seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
         )
+        low = np.zeros(disparity.size, bool)
+        low[rows] = height_m < SHIN_M
+        return self._with_feet(moving, disparity, low.reshape(disparity.shape))
 
     def enlarged(self, region: NDArray[np.uint8]) -> Region | None:
         """Return a region of the shrunk image in that of the camera (H, W), None for none."""
@@ -274,3 +284,21 @@ class MovingRegions:
         moving = whole[labels] | ((seeds > 0) & (seeded[labels] >= MIN_AREA_PX))
         # As far as blocks reach beyond the edge of what moves.
         return cv2.dilate(np.where(moving, np.uint8(255), np.uint8(0)), block)
+
+    def _with_feet(
+        self, moving: NDArray[np.uint8], disparity: Disparity, low: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """Return what moves with the feet below it, which are as low as the floor. low: (h, w)
+        where something is no higher than a shin.
+        """
+        pixel_per_metre = self._small.focal[0] / self._small.disparity_m
+        shins, result = (moving > 0) & low, moving.copy()
+        for nearer, farther in zip(FOOT_STEPS_PX[1:], FOOT_STEPS_PX[:-1], strict=True):
+            here = shins & (disparity >= farther) & (disparity < nearer)
+            if here.any():
+                reach = round(FOOT_M * pixel_per_metre * farther)
+                kernel = np.ones((reach + 1, 2 * (reach // 2) + 1), np.uint8)
+                # The anchor at the lower end: only what lies below is reached.
+                below = cv2.dilate(here.astype(np.uint8), kernel, anchor=(reach // 2, reach))
+                result[below > 0] = 255
+        return result

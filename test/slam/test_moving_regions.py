@@ -76,3 +76,17 @@ def test_points_are_seen_through_where_the_image_shows_what_is_behind_them(regio
     depth_m = CAMERA.disparity_times_depth / FACTOR / np.array([WALL_PX, NEARER_PX, 2.0])
     points = np.stack([np.zeros(3), np.zeros(3), depth_m], axis=1)
     np.testing.assert_array_equal(regions.seen_through(wall, points), [False, True, False])
+
+
+def test_the_feet_below_shins_that_move_are_left_out_too(regions):
+    disparity = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), NEARER_PX, np.float32)
+    moving, low = np.zeros(disparity.shape, np.uint8), np.zeros(disparity.shape, bool)
+    moving[40:60, 70:80] = 255
+    np.testing.assert_array_equal(regions._with_feet(moving, disparity, low), moving)
+    low[50:] = True
+    found = regions._with_feet(moving, disparity, low)
+    foot_px = 0.2 * CAMERA.fx / CAMERA.disparity_times_depth * NEARER_PX
+    below = np.flatnonzero(found[:, 75])
+    assert below.min() == 40
+    assert 0.75 * foot_px < below.max() - 59 <= foot_px
+    assert not found[45, :69].any()
