@@ -11,7 +11,9 @@ Drives have a true path (poses.txt). `again` and `kidnap` also need base_poses.t
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
+import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -25,8 +27,11 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.geometry import invert, rotation_angle
+from segfloor_ros.geometry import Array, invert, rotation_angle
+from segfloor_ros.map_file import from_bytes, to_bytes
+from segfloor_ros.resident_memory import rss_mb
 from segfloor_ros.slam.results import FrameResult, KeyframePath
+from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
@@ -136,6 +141,116 @@ def loops(
             f'loops {slam.loop_count}; {dict(sorted(verdicts.items()))}',
             flush=True,
         )
+
+
+@app.command()
+def kidnap(
+    drive: Annotated[Path, typer.Argument(help='A recording that comes back to places.')],
+    first: Annotated[int, typer.Option(help='Frame before which nothing is cut out.')] = 200,
+    cases: Annotated[int, typer.Option(help='Cuts, evenly spaced.')] = 40,
+    cut_s: Annotated[float, typer.Option(help='What is cut out.')] = 10.0,
+) -> None:
+    """Cut a drive at many places, and see how long after the cut the camera is found."""
+    configuration = resolve()
+    source = open_recording(drive, configuration)
+    frames = list(source.frames())
+    times, truth = read_trajectory(drive / 'poses.txt')
+    last = int(np.searchsorted(times, times[-1] - cut_s - 3.0))
+    cuts = set(np.linspace(first, last, cases).astype(int).tolist())
+    slam = make_slam(source.camera, configuration.stereo_slam)
+    took_s: list[float] = []
+    false = 0
+    for number, frame in enumerate(frames):
+        slam.process(frame)
+        if number in cuts:
+            found_s, wrong_m = _recover(copy.deepcopy(slam), frames, times, truth, number, cut_s)
+            took_s.append(found_s)
+            false += wrong_m > FALSE_M
+    took = np.array(took_s)
+    print(
+        f'{drive.name}: {len(took)} cuts of {cut_s:g} s, back within 1 s: '
+        f'{(took <= 1.0).sum()}, median {np.median(took):.2f} s, 95th percentile '
+        f'{np.percentile(took, 95):.2f} s, at a wrong place: {false}'
+    )
+
+
+def _recover(
+    slam: StereoSlam,
+    frames: list[StereoFrame],
+    times: Array,
+    truth: Array,
+    cut: int,
+    cut_s: float,
+) -> tuple[float, float]:
+    """Return how long it took to be tracked after a cut (s), and how far off it was then (m)."""
+    assert slam.mount is not None
+    T_map_left = slam.mount.T_base_left
+    start = int(np.searchsorted(times, times[cut] + cut_s))
+    for k in range(start, len(frames)):
+        result = slam.process(frames[k])[-1]
+        if result.tracked:
+            T_world_left = invert(T_map_left) @ result.T_map_odom @ result.T_odom_base @ T_map_left
+            wrong_m = float(np.linalg.norm((invert(truth[k]) @ T_world_left)[:3, 3]))
+            return float(times[k] - times[start]), wrong_m
+    return math.inf, 0.0
+
+
+@app.command()
+def again(
+    first: Annotated[Path, typer.Argument(help='The drive that makes the map.')],
+    second: Annotated[Path, typer.Argument(help='A drive in the same scene.')],
+    map_on: Annotated[bool, typer.Option(help='Map on instead of localizing.')] = False,
+) -> None:
+    """Save the map of one drive, load it, and follow another drive in it."""
+    configuration = resolve()
+    source = open_recording(first, configuration)
+    made = Followed(make_slam(source.camera, configuration.stereo_slam))
+    made.process(source.frames())
+    data = to_bytes(save_slam(made.slam, source.camera))
+    slam = make_slam(source.camera, configuration.stereo_slam)
+    load_slam(slam, source.camera, from_bytes(data, 'map'), 'map', localize=not map_on)
+    followed, start_mb = Followed(slam), rss_mb()
+    followed.process(open_recording(second, configuration).frames())
+    keyframes = len(made.slam.map.keyframes)
+    print(
+        f'map of {first.name}: {keyframes} keyframes, {len(data) / keyframes / 1e3:.1f} kB each; '
+        f'frame {1e3 * np.median(made.frame_s):.1f} ms in the median, '
+        f'{1e3 * np.mean(made.frame_s):.1f} on average'
+    )
+    errors = _errors_in_map(followed.results, first, second)
+    tracked = np.isfinite(errors)
+    print(
+        f'{second.name}: tracked {tracked.sum()} of {len(errors)}, first at frame '
+        f'{int(np.argmax(tracked))}, error {np.nanmedian(errors):.4f} m in the median, '
+        f'{np.nanpercentile(errors, 95):.4f} m 95th percentile, {np.nanmax(errors):.3f} m at most; '
+        f'frame {1e3 * np.median(followed.frame_s):.1f} ms in the median, '
+        f'{1e3 * np.mean(followed.frame_s):.1f} on average; keyframes {len(slam.map.keyframes)}, '
+        f'loops {slam.loop_count}, memory {start_mb:.0f} to {rss_mb():.0f} MB'
+    )
+    again_data = to_bytes(save_slam(slam, source.camera))
+    print(f'saved again: {len(again_data) / 1e6:.2f} MB, before {len(data) / 1e6:.2f} MB')
+
+
+def _errors_in_map(results: list[FrameResult], first: Path, second: Path) -> Array:
+    """Return the distance (N,) of the base from where it truly is in the map, NaN where lost."""
+    start, truth = (_base_poses(drive) for drive in (first, second))
+    T_map_base = invert(start[0]) @ truth
+    errors = np.full(len(results), np.nan)
+    for k, result in enumerate(results):
+        if result.tracked:
+            found = result.T_map_odom @ result.T_odom_base
+            errors[k] = np.linalg.norm((invert(T_map_base[result.index]) @ found)[:2, 3])
+    return errors
+
+
+def _base_poses(drive: Path) -> Array:
+    """Return the true poses T_world_base (N, 4, 4)."""
+    x, y, yaw = np.loadtxt(drive / 'base_poses.txt')[:, 1:4].T
+    poses = np.tile(np.eye(4), (len(x), 1, 1))
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(yaw)
+    poses[:, 1, 0], poses[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    poses[:, 0, 3], poses[:, 1, 3] = x, y
+    return poses
 
 
 if __name__ == '__main__':

@@ -15,7 +15,7 @@ from segfloor_ros.measurements import Up
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.front_end import FrontEnd
-from segfloor_ros.slam.global_adjustment import apply_global, plan_global, solve_global
+from segfloor_ros.slam.global_adjustment import apply_global, copy_map, solve_global
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.known_map import KnownMap
@@ -178,11 +178,10 @@ class BackEnd:
         if not apply_closing(self._camera, self._map, closing, result):
             return
         self.loop_count += 1
-        adjustment = plan_global(
+        copied = copy_map(
             self._map, self.mapper.offset.estimate, self._up_world, self.mapper.ground
         )
-        if adjustment is not None:
-            self._global.submit(
-                partial(solve_global, self._camera, adjustment, self._global.is_wanted()),
-                partial(apply_global, self._map, adjustment),
-            )
+        self._global.submit(
+            partial(solve_global, self._camera, copied, self._global.is_wanted()),
+            partial(apply_global, self._map),
+        )

@@ -108,19 +108,15 @@ def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> Non
 
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
     """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
-    alive = np.flatnonzero(sparse_map.alive)
-    point, holder, _ = sparse_map.edges_of(alive)
+    point, holder, _ = sparse_map.edges()
     last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
-    np.maximum.at(last, point, holder)
+    last[point] = holder
     before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
     motion = invert(T_camera_world) @ before
-    of_point = motion[last[alive]]
-    xyz = sparse_map.xyz_world[alive]
-    sparse_map.xyz_world[alive] = (
-        np.einsum('nij,nj->ni', of_point[:, :3, :3], xyz) + of_point[:, :3, 3]
-    )
-    direction = sparse_map.viewing_direction[alive]
-    sparse_map.viewing_direction[alive] = np.einsum('nij,nj->ni', of_point[:, :3, :3], direction)
+    R, t = motion[last, :3, :3], motion[last, :3, 3]
+    for column in (sparse_map.xyz_world, sparse_map.viewing_direction):
+        column[:] = (R @ column[:, :, None])[:, :, 0]
+    sparse_map.xyz_world[:] += t
     for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
         keyframe.T_camera_world = pose
     sparse_map.follow()

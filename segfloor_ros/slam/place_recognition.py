@@ -19,7 +19,6 @@ from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.place_index import PlaceIndex
-from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import Track
 from segfloor_ros.slam.tracking import Tracker
@@ -49,10 +48,17 @@ class PlaceRecognition:
         self._map = sparse_map
         self._vocabulary = Vocabulary.load()
         self._index = PlaceIndex()
+        self._latest: tuple[Features, NDArray[np.int32]] | None = None
 
     def add(self, keyframe: KeyframeRecord) -> None:
         """Take in a keyframe."""
-        self._index.add(keyframe.index, self._vocabulary.words(keyframe.features.descriptor))
+        self._index.add(keyframe.index, self._words(keyframe.features))
+
+    def _words(self, features: Features) -> NDArray[np.int32]:
+        """Return the words (N,) of features; those of the latest view are asked for twice."""
+        if self._latest is None or self._latest[0] is not features:
+            self._latest = features, self._vocabulary.words(features.descriptor)
+        return self._latest[1]
 
     def reset(self) -> None:
         """Begin again with an empty map."""
@@ -75,7 +81,7 @@ class PlaceRecognition:
         not at all.
         """
         keyframes = self._map.keyframes
-        score = self._index.score(self._vocabulary.words(features.descriptor), len(keyframes))
+        score = self._index.score(self._words(features), len(keyframes))
         return score * np.array([k.retired is None for k in keyframes])
 
     def groups(self, score: Array, count: int) -> list[NDArray[np.intp]]:
@@ -83,7 +89,8 @@ class PlaceRecognition:
         as scored (K,); each keyframe is in one of them only.
         """
         best = np.argsort(-score, kind='stable')[:BEST_KEYFRAMES]
-        groups = [self._around(int(k), score) for k in best if score[k] > 0]
+        links = self._map.links()
+        groups = [self._around(int(k), score, links) for k in best if score[k] > 0]
         groups.sort(key=lambda group: -float(score[group].sum()))
         chosen: list[NDArray[np.intp]] = []
         for group in groups:
@@ -91,10 +98,14 @@ class PlaceRecognition:
                 chosen.append(group)
         return chosen[:count]
 
-    def _around(self, index: int, score: Array) -> NDArray[np.intp]:
-        keyframe = self._map.keyframes[index]
-        order, _ = self._map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
-        others = order[(order != index) & (score[order] > 0)][: GROUP_KEYFRAMES - 1]
+    def _around(
+        self, index: int, score: Array, links: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ) -> NDArray[np.intp]:
+        """Return a keyframe and those linked to it that look most like the view."""
+        i, j = links
+        others = np.union1d(j[i == index], i[j == index])
+        others = others[np.argsort(-score[others], kind='stable')]
+        others = others[score[others] > 0][: GROUP_KEYFRAMES - 1]
         return np.append(index, others).astype(np.intp)
 
     def locate(
