@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -94,6 +95,8 @@ class BodyMotion:
         self._wheels = WheelOdometry()
         self._calibrator = WheelCalibrator()
         self._window: tuple[int, Array] | None = None
+        self._window_rate_rad_s = math.nan
+        self._last_seen: tuple[int, Array] | None = None
         self._slipped_ns: int | None = None
 
     def add(self, measurement: Measurement) -> None:
@@ -160,8 +163,9 @@ class BodyMotion:
     def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
         """Learn from the pose of a frame that the images tell well."""
         self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
+        rate_before, rate_rad_s = self._window_rate_rad_s, self._turn_rate(stamp_ns, T_odom_camera)
         if self._window is None:
-            self._window = stamp_ns, T_odom_camera
+            self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
             return
         before_ns, T_odom_before = self._window
         T_before_now = invert(T_odom_before) @ T_odom_camera
@@ -172,10 +176,19 @@ class BodyMotion:
             and stamp_ns - before_ns < WINDOW_NS
         ):
             return
-        self._window = stamp_ns, T_odom_camera
+        self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
         self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
         self._remark(self.gyroscope.remarks())
-        self._learn_wheels(T_before_now, before_ns, stamp_ns)
+        turning_up = 0.0 if math.isnan(rate_before) else rate_rad_s - rate_before
+        self._learn_wheels(T_before_now, before_ns, stamp_ns, turning_up)
+
+    def _turn_rate(self, stamp_ns: int, T_odom_camera: Array) -> float:
+        """Return how fast the base turns as the last two frames see it, NaN after one."""
+        before, self._last_seen = self._last_seen, (stamp_ns, T_odom_camera)
+        if before is None or self.T_base_left is None:
+            return math.nan
+        turned = self.T_base_left[:3, :3] @ before[1][:3, :3].T @ T_odom_camera[:3, :3]
+        return yaw_of(turned @ self.T_base_left[:3, :3].T) * 1e9 / max(stamp_ns - before[0], 1)
 
     def reset_world(self) -> None:
         """Forget where up is: the world is another one."""
@@ -183,14 +196,16 @@ class BodyMotion:
 
     def stop_learning(self) -> None:
         """Note that there is a frame without a pose from the images."""
-        self._window = None
+        self._window = self._last_seen = None
 
-    def _learn_wheels(self, T_before_now: Array, before_ns: int, now_ns: int) -> None:
+    def _learn_wheels(
+        self, T_before_now: Array, before_ns: int, now_ns: int, turning_up_rad_s: float
+    ) -> None:
         told = self._wheels.stretch(before_ns, now_ns)
         if told is None or self.T_base_left is None:
             return
         seen = self.T_base_left @ T_before_now @ invert(self.T_base_left)
-        window = Window(seen[:2, 3], yaw_of(seen), told)
+        window = Window(seen[:2, 3], yaw_of(seen), turning_up_rad_s, told)
         if not self._calibrator.add(window):
             self.slips += 1
             in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS

@@ -101,11 +101,12 @@ class Stretch:
 @dataclass(frozen=True)
 class Window:
     """A stretch of the drive as the images see it: translation (2,) in metres in the base's plane
-    and turn in radians, and as the wheels tell it.
+    and turn in radians, by how much the rate of the turn grew meanwhile, and what the wheels tell.
     """
 
     seen_m: Array
     seen_rad: float
+    turning_up_rad_s: float
     told: Stretch
 
     @property
@@ -251,7 +252,8 @@ def _equations(window: Window) -> Array:
     rows[:2, :2] = [[x, -y], [y, x]]
     rows[:2, 2:4] = np.eye(2) - rotation_2d(window.seen_rad)
     rows[2, 4] = window.seen_rad
-    rows[:, 5] = -np.append(window.told.speeding_up_m_s, window.told.turning_up_rad_s)
+    # Of a lag only turns tell: the way that the images see is a little too long or too short.
+    rows[2, 5] = -window.turning_up_rad_s
     rows[:, 6] = np.append(window.told_m, window.told_rad)
     return rows / _sigmas(window)[:, None]
 

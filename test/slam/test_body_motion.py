@@ -86,7 +86,7 @@ def test_the_bias_is_learnt_from_the_images_and_one_wrong_turn_is_not():
 
 def window(way, turn, told_way, told_turn, speeding_up=(0.0, 0.0), turning_up=0.0):
     told = Stretch(base_pose(*told_way, told_turn), np.array(speeding_up), turning_up)
-    return Window(np.array(way), turn, told)
+    return Window(np.array(way), turn, 0.0, told)
 
 
 def driven(calibration, motions):
@@ -144,7 +144,9 @@ def test_stamps_of_wheels_that_are_late_are_found_out():
     for k in range(2, 145):
         seen = invert(base(0.2 * k)) @ base(0.2 * (k + 1))
         told = wheels.stretch(k * 200 * MS, (k + 1) * 200 * MS)
-        calibrator.add(Window(seen[:2, 3], np.arctan2(seen[1, 0], seen[0, 0]), told))
+        turning_up = 0.5 * 1.3 * (np.cos(1.3 * 0.2 * (k + 1)) - np.cos(1.3 * 0.2 * k))
+        turn = np.arctan2(seen[1, 0], seen[0, 0])
+        calibrator.add(Window(seen[:2, 3], turn, turning_up, told))
     assert calibrator.current.lag_s == pytest.approx(lag_s, abs=4e-3)
     assert list(calibrator.current.remarks()) == ['lag']
 
