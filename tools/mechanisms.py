@@ -69,6 +69,11 @@ SLAM: dict[str, Mechanism] = {
     'known views': Mechanism({'slam.places.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.retire_redundant': _none}),
     'loops': Mechanism({'slam.back_end.BackEnd._close_loop': lambda *_: False}),
+    'two motions told apart': Mechanism(
+        {'slam.consensus._differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
+    ),
+    'scene flow': Mechanism({'slam.scene_flow.SceneFlow._earlier': lambda *_: []}),
+    'points seen through': Mechanism({'slam.sparse_map.GONE_AFTER': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""
