@@ -95,7 +95,6 @@ FLOOR: dict[str, Mechanism] = {
     'floor up to contacts': Mechanism(
         {'floor.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
     ),
-    'no contacts far away': Mechanism({'floor.contact._LEAST_PX': 0.0}),
     'boards count twice': Mechanism({'floor.segmentation._BOARD': 1}),
     'filling of regions': Mechanism(
         {'floor.segmentation.fill_regions': lambda view, mask, *_: mask}

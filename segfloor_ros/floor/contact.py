@@ -23,8 +23,6 @@ _GAP_ROWS = 2
 _MIN_SHARE = 0.25
 _MAX_SPREAD_PX = 1.2
 _TOLERANCE_PX = 1.0
-_LEAST_PX = 5.0
-"""Where the floor has a smaller disparity any surface would be a contact, within the tolerance."""
 _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
 
@@ -53,7 +51,6 @@ def fill_to_contact(
     last = small.shape[0] - 1
     below = np.minimum.accumulate(np.where(open_, last, rows)[::-1], axis=0)[::-1]
     starts = np.take_along_axis(small, below, axis=0) == FLOOR
-    contact &= floor_px > _LEAST_PX
     starts |= open_[last] & (below == last)
     return open_ & starts & np.take_along_axis(contact, above, axis=0)
 
