@@ -104,6 +104,7 @@ class LockstepRun:
         self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
+        self.note = ''
         self._map_options = map_options
         loaded = map_options.read(source.camera)
         if loaded is not None:
@@ -130,8 +131,7 @@ class LockstepRun:
         mount, labelled, poses = self._pipeline.mount, stages.labelled, self._tracked_poses()
         if grid is None or mount is None or labelled is None or not poses:
             raise MapError(self._why_no_map())
-        if self._map_options.save is not None:
-            write_map_file(self._map_options.save, self._pipeline.save())
+        self._save_map()
         path = self._path
         return RunResult(
             grid,
@@ -142,6 +142,20 @@ class LockstepRun:
             self._summary(wall_s),
             self._configuration,
         )
+
+    def _save_map(self) -> None:
+        """Save the map; one that the drive has not recognised is not overwritten with its own."""
+        save, load = self._map_options.save, self._map_options.load
+        if save is None:
+            return
+        apart = not self._pipeline.slam.is_in_loaded_map
+        if apart and load is not None and save.resolve() == load.resolve():
+            self.note = (
+                f'{save}: stays as it was, since no place of it was recognised; give --save-map '
+                'another name to keep the map of this drive'
+            )
+            return
+        write_map_file(save, self._pipeline.save())
 
     def _tracked_poses(self) -> list[TrackedPose]:
         return [

@@ -22,7 +22,13 @@ from segfloor_ros.cli.options import (
     SetOption,
     recording_settings,
 )
-from segfloor_ros.cli.output import finish_run, print_sensors, print_summary, progress_bar
+from segfloor_ros.cli.output import (
+    finish_run,
+    print_error,
+    print_sensors,
+    print_summary,
+    progress_bar,
+)
 from segfloor_ros.configuration import resolve
 from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
 from segfloor_ros.results_folder import OutputFolder
@@ -60,9 +66,12 @@ def run(
     print_sensors(source.sensors)
     with OutputFolder(out) as folder:
         with progress_bar('mapping', source.frame_count) as progress:
-            result = LockstepRun(
-                source, configuration, folder, save_masks, save_debug, maps
-            ).execute(lambda done, state: progress.update(TaskID(0), completed=done, note=state))
+            drive = LockstepRun(source, configuration, folder, save_masks, save_debug, maps)
+            result = drive.execute(
+                lambda done, state: progress.update(TaskID(0), completed=done, note=state)
+            )
         folder.write(result)
     print_summary(input, result.summary)
     finish_run(input, out, report)
+    if drive.note:
+        print_error(drive.note)

@@ -92,6 +92,13 @@ class StereoSlam:
         return self._front_end.motion.T_world_odom
 
     @property
+    def is_in_loaded_map(self) -> bool:
+        """Whether the drive goes on in the map that was loaded, not in one of its own; also where
+        none was loaded.
+        """
+        return self._back_end.is_joined
+
+    @property
     def is_adjusting(self) -> bool:
         """Whether the map is being adjusted beside tracking."""
         return not self._back_end.idle

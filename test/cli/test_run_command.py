@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.cli.main import main
 from segfloor_ros.grid.map_file import load_map
@@ -312,6 +312,15 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     summary = json.loads((second / 'summary.json').read_text())
     assert summary['map_updates'] == 0
     assert summary['relocalisations'] == []
+    elsewhere = StereoRoom(seed=77)
+    frames = [elsewhere.frame(i, planar_pose(0.06 * i, 0.0, 0.01 * i)) for i in range(FRAMES)]
+    other, third, kept = tmp_path / 'other', tmp_path / 'third', saved.read_bytes()
+    write_kitti(other, frames)
+    done = segfloor('run', other, '--out', third, '--load-map', saved, '--save-map', saved)
+    assert done.returncode == 0, done.stderr
+    assert 'no place of it was recognised' in ' '.join(done.stderr.split())
+    assert saved.read_bytes() == kept
+    assert (load_map(third / 'map.yaml').cells == FREE).any()
 
 
 @pytest.mark.parametrize(
