@@ -30,6 +30,12 @@ MIN_AGREEMENT = 0.5
 MIN_PROVEN = 12
 """Fewest points with a record that may speak against the majority."""
 
+USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
+"""Where at least this share of what has a record fits, at no more than this noise, all is well."""
+
+LEAST_VARIANCE = 1e-12
+"""Of a pose, m² and rad²: a direction that is not observed must not look exact."""
+
 CONTRADICTED_SHARE = 0.5
 """The majority's motion is contradicted where it fits less than this share of what has a record."""
 
@@ -135,8 +141,13 @@ class _Problem:
         return replace(found, counted=found.counted | witnesses)
 
     def near(self, T_camera_world: Array, noise_factor: float) -> Agreement:
-        """Return a pose refined by what fits it; nothing else counts."""
+        """Return a pose refined by what fits it; nothing else counts. With too few points none
+        agrees.
+        """
         near = self.fitting(T_camera_world, noise_factor)
+        if near.sum() < MIN_PROVEN:
+            nobody = np.zeros(len(self.points), bool)
+            return Agreement(replace(self.of_most, inliers=nobody), near)
         estimate = refine_pose(
             self.camera,
             T_camera_world,
@@ -155,11 +166,13 @@ class _Problem:
 
 
 def _fits(estimate: PoseEstimate, proven: NDArray[np.bool_]) -> bool:
-    """Whether nothing hints at a second motion."""
-    return estimate.noise_factor < 1.2 and bool(estimate.inliers[proven].mean() > 0.8)
+    """Whether nothing hints at a second motion; to look for one costs as much as the pose."""
+    fitting = bool(estimate.inliers[proven].mean() > USUAL_SHARE)
+    return fitting and estimate.noise_factor < USUAL_NOISE
 
 
 def _differ(a: PoseEstimate, b: PoseEstimate) -> bool:
     """Whether two poses differ by more than their joint uncertainty."""
     error = se3_log(a.T_camera_world @ invert(b.T_camera_world))
-    return bool(error @ np.linalg.solve(a.covariance + b.covariance, error) > DIFFERENT_CHI2)
+    covariance = a.covariance + b.covariance + LEAST_VARIANCE * np.eye(6)
+    return bool(error @ np.linalg.solve(covariance, error) > DIFFERENT_CHI2)

@@ -88,3 +88,12 @@ def test_corners_of_what_moves_do_not_overrule_the_patches_of_the_same_image():
     found = consensus.refine(np.eye(4), sparse_map, ids, seen, known=patches)
     assert error_m(found.estimate.T_camera_world) < 0.01
     assert not found.estimate.inliers[STILL:].any()
+
+
+def test_where_next_to_nothing_fits_the_patches_no_corner_agrees():
+    sparse_map, seen = scene(observers_of_still=1)
+    ids = np.arange(STILL, STILL + MOVING, dtype=np.int32)
+    still = np.arange(STILL)
+    patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[still], seen.take(still))
+    found = Consensus(CAMERA).refine(np.eye(4), sparse_map, ids, seen.take(ids), known=patches)
+    assert found.agreeing == 0
