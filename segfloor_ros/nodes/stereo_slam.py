@@ -81,7 +81,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._is_resumed = False
         self._frames = CameraFrames('', '')
         self._mount: Mount | None = None
-        self._provisional_ns = 0
+        self._provisional_ns = -1
         self._frame_count = 0
         self._unannounced: tuple[MapFile, LoadedMap] | None = None
         if saved is not None:
