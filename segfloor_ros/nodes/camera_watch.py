@@ -77,6 +77,7 @@ class CameraWatch:
                 Level.ERROR,
             )
         self._find_silence()
+        self._find_mono()
         self._find_different_stamps()
 
     def check_rows(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> None:
@@ -127,6 +128,19 @@ class CameraWatch:
                     'running?',
                     Level.ERROR,
                 )
+
+    def _find_mono(self) -> None:
+        """Decline one camera alone."""
+        left, right = self._stamps
+        if len(self._stamps[left]) < RECENT or self._stamps[right]:
+            return
+        if not self._node.get_publishers_info_by_topic(right):
+            self._node.reporter.diagnose(
+                'one camera',
+                f'images come on {left}, but nobody publishes {right}: one camera alone does not '
+                'tell how far away anything is; publish or remap right or depth images',
+                Level.ERROR,
+            )
 
     def _find_different_stamps(self) -> None:
         left, right = self._stamps.values()

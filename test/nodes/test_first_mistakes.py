@@ -129,6 +129,20 @@ def test_a_topic_that_nobody_publishes_is_on_the_console_with_its_lookalike(
     assert not graph.comes(lambda: len(line()) > 1, 6.0), 'once is enough for a while'
 
 
+def test_one_camera_alone_is_declined_in_one_line_that_says_why(make_graph, console) -> None:
+    frames, _ = room_drive(12)
+    graph = make_graph(*GIVEN)
+    graph.add(StereoSlamNode())
+    with another_participant() as driver:
+        left = driver.create_publisher(Image, '/left/image_raw', qos.IMAGES)
+        graph.until(lambda: left.get_subscription_count() == 1, 'the left images are received')
+        for frame in frames:
+            left.publish(image_message(frame.stamp_ns, 'left', frame.left))
+        graph.until(lambda: any('one camera alone' in line for _, line in console), 'the line')
+    (line,) = {line for _, line in console if 'one camera alone' in line}
+    assert 'left/image_raw' in line and 'right/image_raw' in line and '\n' not in line
+
+
 def test_a_topic_of_another_type_is_named_as_that(make_graph, console) -> None:
     graph = make_graph('-p', 'image_transport:=raw')
     profile = TOPICS['left/image_raw'].profile
