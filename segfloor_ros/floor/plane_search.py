@@ -82,11 +82,11 @@ class PlaneSearch:
 
     def _prior(self, count: int) -> tuple[Array, Array]:
         """Return what pitch, roll and height (3,) are expected, and their standard deviations."""
+        # Frames that show the same err together: the prior counts once per frame, too.
         if self._up is None:
-            # Frames that show the same err together: the prior counts once per frame, too.
             return np.zeros(3), _LEVEL_SIGMA / math.sqrt(count)
         pitch, roll, _ = angles_height_of(self._up.direction)
-        sigma = math.hypot(self._up.sigma_rad, _FLOOR_SLOPE)
+        sigma = math.hypot(self._up.sigma_rad, _FLOOR_SLOPE) / math.sqrt(count)
         return np.array([pitch, roll, 0.0]), np.array([sigma, sigma, np.inf])
 
 
