@@ -114,6 +114,11 @@ ARGUMENTS = {
         'A recording slows down rather than lose a frame where the nodes cannot follow: true, '
         'false, or auto, which is true unless input is a device.',
     ),
+    'load_map': ('', 'Saved map to go on with; empty: begin with an empty one.'),
+    'localize': (
+        'false',
+        'Only find the robot in the map of load_map, and add nothing to it: true or false.',
+    ),
     'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
     'autostart': (
         'true',
@@ -208,12 +213,27 @@ def make_nodes(context: LaunchContext) -> list[Node]:
         is_recording = not source.removeprefix('/dev/video').isdigit()
         slows_down = is_recording if lossless.lower() == 'auto' else truth('lossless', lossless)
         given = (*given, '-p', f'lossless:={str(slows_down).lower()}')
+    maps = of_maps(context)
     if composed:
-        nodes = [node('segfloor_pipeline', *given)]
+        nodes = [node('segfloor_pipeline', *given, *maps)]
     else:
         nodes = [node('stereo_camera', *given, name='stereo_camera')] if with_camera else []
-        nodes += [node(stage, name=stage) for stage in STAGES]
+        nodes += [
+            node(stage, *(maps if stage == 'stereo_slam' else ()), name=stage) for stage in STAGES
+        ]
     return [*nodes, rviz(sim_time, tf)] if with_rviz else nodes
+
+
+def of_maps(context: LaunchContext) -> tuple[str, ...]:
+    """Return the arguments on a saved map; none where none is named: the parameter file holds."""
+    file = LaunchConfiguration('load_map').perform(context)
+    localize = truth('localize', LaunchConfiguration('localize').perform(context))
+    if not file:
+        if localize:
+            raise ValueError('localize:=true needs the map to localize in: load_map:=FILE')
+        return ()
+    localizes = f'localize:={str(localize).lower()}'
+    return ('-p', as_text('load_map', file, True), '-p', localizes)
 
 
 def has_camera_node(camera: str, source: str) -> bool:

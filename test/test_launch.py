@@ -27,6 +27,7 @@ ARGUMENTS = {
     'namespace', 'params_file', 'use_sim_time', 'input', 'camera', 'composed', 'autostart',
     'respawn', 'namespaced_tf', 'log_level', 'lossless', 'rviz', 'rviz_config', 'left_image',
     'right_image', 'left_camera_info', 'right_camera_info', 'depth', 'odometry', 'imu',
+    'load_map', 'localize',
 }  # fmt: skip
 
 
@@ -55,6 +56,18 @@ def test_every_argument_is_described_and_used(path) -> None:
     assert {call.args[0].value for call in named_calls(ast.parse(source))} <= names
     assert {'namespace', 'params_file'} <= names
     assert path != SEGFLOOR or names == ARGUMENTS
+
+
+def test_a_saved_map_goes_to_slam_alone(launched) -> None:
+    found = launched(load_map="home's.map", localize='true')
+    with_map = {name for name, process in found.items() if 'home' in str(process.arguments)}
+    assert with_map == {'stereo_slam'}
+    words = found['stereo_slam'].arguments
+    assert "load_map:='home''s.map'" in words
+    assert 'localize:=true' in words
+    assert not any('load_map' in str(process.arguments) for process in launched().values())
+    with pytest.raises(ValueError, match='load_map:=FILE'):
+        launched(localize='true')
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
