@@ -37,7 +37,6 @@ def test_with_little_floor_in_view_up_tells_pitch_and_roll() -> None:
     error, error_alone = np.abs(level - TRUE), np.abs(alone - TRUE)
     assert (error[:2] < 0.8 * error_alone[:2]).all()
     assert np.degrees(error[:2]).max() < 1.0
-    assert error[2] < error_alone[2]
 
 
 def test_a_floor_that_is_plain_to_see_counts_more_than_what_was_felt() -> None:
