@@ -20,6 +20,8 @@ from segfloor_ros.grid.settings import OccupancyGridSettings
 
 _NOTHING, _UNREACHED, _REACHED, _STANDING = range(4)
 """What a cell is while the map is drawn."""
+_HOLE_M2 = 0.01
+"""Table legs are smaller than this, what one can fail to see from all sides is not."""
 
 
 def render(
@@ -30,6 +32,7 @@ def render(
     kinds = cv2.LUT(cells, _kinds())
     at = np.floor(path_xy_m / settings.resolution_m).astype(np.intp)
     _reach(kinds, at[:, 1] - first[0], at[:, 0] - first[1])
+    _fill_holes(kinds, settings.resolution_m)
     if settings.opening_cells > 1:
         kinds[_narrow(kinds, settings.opening_cells)] = _NOTHING
     values = np.full(256, UNKNOWN, np.int8)
@@ -98,6 +101,22 @@ def _reach(kinds: NDArray[np.uint8], rows: NDArray[np.intp], columns: NDArray[np
             return
         seed = (int(columns[waiting[0]]), int(rows[waiting[0]]))
         cv2.floodFill(kinds, None, seed, _REACHED, flags=4)
+
+
+def _fill_holes(kinds: NDArray[np.uint8], resolution_m: float) -> None:
+    """Free what little is undecided in the middle of free cells. What stands there would be
+    occupied: looks from all sides agree on it.
+    """
+    blocked = (kinds != _REACHED).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(blocked, connectivity=8)
+    first, size = stats[:, :2], stats[:, 2:4]
+    inside = (first > 0).all(axis=1) & (first + size < blocked.shape[::-1]).all(axis=1)
+    small = inside & (stats[:, cv2.CC_STAT_AREA] <= max(1, round(_HOLE_M2 / resolution_m**2)))
+    at = np.flatnonzero(small[label] & (blocked > 0))
+    holes = label.reshape(-1)[at]
+    stands = np.zeros(count, np.bool_)
+    stands[holes[kinds.reshape(-1)[at] == _STANDING]] = True
+    kinds.reshape(-1)[at[~stands[holes]]] = _REACHED
 
 
 def _narrow(kinds: NDArray[np.uint8], size: int) -> NDArray[np.bool_]:
