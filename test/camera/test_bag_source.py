@@ -355,7 +355,7 @@ def test_without_the_library_the_message_says_what_to_install(
         return real_import(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, '__import__', no_rosbags)
-    with pytest.raises(InputError, match=r'pip install rosbags.*bag\.launch\.py'):
+    with pytest.raises(InputError, match=r'rosbag2_py of a ROS.*pip install rosbags'):
         opened(path)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -58,11 +59,15 @@ def test_it_makes_the_map_of_the_run_and_serves_listeners_outside(pipeline, driv
     np.testing.assert_array_equal(load_map(folder / 'map.yaml').cells, lockstep_map(drive).cells)
 
 
+def publishes(graph, node: str, topic: str) -> bool:
+    publishers = graph.tester.get_publishers_info_by_topic(topic)
+    return node in {publisher.node_name for publisher in publishers}
+
+
 def test_it_has_the_topics_of_the_five_nodes_and_ends_on_interrupt(pipeline) -> None:
     graph, process, _ = pipeline
     for node in NODES:
         for topic in published_by(node):
-            publishers = graph.tester.get_publishers_info_by_topic(topic.name)
-            assert node in {publisher.node_name for publisher in publishers}, topic.name
+            graph.until(partial(publishes, graph, node, topic.name), f'{topic.name} of {node}')
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=20) == 0

@@ -106,6 +106,8 @@ def test_the_chain_of_frames_leads_to_the_camera(start, drive) -> None:
     keyframes, odometry = graph.collect('keyframe/odometry'), graph.collect('odometry')
     graph.until(lambda: graph.tester.count_subscribers('/tf') >= 2, 'the listeners')
     graph.until(lambda: graph.tester.count_publishers('/tf') >= 1, 'the broadcaster')
+    # Both are known then, and connected a moment later.
+    graph.comes(lambda: False, 0.5)
     chain.drive(frames)
     stamps = [frame.stamp_ns for frame in frames]
     graph.until(lambda: tf.stamps('base_link') == stamps, 'all transforms')
