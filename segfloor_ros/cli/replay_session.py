@@ -147,8 +147,7 @@ class ReplaySession:
         self._check_result(graph.recorder)
         graph.wait_for_map()
         graph.call(Trigger, 'save_map', Trigger.Request())
-        if self._maps.save is not None:
-            graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), SAVE_S)
+        kept_map = self._save_map(graph)
         result = self._result(graph.recorder, folder / 'map.yaml', wall_s)
         stop_s = time.perf_counter()
         graph.processes.stop()
@@ -156,9 +155,21 @@ class ReplaySession:
             discovery_s,
             time.perf_counter() - stop_s,
             len(graph.recorder.failed),
-            graph.processes.notices(),
+            [*graph.processes.notices(), *kept_map],
         )
         return result, report
+
+    def _save_map(self, graph: ReplayGraph) -> list[str]:
+        """Save the map; returns why it was not, where the one that was loaded stays as it is."""
+        if self._maps.save is None:
+            return []
+        try:
+            graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), SAVE_S)
+        except ReplayError as error:
+            if self._maps.load is None or self._maps.save.resolve() != self._maps.load.resolve():
+                raise
+            return [str(error)]
+        return []
 
     def _check_result(self, recorder: ReplayRecorder) -> None:
         name, sent = self._configuration.stereo_camera.input, len(recorder.frame_index)

@@ -131,6 +131,7 @@ class SlamMaps:
         if self._arrived is not None:
             raise MapError('a map is being saved already')
         path = Path(name).expanduser().absolute()
+        self._refuse_to_overwrite(path)
         saved = self._slam_part()
         start_ns = saved.header.pop('start_ns')
         self._parts = {}
@@ -148,6 +149,16 @@ class SlamMaps:
         finally:
             self._stop(give_up)
         return path
+
+    def _refuse_to_overwrite(self, path: Path) -> None:
+        """Raise MapError where a map would be replaced that the drive has not recognised."""
+        known, load_map = self._known(), self._own.load_map
+        is_apart = known is not None and not known[0].is_in_loaded_map
+        if is_apart and load_map and Path(load_map).expanduser().resolve() == path.resolve():
+            raise MapError(
+                f'{path}: stays as it was, since no place of it was recognised; set save_map to '
+                'another name to keep the map of this drive'
+            )
 
     def _stop(self, timer: Timer) -> None:
         self._node.destroy_timer(timer)

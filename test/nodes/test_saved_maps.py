@@ -12,7 +12,7 @@ from rcl_interfaces.srv import SetParameters
 from ros_graph import Graph, fresh_graph
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive
-from stereo_room import CAMERA, MOUNT
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
@@ -233,6 +233,18 @@ def test_load_map_takes_all_nodes_to_another_map(saved, drive, make_graph, tmp_p
         lambda: np.array_equal(grid_arrays(chain.heard['map'][-1], 'x').cells, saved[1].cells),
         'the map of the file',
     )
+
+
+def test_a_map_that_was_not_recognised_is_not_overwritten(saved, loaded) -> None:
+    before = saved[0].read_bytes()
+    chain = loaded()
+    room = StereoRoom(seed=77)
+    other = [room.frame(k, planar_pose(0.06 * k, 0.0, 0.01 * k)) for k in range(16)]
+    answers = chain.drive(other)
+    chain.mapped(last_keyframe(answers))
+    answer = chain.save(saved[0])
+    assert (answer.success, 'stays as it was' in answer.message) == (False, True)
+    assert saved[0].read_bytes() == before
 
 
 def test_a_node_does_not_start_with_a_file_that_is_no_map(make_graph, tmp_path) -> None:
