@@ -227,7 +227,7 @@ GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, fl
 """Generator, size in pixels and side in metres of each texture."""
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=32)
 def make_texture(name: str, seed: int) -> Texture:
     """Return a texture by name; the same seed gives the same pixels.
 
