@@ -222,6 +222,7 @@ def run(*arguments, fails=False):
     return result.output
 
 
+@pytest.mark.slow
 def test_benchmark_prints_tables_and_writes_json(tmp_path):
     file = tmp_path / 'new' / 'figures.json'
     output = run('--sizes', '5,20', '--frames', '8', '--seed', '2', '--json', file)

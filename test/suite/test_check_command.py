@@ -54,6 +54,7 @@ def good_alone(text: str = SUITE) -> str:
     return text.partition('  - input: {empty}')[0]
 
 
+@pytest.mark.slow
 def test_a_suite_is_checked_kept_and_resumed(room, tmp_path):
     out, cache = tmp_path / 'out', tmp_path / 'cache'
     done = check(suite_of(tmp_path, room), '--out', out, '--cache', cache)
