@@ -24,7 +24,7 @@ from segfloor_ros.slam.motion_links import factors_of
 from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.sparse_map import SparseMap
 
-POINTS_PER_KEYFRAME = 80
+POINTS_PER_KEYFRAME = 300
 """Points of a keyframe that most others see: they hold the map together, the rest moves along."""
 
 MIN_POINTS = 15
