@@ -108,15 +108,16 @@ def _fill_holes(kinds: NDArray[np.uint8], resolution_m: float) -> None:
     occupied: looks from all sides agree on it.
     """
     blocked = (kinds != _REACHED).astype(np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(blocked, connectivity=8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats(blocked, connectivity=8)
     first, size = stats[:, :2], stats[:, 2:4]
     inside = (first > 0).all(axis=1) & (first + size < blocked.shape[::-1]).all(axis=1)
-    small = inside & (stats[:, cv2.CC_STAT_AREA] <= max(1, round(_HOLE_M2 / resolution_m**2)))
-    at = np.flatnonzero(small[label] & (blocked > 0))
-    holes = label.reshape(-1)[at]
-    stands = np.zeros(count, np.bool_)
-    stands[holes[kinds.reshape(-1)[at] == _STANDING]] = True
-    kinds.reshape(-1)[at[~stands[holes]]] = _REACHED
+    small = stats[:, cv2.CC_STAT_AREA] <= max(1, round(_HOLE_M2 / resolution_m**2))
+    for hole in np.flatnonzero(inside & small):
+        column, row, width, height = stats[hole, :4]
+        part = np.s_[row : row + height, column : column + width]
+        there, cells = label[part] == hole, kinds[part]
+        if not (cells[there] == _STANDING).any():
+            cells[there] = _REACHED
 
 
 def _narrow(kinds: NDArray[np.uint8], size: int) -> NDArray[np.bool_]:
