@@ -101,6 +101,18 @@ class Consensus:
             found = problem.choose(of_proven.T_camera_world, of_proven.noise_factor, proven)
         return problem.of_everyone() if found is None else found
 
+    def at(
+        self,
+        known: PoseEstimate,
+        sparse_map: SparseMap,
+        ids: NDArray[np.int32],
+        observations: Observations,
+    ) -> Agreement:
+        """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
+        problem = _Problem(self._camera, sparse_map.xyz_world[ids], observations, known)
+        fitting = problem.fitting(known.T_camera_world, KNOWN_NOISE * known.noise_factor)
+        return Agreement(replace(known, inliers=fitting), fitting)
+
     def _proven(
         self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
     ) -> NDArray[np.bool_]:

@@ -109,7 +109,7 @@ class Tracker:
         seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
-        if len(rows) < MIN_TRACKED:
+        if len(rows) < (MIN_TRACKED if known is None else 1):
             return None
         ids = seen.ids[points]
         align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
@@ -118,7 +118,9 @@ class Tracker:
         measured = observations.take(rows).without_offset(offset_px)
         found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
         if not self._agree(found):
-            return None
+            if known is None:
+                return None
+            found = self._consensus.at(known, sparse_map, ids, measured)
         estimate = found.estimate
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)

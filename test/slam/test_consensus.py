@@ -97,3 +97,13 @@ def test_where_next_to_nothing_fits_the_patches_no_corner_agrees():
     patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[still], seen.take(still))
     found = Consensus(CAMERA).refine(np.eye(4), sparse_map, ids, seen.take(ids), known=patches)
     assert found.agreeing == 0
+
+
+def test_a_known_pose_stands_however_few_corners_fit_it():
+    sparse_map, seen = scene(observers_of_still=1)
+    still, few = np.arange(STILL), np.arange(STILL - 10, STILL + 40, dtype=np.int32)
+    patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[still], seen.take(still))
+    found = Consensus(CAMERA).at(patches, sparse_map, few, seen.take(few))
+    np.testing.assert_array_equal(found.estimate.T_camera_world, patches.T_camera_world)
+    assert 7 <= found.agreeing <= 10
+    assert not found.estimate.inliers[10:].any()
