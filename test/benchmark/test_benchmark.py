@@ -118,6 +118,7 @@ def test_the_floor_in_the_images_has_the_disparity_of_the_floor():
     assert np.abs(frame.right.astype(float) - frame.left)[floor].mean() > 10.0
 
 
+@pytest.mark.slow
 def test_the_chain_makes_the_map_of_the_pipeline():
     chain = MeasuredStages(CAMERA, CONFIGURATION, MOUNT)
     settings = {'camera_height_m': 0.3, 'camera_pitch_rad': 0.12, 'camera_roll_rad': 0.0}
@@ -198,6 +199,7 @@ def half(number, on_progress):
     return number / 2, os.getpid()
 
 
+@pytest.mark.slow
 def test_work_apart():
     done = []
     value, process = run_apart(half, 3, on_progress=done.append)

@@ -88,6 +88,7 @@ def test_scenes_are_driven_once_for_each_seed(tmp_path) -> None:
     assert (recordings[0] / 'poses.txt').stat().st_mtime_ns == rendered
 
 
+@pytest.mark.slow
 def test_a_soak_goes_to_and_fro_and_its_map_does_not_grow(drive, tmp_path) -> None:
     source = open_source(StereoCameraSettings(input=str(drive)))
     path = write_endless_drive(source, tmp_path / 'drive', duration_s=48.0, rate_hz=2.0)
