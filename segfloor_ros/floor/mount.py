@@ -47,6 +47,10 @@ _CONTRADICTED = 0.3
 """A plane below which such a share of the feet stands is no floor."""
 _SIGMAS, _FEET_SIGMAS = (0.015, math.radians(0.2)), (0.025, math.radians(0.4))
 """How well height, as a share of it, and tilt must be known, one sigma."""
+_PATIENCE, _FAIR_SIGMA = 20, 0.03
+"""After so many keyframes the best plane so far will do, if its height is known to such a share:
+a map that is off by some per cent is better than none.
+"""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
 _SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
@@ -101,6 +105,7 @@ class MountEstimator:
         self._on_surfaces, self._on_feet = PlaneSearch(known), PlaneSearch(known)
         self._fits: list[PlaneFit] = []
         self._feet_fits: list[PlaneFit] = []
+        self._fair: list[PlaneFit] = []
         self._settled: PlaneFit | None = None
 
     @property
@@ -156,7 +161,7 @@ class MountEstimator:
         if self._is_plain(fit):
             self._settled = fit
         else:
-            self._settled = self._at_rest(fit) or self._stood_on(fit)
+            self._settled = self._at_rest(fit) or self._stood_on(fit) or self._best_so_far()
 
     @property
     def _frames(self) -> list[Samples]:
@@ -221,12 +226,21 @@ class MountEstimator:
         """Return the plane of a floor of weak texture, once it has come to rest."""
         if fit.support < _WEAK_SUPPORT or fit.violations > _MAX_VIOLATIONS:
             return None
-        if not _is_certain(fit, _SIGMAS[0], math.inf) or not self._is_possible(fit):
+        if not _is_certain(fit, _FAIR_SIGMA, math.inf) or not self._is_possible(fit):
             return None
         if self._feet and shares(self._feet, fit.angles_height)[1] > _CONTRADICTED:
             return None
-        rests = _rests(self._fits, _REST, 0.03, math.radians(1.0), math.radians(4.0))
-        return fit if rests else None
+        if not _rests(self._fits, _REST, 0.03, math.radians(1.0), math.radians(4.0)):
+            return None
+        self._fair.append(fit)
+        return fit if _is_certain(fit, _SIGMAS[0], math.inf) else None
+
+    def _best_so_far(self) -> PlaneFit | None:
+        """Return the plane that is known best of those that came to rest, after a while."""
+        if len(self._fits) < _PATIENCE or not self._fair:
+            return None
+        best = min(self._fair, key=lambda fit: fit.sigma[2] / fit.angles_height[2])
+        return best if self._is_possible(best) else None
 
     def _is_possible(self, fit: PlaneFit) -> bool:
         """Tell whether a robot drove on the plane: on its way the camera keeps its place above it.

@@ -111,6 +111,17 @@ def test_poses_come_before_the_mount_is_known():
     assert positions[-1] == pytest.approx([0.1 * (settled - 1), 0.0, 0.0], abs=0.02)
 
 
+def test_after_a_while_the_best_plane_will_do():
+    """A rug is all that has texture: its height is known to two per cent, never better."""
+    rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=20.0, seed=5)
+    floor, blank = floor_patch(grey=175.0, contrast=0.0), wall(4.0, contrast=0.0)
+    scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=2.0)
+    assert estimate_on_the_way(scene, 15, step_m=0.01).mount is None
+    mount = estimate_on_the_way(scene, 24, step_m=0.01).mount
+    assert mount is not None
+    assert mount.height_m == pytest.approx(0.3, rel=0.05)
+
+
 def test_posters_on_a_blank_wall_are_not_the_floor():
     """They hang at one height, and nothing shows where the wall ends."""
     poster = [
