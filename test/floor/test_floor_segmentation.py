@@ -304,15 +304,15 @@ def approach(stage, kind=0):
         T_map_base[0, 3] = x_m
         mask = stage.process(*images, MOUNT, T_map_base).mask
         shares_of_corner.append(np.mean(mask[LEFT_CORNER] == FLOOR))
-    assert shares_of_corner[0] < 0.3
-    assert shares_of_corner[-1] > 0.7
-    return images, T_map_base
+    return shares_of_corner, images, T_map_base
 
 
 @pytest.mark.parametrize('kind', range(len(FLOORS)))
 def test_the_left_border_is_known_from_before(kind):
     settings = FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)
-    approach(FloorSegmentation(CAMERA, settings), kind)
+    shares_of_corner, _, _ = approach(FloorSegmentation(CAMERA, settings), kind)
+    assert shares_of_corner[0] < 0.3
+    assert shares_of_corner[-1] > 0.7
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,8 @@ def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_
     """The left border is known from before alone."""
     before = dataclasses.replace(SETTINGS, fill_support=1.0, fill_gap_m=0.0)
     stage = FloorSegmentation(CAMERA, before)
-    last, T_map_base = approach(stage)
+    shares_of_corner, last, T_map_base = approach(stage)
+    assert shares_of_corner[0] < 0.3 and shares_of_corner[-1] > 0.7
     stage.change_settings(dataclasses.replace(before, **change))
     mask = stage.process(*last, MOUNT, T_map_base).mask
     share = np.mean(mask[LEFT_CORNER] == FLOOR)
