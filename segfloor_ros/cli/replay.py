@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import signal
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.progress import TaskID
 
-from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli.options import (
     DepthOption,
@@ -33,7 +34,7 @@ from segfloor_ros.cli.output import (
     print_summary,
     progress_bar,
 )
-from segfloor_ros.configuration import resolve
+from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.node_settings import StereoCameraNodeSettings
@@ -76,14 +77,9 @@ def replay(
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
     maps = MapOptions(load_map, save_map, localize)
-    configuration = resolve(
-        params, assignments or (), stereo_camera=recording_settings(input, masks, ignore, depth)
+    configuration, source = _open(
+        params, assignments, recording_settings(input, masks, ignore, depth)
     )
-    # The camera node reads the recording; here it is opened so that bad input ends at once.
-    source = open_source(configuration.stereo_camera)
-    if any(sensor.name == DEPTH and sensor.used for sensor in source.sensors):
-        camera = dataclasses.replace(configuration.stereo_camera, depth=True)
-        configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
     print_sensors(source.sensors)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -109,3 +105,17 @@ def replay(
         highlight=False,
     )
     finish_run(input, out, report)
+
+
+def _open(
+    params: Path | None, assignments: list[str] | None, recording: dict[str, Any]
+) -> tuple[Configuration, StereoSource]:
+    """Return the configuration and the recording, which the camera node reads: it is opened here so
+    that bad input ends at once.
+    """
+    configuration = resolve(params, assignments or (), stereo_camera=recording)
+    source = open_source(configuration.stereo_camera)
+    if any(sensor.name == DEPTH and sensor.used for sensor in source.sensors):
+        camera = dataclasses.replace(configuration.stereo_camera, depth=True)
+        configuration = dataclasses.replace(configuration, stereo_camera=camera)
+    return configuration, source
