@@ -90,6 +90,12 @@ def test_ros_in_the_commands_is_for_the_replay_alone() -> None:
             assert not ros, path.relative_to(PACKAGE)
 
 
+def test_no_two_test_files_share_a_name() -> None:
+    """pytest imports them by name: two of one name fail, though each passes by itself."""
+    names = [path.name for path in Path(__file__).parent.rglob('test_*.py')]
+    assert len(names) == len(set(names))
+
+
 def test_every_room_is_a_package_with_a_purpose() -> None:
     for path in PACKAGE.rglob('__init__.py'):
         assert ast.get_docstring(ast.parse(path.read_text())), path

@@ -14,6 +14,7 @@ from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.adjustment_runner import AdjustmentRunner
 from segfloor_ros.slam.disparity_offset import OffsetEstimate
+from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.front_end import FrontEnd
 from segfloor_ros.slam.global_adjustment import apply_global, copy_map, solve_global
 from segfloor_ros.slam.images import Images
@@ -22,6 +23,7 @@ from segfloor_ros.slam.known_map import KnownMap
 from segfloor_ros.slam.level_ground import LevelGround
 from segfloor_ros.slam.loop_closing import Closing, apply_closing, plan_closing, solve_closing
 from segfloor_ros.slam.loops import LoopDetector
+from segfloor_ros.slam.map_arrays import fill_map, map_to_arrays
 from segfloor_ros.slam.mapping import LocalMapper
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
@@ -95,27 +97,45 @@ class BackEnd:
         return self.collect(wait=True) or closed
 
     @property
-    def is_joined(self) -> bool:
-        """Whether the drive is in the map that was loaded, or there is none."""
-        return self._known is None
+    def is_apart(self) -> bool:
+        """Whether the map is a part of its own, beside one that is known."""
+        return self._known is not None
 
-    def map_apart(self, known: Arrays) -> None:
-        """Begin again with an empty map, until the known one is recognised."""
+    def map_apart(self) -> None:
+        """Go on with an empty map, until the known one, which is all there is so far, is
+        recognised.
+        """
+        known = map_to_arrays(self._map) | self.places.to_arrays()
+        self._known = KnownMap(self._camera, self._tracker, self._map, known)
         self._map.reset(int(known['num_ever'][0]))
+        self._forget_places()
+
+    def sees_known(self, images: Images, features: Features) -> bool:
+        """Whether a camera that is lost in a part of the map is seen to be in the known one."""
+        return self._known is not None and self._known.is_seen(images, features, self.offset_px)
+
+    def give_up_part(self) -> None:
+        """Go back to the known map, and forget the part beside it."""
+        assert self._known is not None
+        known, self._known = self._known, None
+        arrays = known.to_arrays()
+        known.restore(arrays)
+        self._forget_places()
+        self.places.from_arrays(arrays)
+
+    def _forget_places(self) -> None:
+        self._global.drop()
         self.places.reset()
         self.loops.reset()
-        self._known = KnownMap(self._camera, self._tracker, self._map, known)
 
     def _join_known(self, keyframe: KeyframeRecord, images: Images, mount: Mount | None) -> bool:
         """Make the drive's own map a part of the known one, where that is recognised."""
         known = self._known
         if known is None or not known.recognise(keyframe, images, self.offset_px, mount):
             return False
-        self._global.drop()
         words = known.join(self.places.to_arrays())
-        self.places.reset()
+        self._forget_places()
         self.places.from_arrays(words)
-        self.loops.reset()
         self._known = None
         return True
 
@@ -132,14 +152,19 @@ class BackEnd:
                 finished[1]()
         return any(apply is not None for apply in finished)
 
-    def to_arrays(self) -> Arrays:
-        """Return what is known besides the map, for a file."""
+    def to_arrays(self, of_known: bool) -> Arrays:
+        """Return the map and what belongs to it, for a file. of_known: of the known map, where the
+        present one is a part beside it.
+        """
         offset = self.mapper.offset.estimate
-        known: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
-        return self.places.to_arrays() | known
+        measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
+        if of_known and self._known is not None:
+            return self._known.to_arrays() | measured
+        return map_to_arrays(self._map) | self.places.to_arrays() | measured
 
     def from_arrays(self, arrays: Arrays) -> None:
-        """Take in what `to_arrays` returned."""
+        """Go on with what `to_arrays` returned."""
+        fill_map(self._map, arrays)
         self.places.from_arrays(arrays)
         self.mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
 

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +15,7 @@ from segfloor_ros.geometry import Array, adjoint, invert, make_transform
 from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
 from segfloor_ros.slam.gravity import Gravity
 from segfloor_ros.slam.gyroscope import Gyroscope
+from segfloor_ros.slam.inertial_odometry import InertialOdometry
 from segfloor_ros.slam.wheel_odometry import (
     Stretch,
     WheelCalibrator,
@@ -54,13 +56,18 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class RelativeMotion:
     """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
-    twist in exp(twist) T_now_before, translation first. with_way: whether the translation was
-    measured, too.
+    twist in exp(twist) T_now_before, translation first. told_by: wheels, an IMU, or a gyroscope
+    alone with a speed that is taken for constant.
     """
 
     T_now_before: Array
     covariance: Array
-    with_way: bool = True
+    told_by: Literal['wheels', 'IMU', 'gyroscope'] = 'wheels'
+
+    @property
+    def by_wheels(self) -> bool:
+        """Whether wheels told it."""
+        return self.told_by == 'wheels'
 
     @classmethod
     def none(cls) -> RelativeMotion:
@@ -73,7 +80,7 @@ class RelativeMotion:
         return RelativeMotion(
             later.T_now_before @ self.T_now_before,
             A @ self.covariance @ A.T + later.covariance,
-            self.with_way and later.with_way,
+            later.told_by if self.by_wheels else self.told_by,
         )
 
 
@@ -92,6 +99,7 @@ class BodyMotion:
         self.remarks: dict[str, str] = {}
         self.gyroscope = Gyroscope()
         self.gravity = Gravity(self.gyroscope)
+        self._inertial = InertialOdometry(self.gyroscope, self.gravity)
         self._wheels = WheelOdometry()
         self._calibrator = WheelCalibrator()
         self._window: tuple[int, Array] | None = None
@@ -163,6 +171,7 @@ class BodyMotion:
     def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
         """Learn from the pose of a frame that the images tell well."""
         self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
+        self._inertial.see(stamp_ns, T_odom_camera, R_world_odom)
         rate_before, rate_rad_s = self._window_rate_rad_s, self._turn_rate(stamp_ns, T_odom_camera)
         if self._window is None:
             self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
@@ -190,13 +199,43 @@ class BodyMotion:
         turned = self.T_base_left[:3, :3] @ before[1][:3, :3].T @ T_odom_camera[:3, :3]
         return yaw_of(turned @ self.T_base_left[:3, :3].T) * 1e9 / max(stamp_ns - before[0], 1)
 
+    def felt(
+        self, before_ns: int, now_ns: int, T_odom_before: Array, R_world_odom: Array
+    ) -> RelativeMotion | None:
+        """Return the motion of the camera since the last pose as an IMU alone tells it."""
+        turn, way = self.turn(before_ns, now_ns), self._inertial.way(now_ns, R_world_odom)
+        if turn is None or way is None:
+            return None
+        R_now_before, sigma_rad = turn
+        moved_m = -R_now_before @ T_odom_before[:3, :3].T @ way.moved_m
+        variance = np.array([way.variance_m2] * 3 + [sigma_rad**2] * 3)
+        return RelativeMotion(
+            make_transform(R_now_before, moved_m),
+            np.diag(variance),
+            'IMU' if way.is_felt else 'gyroscope',
+        )
+
+    def carry(
+        self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array, on_wheels: bool
+    ) -> None:
+        """Note the pose of a frame that no image tells, but wheels or an IMU alone."""
+        self._window = self._last_seen = None
+        if on_wheels:
+            self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
+            self._inertial.see(stamp_ns, T_odom_camera, R_world_odom)
+        else:
+            self._inertial.carry(stamp_ns, T_odom_camera, R_world_odom)
+
     def reset_world(self) -> None:
         """Forget where up is: the world is another one."""
         self.gravity = Gravity(self.gyroscope)
+        self._inertial = InertialOdometry(self.gyroscope, self.gravity)
 
-    def stop_learning(self) -> None:
-        """Note that there is a frame without a pose from the images."""
+    def stop(self) -> None:
+        """Note that there is a frame without a pose."""
         self._window = self._last_seen = None
+        self.gravity.stop()
+        self._inertial.stop()
 
     def _learn_wheels(
         self, T_before_now: Array, before_ns: int, now_ns: int, turning_up_rad_s: float

@@ -91,7 +91,7 @@ class Consensus:
         problem = _Problem(self._camera, points, observations, of_most)
         if known is not None and _differ(of_most, known):
             return problem.near(known.T_camera_world, max_noise_factor)
-        proven = self._proven(sparse_map, ids, T_start)
+        proven = self.proven(sparse_map, ids, T_start)
         if proven.sum() < MIN_PROVEN or _fits(of_most, proven):
             return problem.of_everyone()
         measured = observations.take(proven)
@@ -113,7 +113,7 @@ class Consensus:
         fitting = problem.fitting(known.T_camera_world, KNOWN_NOISE * known.noise_factor)
         return Agreement(replace(known, inliers=fitting), fitting)
 
-    def _proven(
+    def proven(
         self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
     ) -> NDArray[np.bool_]:
         """Return which points (N,) have a record of standing still, or belong to the floor."""

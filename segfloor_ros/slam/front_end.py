@@ -9,7 +9,7 @@ import numpy as np
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.body_motion import BodyMotion
 from segfloor_ros.slam.consensus import Consensus
 from segfloor_ros.slam.excluded import Region, is_inside, join
@@ -21,13 +21,14 @@ from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.local_map import LocalMap
-from segfloor_ros.slam.motion import CameraMotion
+from segfloor_ros.slam.motion import MAX_BLIND_SIGMA_M, CameraMotion
 from segfloor_ros.slam.place_recognition import PlaceRecognition
+from segfloor_ros.slam.pose_information import pose_covariance
 from segfloor_ros.slam.relocalisation import Relocaliser, is_within
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.track import ObservedFeatures, Track
+from segfloor_ros.slam.track import MIN_TRACKED, ObservedFeatures, Track
 from segfloor_ros.slam.tracking import Tracker
 
 RECOVERY_RATIO = 0.15
@@ -38,18 +39,23 @@ CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 """Points, and their share of those expected, that must be found where the sensors have the camera
 somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
+CARRY_ON = 0.6
+"""A poor pose gives way to the motion so far, where that explains this share of its points."""
+
 FEW_POINTS, RESUMING_POINTS = 50, 60
 """Wheels tell the pose better than fewer points, spread over the image, that do not slide along
-edges. A few more end a blind stretch."""
+edges, and an IMU alone better than half as many. A few more end a blind stretch."""
 
-MAX_BLIND_SIGMA_M = 0.5
-"""Uncertainty of the pose up to which keyframes are made of it."""
+PLENTY = 100
+"""With so many points in view the place is certain enough, whatever they are."""
 
 
 class FrontEnd:
     """Tracks frames against the map, and looks for a camera that was lost.
 
     offset_px: the error that all disparities share. is_fixed: whether the map stays as it is.
+    is_poor: whether the last pose was told by few points of many. seen_sigma_m: how uncertain the
+    last image leaves the place of the camera, 0 where it shows plenty or nothing.
     """
 
     def __init__(
@@ -66,8 +72,8 @@ class FrontEnd:
         self.tracker = Tracker(camera, self.consensus)
         self.extractor = FeatureExtractor(settings)
         self.places = PlaceRecognition(camera, self.tracker, sparse_map)
-        self.offset_px = 0.0
-        self.is_fixed = False
+        self.offset_px = self.seen_sigma_m = 0.0
+        self.is_fixed = self.is_poor = False
         self.frames_since_keyframe = 0
         self._camera = camera
         self._map = sparse_map
@@ -75,11 +81,17 @@ class FrontEnd:
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
 
-    def reset(self) -> None:
-        """Begin at the origin of an empty map."""
-        self.motion.reset()
+    @property
+    def is_searching(self) -> bool:
+        """Whether the camera is looked for in the whole map."""
+        return self.motion.is_lost and not self._relocaliser.is_narrow
+
+    def leave_map(self) -> None:
+        """Forget what was seen of the map: another one takes its place."""
+        self.motion.stop()
         self.local.point_ids = np.zeros(0, np.int32)
         self.follower.reset()
+        self._relocaliser.reset()
 
     def start_lost(self, T_world_odom: Array | None) -> None:
         """Go on with a map in which the camera must be found. T_world_odom: (4, 4), where the drive
@@ -97,10 +109,8 @@ class FrontEnd:
         here = is_within(self.motion.T_camera_world @ T_world_camera, reach_m, reach_rad)
         if here and not self.motion.is_lost:
             return
+        self.leave_map()
         self._relocaliser.search_near(T_world_camera, reach_m, reach_rad)
-        self.follower.reset()
-        self.motion.stop()
-        self.local.point_ids = np.zeros(0, np.int32)
 
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
@@ -128,6 +138,7 @@ class FrontEnd:
     def track(self, frame: StereoFrame, images: Images) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features."""
         predictions = self._predict_poses(frame, images)
+        self.is_poor, self.seen_sigma_m = False, 0.0
         track = self.follower.follow(
             images, self._map, self.local.point_ids, predictions[0], self.offset_px
         )
@@ -148,22 +159,33 @@ class FrontEnd:
         """Whether the camera can have come to where the images have it."""
         motion, pose = self.motion, track.T_camera_world
         if motion.is_lost:
-            return True
+            return motion.may_face(pose, stamp_ns)
         few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
-        if motion.is_held(stamp_ns) and count_firm(images.left, track.uv_px) < few:
+        few = few if motion.is_held(stamp_ns) else few // 2 if motion.is_felt(stamp_ns) else 0
+        if few and count_firm(images.left, track.uv_px) < few:
             return False
+        if len(track.point_ids) < PLENTY:
+            self.seen_sigma_m = self._sigma_m(track, images)
         if motion.is_consistent(pose, track.covariance, stamp_ns):
             return motion.is_plausible(pose, stamp_ns)
         least, ratio = CONTRARY_WHEN_BLIND if motion.is_blind else CONTRARY
         return len(track.point_ids) >= least and _recognised(track, ratio)
+
+    def _sigma_m(self, track: Track, images: Images) -> float:
+        """Return how uncertain an image leaves the place along the axis on which it is most."""
+        pose = track.T_camera_world
+        points = transform_points(pose, self._map.xyz_world[track.point_ids])
+        covariance = pose_covariance(self._camera, images.left, track.uv_px, points)
+        variance = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        return track.estimate.noise_factor * float(np.sqrt(variance))
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
         if self.motion.bridge(frame.stamp_ns):
             self.local.move_to(np.zeros(0, np.int32), self.motion.T_camera_world)
             self.frames_since_keyframe += 1
-        elif not fault or self.motion.is_blind:
-            self.motion.stop()
+        elif not fault or self.motion.is_blind or self.motion.is_lost:
+            self.motion.lose(frame.stamp_ns)
 
     def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
@@ -185,14 +207,51 @@ class FrontEnd:
             self.offset_px,
         )
         if not (self.motion.is_lost or self.motion.is_blind):
-            return track
+            return self._carry_on(images, features, frame.stamp_ns, track)
         if track is not None and _recognised(track, RECOVERY_RATIO):
             return track
-        return self._relocalise(images, features)
+        return self._relocalise(images, features, frame.stamp_ns)
 
-    def _relocalise(self, images: Images, features: Features) -> Track | None:
+    def _carry_on(
+        self, images: Images, features: Features, stamp_ns: int, track: Track | None
+    ) -> Track | None:
+        """Return the pose that the motion so far leads to, where it explains more points that have
+        a record of standing still, or where a pose is poor, nearly as many: what comes close and
+        fills the image has the most points, and takes the pose along.
+        """
+        self.is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
+        steady = self.motion.expected(stamp_ns)
+        close = self.tracker.track_at(
+            images,
+            features,
+            self._map,
+            self.local.point_ids,
+            steady.T_camera_world,
+            self.offset_px,
+            steady,
+            is_given=True,
+        )
+        if close is None or len(close.point_ids) < MIN_TRACKED:
+            return track
+        if track is not None:
+            told, explained = (self._count_proven(t) for t in (track, close))
+            if explained <= (CARRY_ON if self.is_poor else 1.0) * told:
+                return track
+        self.is_poor = True
+        return close
+
+    def _count_proven(self, track: Track) -> int:
+        proven = self.consensus.proven(self._map, track.point_ids, track.T_camera_world)
+        return int(proven.sum())
+
+    def _relocalise(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
         """Look for the view in the whole map."""
-        found = self._relocaliser.find(images, features, self.offset_px)
+        motion = self.motion
+        is_possible = partial(motion.may_face, stamp_ns=stamp_ns)
+        lost_at = motion.T_camera_world if motion.lost_here else None
+        found = self._relocaliser.find_surely(
+            images, features, self.offset_px, is_possible, lost_at
+        )
         if found is None:
             return None
         pose = found.T_camera_world

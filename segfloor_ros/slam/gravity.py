@@ -33,6 +33,8 @@ OUTLIER_CHI2 = 16.27
 """The 99.9 % quantile of the chi-squared distribution with three degrees of freedom."""
 
 MIN_MEASURED = 3
+GRAVITY_M_S2, MAX_OFF_M_S2 = 9.81, 1.0
+"""An accelerometer that feels another gravity measures something else, or nothing."""
 
 
 class Gravity:
@@ -54,17 +56,23 @@ class Gravity:
     @property
     def up_world(self) -> Up | None:
         """Up in the world, None before enough is known."""
-        if self._measured < MIN_MEASURED:
-            return None
-        lift = self._state[:3]
-        return _up(lift, self._covariance[:3, :3])
+        return _up(self._state[:3], self._covariance[:3, :3]) if self._is_known else None
+
+    @property
+    def _is_known(self) -> bool:
+        off_m_s2 = abs(float(np.linalg.norm(self._state[:3])) - GRAVITY_M_S2)
+        return self._measured >= MIN_MEASURED and off_m_s2 < MAX_OFF_M_S2
+
+    def lift(self, R_world_camera: Array) -> Array | None:
+        """Return what is felt at rest (3,), in axes of the world; None before enough is known."""
+        return _design(R_world_camera) @ self._state if self._is_known else None
 
     def up_camera(self, T_odom_camera: Array) -> Up | None:
         """Return up in the camera's axes as the latest measurement has it, which is given out once.
         sigma_rad: of its difference to `up_world`.
         """
         latest, self._latest = self._latest, None
-        if latest is None or self._measured < MIN_MEASURED:
+        if latest is None or not self._is_known:
             return None
         lift_odom, R_world_odom = latest
         R_camera_odom = T_odom_camera[:3, :3].T

@@ -39,25 +39,42 @@ OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Felt:
-    """What an IMU felt between two times, in the axes of the first: R_before_now (3, 3), and the
-    acceleration, gravity's included, integrated once (3,) in m/s and twice (3,) in m.
+    """What an IMU felt between two times, in the axes of the first: R_before_now (3, 3) and the
+    standard deviation of its angles, and the acceleration of the camera, gravity's included,
+    integrated once (3,) in m/s and twice (3,) in m.
     """
 
     turn: Array
+    sigma_rad: float
     speed: Array
     way: Array
 
 
 @dataclass(frozen=True)
 class _Path:
-    """Seconds (N,), R_before_now (N, 3, 3) and acceleration (N, 3) in the axes of that moment.
-    speeding_up: (3,) by how much the rate of the turn grew, in rad/s, in the axes of the end.
+    """Seconds (N,), R_before_now (N, 3, 3), and rates of the turn and acceleration (N, 3) in the
+    axes of that moment. place_m: (3,) of the IMU on the camera.
     """
 
     seconds: Array
     turns: Array
+    rates_rad_s: Array
     accel_m_s2: Array
-    speeding_up: Array
+    place_m: Array
+
+    @property
+    def speeding_up(self) -> Array:
+        """By how much the rate of the turn grew (3,), in rad/s, in the axes of the end."""
+        return np.asarray(self.rates_rad_s[-1] - self.turns[-1].T @ self.rates_rad_s[0])
+
+    @property
+    def circle(self) -> tuple[Array, Array]:
+        """The speed and the way (3,) that an IMU beside the camera has because it turns: what is
+        felt of them is the difference of both ends, whatever happens between.
+        """
+        first, last = np.cross(self.rates_rad_s[[0, -1]], self.place_m)
+        swept = self.turns[-1] @ self.place_m - self.place_m
+        return self.turns[-1] @ last - first, swept - self.seconds[-1] * first
 
     @property
     def angle_rad(self) -> float:
@@ -88,9 +105,11 @@ class Gyroscope:
         self.lag_s = 0.0
         self._covariance: Array = np.diag([FIRST_BIAS_SIGMA**2] * 3 + [FIRST_LAG_SIGMA_S**2])
         self._samples: list[ImuSample] = []
+        self._latest: tuple[tuple[int, int], _Path | None] | None = None
 
     def add(self, sample: ImuSample) -> None:
         """Take in a sample; one that comes late is put where it belongs."""
+        self._latest = None
         if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns - RESTART_NS:
             self._samples.clear()
         insort(self._samples, sample, key=_stamp)
@@ -114,9 +133,17 @@ class Gyroscope:
         speed = np.cumsum((accel[1:] + accel[:-1]) / 2 * step_s, axis=0)
         before = np.vstack([np.zeros(3), speed[:-1]])
         way = ((before + speed) / 2 * step_s).sum(axis=0)
-        return Felt(path.turns[-1], speed[-1], way)
+        turning, swept = path.circle
+        sigma_rad = path.sigma_rad(self._sigma)
+        return Felt(path.turns[-1], sigma_rad, speed[-1] - turning, way - swept)
 
     def _path(self, before_ns: int, now_ns: int) -> _Path | None:
+        """Return what was felt between two times; many ask for the motion of the same frame."""
+        if self._latest is None or self._latest[0] != (before_ns, now_ns):
+            self._latest = (before_ns, now_ns), self._integrated(before_ns, now_ns)
+        return self._latest[1]
+
+    def _integrated(self, before_ns: int, now_ns: int) -> _Path | None:
         """Return turn and acceleration at two times and at all samples between. The rate between
         two samples is their mean.
         """
@@ -141,8 +168,7 @@ class Gyroscope:
         turns = [np.eye(3)]
         for R in Rotation.from_rotvec(steps).as_matrix():
             turns.append(turns[-1] @ R)
-        speeding_up = rates[-1] - turns[-1].T @ rates[0]
-        return _Path(nodes, np.stack(turns), at_nodes[:, 3:], speeding_up)
+        return _Path(nodes, np.stack(turns), rates, at_nodes[:, 3:], samples[-1].place_m)
 
     def learn(self, seen: Array, before_ns: int, now_ns: int) -> None:
         """Learn bias and lag from R_before_now (3, 3) as the images tell it (a Kalman filter)."""
@@ -158,6 +184,7 @@ class Gyroscope:
         S = H @ self._covariance @ H.T + noise**2 * np.eye(3)
         if (np.abs(excess) > OUTLIER_SIGMAS * np.sqrt(np.diag(S))).any():
             return
+        self._latest = None
         gain = self._covariance @ H.T @ np.linalg.inv(S)
         change = gain @ excess
         self.bias_rad_s = self.bias_rad_s + change[:3]

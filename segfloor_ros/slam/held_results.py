@@ -1,11 +1,13 @@
-"""Results wait here for the mount of the camera.
+"""Results wait here until it is known where they are in frame `map`.
 
 Tracking and mapping work in optical axes from the first camera pose. Frame `map` lies on the
-floor, so it is known only when the mount is.
+floor, so it is known only when the mount is. A camera that got lost and maps on its own does not
+know it until it recognises the map.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,20 +18,27 @@ from segfloor_ros.slam.moving_points import turned
 from segfloor_ros.slam.results import FrameResult, Keyframe
 
 MAX_HELD_KEYFRAMES = 50
-"""Keyframes that wait with their images for the mount to be known."""
+"""Keyframes that wait with their images; of more, every second one goes without."""
 
 
 class HeldResults:
-    """Holds results in optical axes back until the mount is known, then turns all of them."""
+    """Holds results in optical axes back, then turns all of them into ROS frames."""
 
     def __init__(self) -> None:
         self._held: list[FrameResult] = []
 
-    def release(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
-        """Take in the next result; returns those that are ready, in ROS frames, oldest first."""
+    def add(self, result: FrameResult) -> None:
+        """Take in the next result."""
         self._held.append(result)
+        self._thin_out()
+
+    def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
+        """Change all results that are held."""
+        self._held = [change(result) for result in self._held]
+
+    def release(self, mount: Mount | None) -> list[FrameResult]:
+        """Return the results in ROS frames, oldest first; none while the mount is unknown."""
         if mount is None:
-            self._drop_old_keyframes()
             return []
         ready, self._held = self._held, []
         return [in_map(held, mount.T_base_left) for held in ready]
@@ -40,12 +49,12 @@ class HeldResults:
             return None
         return in_map(replace(self._held[-1], keyframe=None, moving=None), mount.T_base_left)
 
-    def _drop_old_keyframes(self) -> None:
-        """Keep the images of the latest keyframes only: a camera that never sees the floor must not
+    def _thin_out(self) -> None:
+        """Keep the images of so many keyframes only: a camera that never sees the floor must not
         fill the memory. The poses of all frames are kept.
         """
         holders = [i for i, held in enumerate(self._held) if held.keyframe is not None]
-        for i in holders[:-MAX_HELD_KEYFRAMES]:
+        for i in holders[1::2] if len(holders) > MAX_HELD_KEYFRAMES else []:
             self._held[i] = replace(self._held[i], keyframe=None)
 
 

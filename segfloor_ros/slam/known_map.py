@@ -1,8 +1,8 @@
-"""A saved map that a drive does not start in: the drive maps on its own until it recognises it.
+"""A known map that the camera is not found in: the drive maps on its own until it recognises it.
 
-The two maps are kept apart until then. Several keyframes in a row must see the known map and agree
-on where it lies; then the drive's own map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO
-2021, section VI: map merging).
+It was saved by another drive, or made by this one before it got lost. The two maps are kept apart.
+Several keyframes in a row must see the known map and agree on where it lies; then the drive's own
+map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import invert
 from segfloor_ros.map_file import Arrays
+from segfloor_ros.slam.features import Features
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord, LoopEdge, Match
 from segfloor_ros.slam.loop_checks import LoopChecks, are_certain, drift, median_depth_m
@@ -29,6 +30,10 @@ from segfloor_ros.slam.tracking import Tracker
 
 NEIGHBOURS = 20
 MAX_MISSES = 1
+TIMES_A_LOOP = 2
+"""No drift tells where the known map can be: so many times the sightings of a loop are asked for.
+With as many as for a loop, walls with the same paper were taken for one.
+"""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,6 @@ class KnownMap:
     def __init__(
         self, camera: StereoCamera, tracker: Tracker, own: SparseMap, arrays: Arrays
     ) -> None:
-        self._arrays = arrays
         self._own = own
         self._camera = camera
         self._map = SparseMap()
@@ -72,7 +76,13 @@ class KnownMap:
             self._misses += 1
             if self._misses > MAX_MISSES:
                 self._sightings = []
-        return are_certain(self._own, [sighting.match for sighting in self._sightings])
+        matches = [sighting.match for sighting in self._sightings]
+        return are_certain(self._own, matches, TIMES_A_LOOP)
+
+    def is_seen(self, images: Images, features: Features, offset_px: float) -> bool:
+        """Whether enough frames in a row see the known map, this one the last of them."""
+        found = self._relocaliser.find_surely(images, features, offset_px, None, None)
+        return found is not None
 
     def _look(self, keyframe: KeyframeRecord, images: Images, offset_px: float) -> Match | None:
         """Look for the view where the keyframes before saw it, else in the whole known map."""
@@ -105,8 +115,8 @@ class KnownMap:
         T_known_own = invert(drift(self._own, latest))
         before = len(self._map.keyframes)
         arrays = moved(map_to_arrays(self._own), T_known_own)
-        self._own.reset()
-        fill_map(self._own, self._arrays)
+        known = self.to_arrays()
+        self.restore(known)
         fill_map(self._own, arrays)
         for sighting in self._sightings:
             match, i = sighting.match, before + sighting.match.keyframe
@@ -115,7 +125,16 @@ class KnownMap:
             self._own.loops.append(LoopEdge(i, match.place, T_i_j))
             merge_pairs(self._own, self._rows(sighting.own_ids), self._rows(sighting.known_ids))
         fuse_latest(self._camera, self._own, before + latest.keyframe)
-        return {name: np.concatenate([self._arrays[name], own_words[name]]) for name in own_words}
+        return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
+
+    def to_arrays(self) -> Arrays:
+        """Return the known map and the words of its keyframes."""
+        return map_to_arrays(self._map) | self._places.to_arrays()
+
+    def restore(self, known: Arrays) -> None:
+        """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
+        self._own.reset()
+        fill_map(self._own, known)
 
     def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
         """Return the rows (N,) of points in the joined map, -1 for those that are gone."""

@@ -181,14 +181,16 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     return invert(own) @ match.T_camera_world
 
 
-def are_certain(sparse_map: SparseMap, matches: list[Match]) -> bool:
-    """Whether enough keyframes agree, over enough of a motion."""
-    if len(matches) < CONFIRMATIONS:
+def are_certain(sparse_map: SparseMap, matches: list[Match], times: int = 1) -> bool:
+    """Whether enough keyframes agree, over enough of a motion. times: as many and as much as for a
+    loop.
+    """
+    if len(matches) < times * CONFIRMATIONS:
         return False
     latest = matches[-1]
     motion = latest.T_camera_world @ invert(matches[0].T_camera_world)
-    moved = float(np.linalg.norm(motion[:3, 3])) >= MIN_MOVED_M
-    if not (moved or rotation_angle(motion[:3, :3]) >= MIN_TURNED_RAD):
+    moved = float(np.linalg.norm(motion[:3, 3])) >= times * MIN_MOVED_M
+    if not (moved or rotation_angle(motion[:3, :3]) >= times * MIN_TURNED_RAD):
         return False
     keyframe = sparse_map.keyframes[latest.keyframe]
     limit_m = AGREE_M + AGREE_DEPTH_SHARE * median_depth_m(sparse_map, keyframe)

@@ -15,17 +15,25 @@ from segfloor_ros.geometry import (
     se3_log,
 )
 from segfloor_ros.slam.body_motion import BodyMotion, RelativeMotion
+from segfloor_ros.slam.pose import PoseEstimate
 
 MAX_TURN_RADPS = 6.0
 """A robot does not spin faster than once a second."""
 
 MIN_STEP_S = 1e-3
 
-MAX_COASTING_NS = 1_000_000_000
-"""A camera whose turn is measured, but not its way, goes on at constant velocity for so long."""
+ACCELERATION = 2.0
+"""Of a robot on wheels, m/s² and rad/s²."""
 
-SIGMA_COASTING_M_S = 0.3
-"""Error of a velocity that is taken for constant."""
+MAX_BLIND_SIGMA_M = 0.5
+"""Uncertainty of the place up to which an IMU alone tells it, and up to which keyframes are made of
+a pose that no image tells."""
+
+MAX_LOST_TURN_RAD = 0.3
+"""A camera that was lost is found only where a gyroscope that went on has it look, by so much."""
+
+SIGMA_FELT_M_S = 0.3
+"""A speed that is only felt speaks against images that tell another by much more."""
 
 CONSISTENT_CHI2 = 22.46
 """Bound on the difference between images and sensors: 99.9 % of six degrees of freedom."""
@@ -37,7 +45,8 @@ class CameraMotion:
 
     T_camera_world: the latest pose (4, 4). covariance: (6, 6) of its twist. T_world_odom: the
     correction of the odometry; both frames are the camera's first pose. is_lost: whether the last
-    frame had no pose. carried_by: the sensor that told the last pose alone, or ''.
+    frame had no pose; `T_camera_world` then turns on as a gyroscope tells. lost_here: whether that
+    is where the camera was lost. carried_by: the sensor that told the last pose alone, or ''.
     """
 
     def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
@@ -50,12 +59,13 @@ class CameraMotion:
         self.T_camera_world: Array = np.eye(4)
         self.covariance: Array = np.zeros((6, 6))
         self.T_world_odom: Array = np.eye(4)
-        self.is_lost = False
+        self.is_lost = self.lost_here = False
         self.carried_by = ''
         self._velocity: Array = np.zeros(6)
         self._last_stamp_ns = 0
-        self._seen_ns = 0
+        self._heading_sigma_rad: float | None = None
         self._since_keyframe: RelativeMotion | None = None
+        self._latest: tuple[tuple[int, int], RelativeMotion | None] | None = None
 
     @property
     def T_odom_camera(self) -> Array:
@@ -70,12 +80,17 @@ class CameraMotion:
     def is_held(self, stamp_ns: int) -> bool:
         """Whether wheels tell where the camera is, too, and did so since the last keyframe."""
         measured, since = self._measured(stamp_ns), self._since_keyframe
-        return all(motion is not None and motion.with_way for motion in (measured, since))
+        return all(motion is not None and motion.by_wheels for motion in (measured, since))
+
+    def is_felt(self, stamp_ns: int) -> bool:
+        """Whether an IMU tells where the camera is, for some seconds."""
+        measured = self._measured(stamp_ns)
+        return measured is not None and measured.told_by == 'IMU'
 
     @property
     def sigma_m(self) -> float:
         """The standard deviation of the position, along the axis on which it is largest."""
-        return float(np.sqrt(np.diag(self.covariance)[:3].max()))
+        return _sigma_m(self.covariance)
 
     def predict(self, stamp_ns: int) -> Array:
         """Return where the camera will be, T_camera_world (4, 4)."""
@@ -84,12 +99,21 @@ class CameraMotion:
 
     def measured_pose(self, stamp_ns: int) -> Array | None:
         """Return where the sensors have the camera, T_camera_world (4, 4)."""
+        if self.is_lost:
+            turned = self._turned(stamp_ns)
+            return None if turned is None else turned[0]
         measured = self._measured(stamp_ns)
         return None if measured is None else measured.T_now_before @ self.T_camera_world
 
     def steady(self, stamp_ns: int) -> Array:
         """Return where the camera will be if it moves on as it did, T_camera_world (4, 4)."""
         return se3_exp(self._velocity * self._step_s(stamp_ns)) @ self.T_camera_world
+
+    def expected(self, stamp_ns: int) -> PoseEstimate:
+        """Return where the camera will be if its motion goes on, as far as that of a robot does."""
+        sigma = 0.5 * self._step_s(stamp_ns) ** 2 * ACCELERATION
+        covariance = self.covariance + np.diag(np.repeat(sigma**2, 6))
+        return PoseEstimate(self.predict(stamp_ns), np.zeros(0, bool), covariance, 1.0)
 
     def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
         """Whether a robot can have come to a pose since the last frame."""
@@ -103,11 +127,22 @@ class CameraMotion:
         """Whether a pose that the images tell, with its covariance (6, 6), fits what the sensors
         tell.
         """
-        prior = self._predicted(self._measured(stamp_ns))
-        if prior is None:
+        measured = self._measured(stamp_ns)
+        prior = self._predicted(measured)
+        if measured is None or prior is None:
             return True
-        error = se3_log(T_camera_world @ invert(prior[0]))
-        return float(error @ np.linalg.solve(prior[1] + covariance, error)) < CONSISTENT_CHI2
+        error, P = se3_log(T_camera_world @ invert(prior[0])), prior[1] + covariance
+        if not measured.by_wheels:
+            P[:3, :3] += (SIGMA_FELT_M_S * self._step_s(stamp_ns)) ** 2 * np.eye(3)
+        return float(error @ np.linalg.solve(P, error)) < CONSISTENT_CHI2
+
+    def may_face(self, T_camera_world: Array, stamp_ns: int) -> bool:
+        """Whether a camera that was lost may have turned to a pose since."""
+        turned = self._turned(stamp_ns)
+        if turned is None or self._heading_sigma_rad is None:
+            return True
+        off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
+        return off_rad < MAX_LOST_TURN_RAD + 3 * (self._heading_sigma_rad + turned[1])
 
     def take(self, T_camera_world: Array, covariance: Array, stamp_ns: int) -> None:
         """Go on from the pose of a frame, found in its images. After a blind stretch `odom` goes on
@@ -123,8 +158,8 @@ class CameraMotion:
         self._velocity = motion / self._step_s(stamp_ns) if steady else np.zeros(6)
         self._note(measured)
         self.T_camera_world, self.covariance = T_camera_world, covariance
-        self._last_stamp_ns = self._seen_ns = stamp_ns
-        self.is_lost, self.carried_by = False, ''
+        self._last_stamp_ns = stamp_ns
+        self.is_lost, self.lost_here, self.carried_by = False, False, ''
         self._body.learn(stamp_ns, self.T_odom_camera, self.T_world_odom[:3, :3])
 
     def bridge(self, stamp_ns: int) -> bool:
@@ -135,29 +170,40 @@ class CameraMotion:
         predicted = self._predicted(measured)
         if measured is None or predicted is None:
             return False
-        if not measured.with_way and stamp_ns - self._seen_ns > MAX_COASTING_NS:
+        if not measured.by_wheels and _sigma_m(predicted[1]) > MAX_BLIND_SIGMA_M:
             return False
         self._note(measured)
         self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]
         self._last_stamp_ns = stamp_ns
-        self.carried_by = 'wheels' if measured.with_way else 'gyroscope'
-        self._body.stop_learning()
-        if measured.with_way:
-            self._body.gravity.see(stamp_ns, self.T_odom_camera, self.T_world_odom[:3, :3])
+        self.carried_by = measured.told_by
+        R_world_odom = self.T_world_odom[:3, :3]
+        self._body.carry(stamp_ns, self.T_odom_camera, R_world_odom, measured.by_wheels)
         return True
 
-    def stop(self) -> None:
+    def lose(self, stamp_ns: int) -> None:
         """Note that a frame has no pose."""
+        turned = self._turned(stamp_ns)
+        sigma_rad = self._heading_sigma_rad if self.is_lost else 0.0
+        lost_here = self.lost_here or not self.is_lost
+        self.stop()
+        self.lost_here = lost_here
+        if turned is not None and sigma_rad is not None:
+            self.T_camera_world = _without_drift(turned[0])
+            self._last_stamp_ns = stamp_ns
+            self._heading_sigma_rad = sigma_rad + turned[1]
+
+    def stop(self) -> None:
+        """Note that nothing is known of where the camera is."""
         self._velocity = np.zeros(6)
-        self.is_lost, self.carried_by = True, ''
+        self.is_lost, self.lost_here, self.carried_by = True, False, ''
+        self._heading_sigma_rad = self._latest = None
         self._since_keyframe = None
-        self._body.stop_learning()
-        self._body.gravity.stop()
+        self._body.stop()
 
     def start_keyframe(self) -> RelativeMotion | None:
         """Return the motion since the last keyframe as the wheels tell it; the next begins."""
         since, self._since_keyframe = self._since_keyframe, RelativeMotion.none()
-        return since if since is not None and since.with_way else None
+        return since if since is not None and since.by_wheels else None
 
     def move_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move the camera along with a keyframe (T_camera_world, (4, 4)) that the map has moved;
@@ -169,20 +215,24 @@ class CameraMotion:
         self.T_world_odom = _without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
 
     def _measured(self, stamp_ns: int) -> RelativeMotion | None:
-        """Return the motion since the last pose: by wheels, or by the gyroscope with a way that is
-        taken for constant.
+        """Return the motion since the last pose, by wheels or by an IMU alone; asked for often."""
+        stretch = self._last_stamp_ns, stamp_ns
+        if self._latest is None or self._latest[0] != stretch:
+            measured = self._body.between(*stretch)
+            if measured is None:
+                R_world_odom = self.T_world_odom[:3, :3]
+                measured = self._body.felt(*stretch, self.T_odom_camera, R_world_odom)
+            self._latest = stretch, measured
+        return self._latest[1]
+
+    def _turned(self, stamp_ns: int) -> tuple[Array, float] | None:
+        """Return the camera at its last place, turned on as a gyroscope tells, (4, 4), and the
+        standard deviation of the turn in radians.
         """
-        measured = self._body.between(self._last_stamp_ns, stamp_ns)
-        if measured is not None:
-            return measured
         turn = self._body.turn(self._last_stamp_ns, stamp_ns)
         if turn is None:
             return None
-        step_s = self._step_s(stamp_ns)
-        R_now_before, sigma_rad = turn
-        variance = np.array([(SIGMA_COASTING_M_S * step_s) ** 2] * 3 + [sigma_rad**2] * 3)
-        T_now_before = make_transform(R_now_before, self._velocity[:3] * step_s)
-        return RelativeMotion(T_now_before, np.diag(variance), with_way=False)
+        return make_transform(turn[0], np.zeros(3)) @ self.T_camera_world, turn[1]
 
     def _predicted(self, measured: RelativeMotion | None) -> tuple[Array, Array] | None:
         """Return where the sensors have the camera after a motion (4, 4), and the covariance."""
@@ -199,6 +249,10 @@ class CameraMotion:
 
     def _step_s(self, stamp_ns: int) -> float:
         return max((stamp_ns - self._last_stamp_ns) * 1e-9, MIN_STEP_S)
+
+
+def _sigma_m(covariance: Array) -> float:
+    return float(np.sqrt(np.diag(covariance)[:3].max()))
 
 
 def _without_drift(T: Array) -> Array:

@@ -9,7 +9,7 @@ seen now is carried into an earlier keyframe, and moves if that keyframe saw wha
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -45,6 +45,12 @@ SHIN_M, FOOT_M = 0.3, 0.2
 
 FOOT_STEPS_PX = (1.5, 2.5, 4.0, 6.5, 10.0, 16.0, 26.0, 64.0)
 """Disparities between which feet are taken to be of one size."""
+
+MOSTLY = 2.0
+"""A thing moves of which so many times more moved than stood still."""
+
+REACH_M = 0.4
+"""From corners of someone who walks to hands and feet."""
 
 NOISE_GREY = 1.0
 MISFIT_OF_TEXTURE = 0.7
@@ -109,8 +115,9 @@ class MovingRegions:
     ) -> Scene:
         """Find what moves in a frame whose pose is known."""
         disparity = self.measure(frame.left, frame.right)
-        votes = self._flow.see(FlowView(frame.stamp_ns, self._pair[0], disparity, T_odom_camera))
-        moving = self.find(disparity, T_camera_world, mount, votes)
+        view = FlowView(frame.stamp_ns, self._pair[0], disparity, T_odom_camera)
+        moving = self.find(disparity, T_camera_world, mount, self._flow.votes(view))
+        self._flow.remember(replace(view, moving=moving))
         return Scene(self._pair[0], disparity, moving)
 
     def positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
@@ -185,7 +192,9 @@ class MovingRegions:
         seeds &= self._shown(disparity, background).ravel()
         doubtful[rows] = (solid <= through) & high
         if votes is not None:
-            seeds[rows] |= votes.moving.ravel()[rows] & high
+            flat = np.zeros(disparity.size, np.uint8)
+            flat[rows] = high
+            seeds |= self._whole_things(votes, flat.reshape(disparity.shape), disparity).ravel()
             doubtful &= 1 - votes.still.ravel()
         moving = self._regions(
             seeds.reshape(disparity.shape), doubtful.reshape(disparity.shape), disparity
@@ -267,16 +276,38 @@ class MovingRegions:
         spread = np.linspace(0, len(near) - 1, min(len(near), COMPARED_VIEWS))
         return [near[i] for i in np.unique(spread.round().astype(int))]
 
+    def _whole_things(
+        self, votes: FlowVotes, high: NDArray[np.uint8], disparity: Disparity
+    ) -> NDArray[np.uint8]:
+        """Return the things (h, w) of which most corners moved, whatever was seen there before, and
+        single corners that moved. high: (h, w), 1 where something is higher than the floor.
+        """
+        found = votes.moving & high
+        _, labels = cv2.connectedComponents(np.where(_edges(disparity), 0, high).astype(np.uint8))
+        moved, still = (
+            np.bincount(labels.ravel(), weights=of.ravel()) for of in (found, votes.still)
+        )
+        moves = (moved > MOSTLY * still) & (moved >= MIN_AREA_PX)
+        for label in np.flatnonzero(moves[1:]) + 1:
+            seed = ((labels == label) & (found > 0)).astype(np.uint8)
+            depth_m = self._small.disparity_m / np.median(disparity[seed > 0])
+            reach = max(1, round(self._small.focal[0] * REACH_M / depth_m))
+            around = cv2.dilate(seed, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+            nearest = self._small.disparity_m / max(depth_m - REACH_M, MIN_DEPTH_M)
+            farthest = self._small.disparity_m / (depth_m + REACH_M)
+            own = (labels == label) & (disparity > farthest) & (disparity < nearest)
+            found[own & (around > 0)] = 1
+        return found
+
     def _regions(
         self, seeds: NDArray[np.uint8], doubtful: NDArray[np.uint8], disparity: Disparity
     ) -> NDArray[np.uint8]:
         """Return the seeds and the connected regions of one depth that consist of them."""
-        around = np.ones((3, 3), np.uint8)
         # Strips no wider than a block are fringes of what stands still.
         block = np.ones((BLOCK_PX, BLOCK_PX), np.uint8)
         seeds = cv2.morphologyEx(seeds, cv2.MORPH_OPEN, block)
-        edge = cv2.dilate(disparity, around) - disparity > 2 * TOLERANCE_PX
-        _, labels = cv2.connectedComponents(np.where(edge, 0, doubtful | seeds).astype(np.uint8))
+        parts = np.where(_edges(disparity), 0, doubtful | seeds).astype(np.uint8)
+        _, labels = cv2.connectedComponents(parts)
         area = np.bincount(labels.ravel())
         seeded = np.bincount(labels.ravel(), weights=seeds.ravel())
         whole = (seeded > SHARE_OF_REGION * area) & (seeded >= MIN_AREA_PX)
@@ -302,3 +333,9 @@ class MovingRegions:
                 below = cv2.dilate(here.astype(np.uint8), kernel, anchor=(reach // 2, reach))
                 result[below > 0] = 255
         return result
+
+
+def _edges(disparity: Disparity) -> NDArray[np.bool_]:
+    """Return where (h, w) something nearer begins."""
+    nearest = cv2.dilate(disparity, np.ones((3, 3), np.uint8))
+    return np.asarray(nearest - disparity > 2 * TOLERANCE_PX)

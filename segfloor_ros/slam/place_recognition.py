@@ -138,13 +138,19 @@ class PlaceRecognition:
         found, expected = len(track.point_ids), len(track.visible_ids)
         if found < MIN_FOUND or found < MIN_FOUND_SHARE * expected:
             return False
+        return self.agreement(track) >= MIN_CELLS_SHARE
+
+    def agreement(self, track: Track) -> float:
+        """Return the share of the parts of the image that show what is expected there, by more than
+        chance; 0 where no part expects enough.
+        """
         seen, there = (
             self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
             for ids in (track.point_ids, track.visible_ids)
         )
         full = there >= MIN_EXPECTED
-        agree = seen >= 0.5 * MIN_FOUND_SHARE * there
-        return bool(full.any() and agree[full].mean() >= MIN_CELLS_SHARE)
+        agree = seen - np.sqrt(seen) >= 0.5 * MIN_FOUND_SHARE * there
+        return float(agree[full].mean()) if full.any() else 0.0
 
     def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
         """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""

@@ -84,7 +84,8 @@ class FrameResult:
     frame. reference_keyframe: stamp of the keyframe the pose is expressed against, for
     correcting it later. state: words for people ('tracking', or why not). blind: whether the pose
     is that of wheels or a gyroscope alone. keyframe: set when
-    this frame became one. moving: what moves, where this frame was searched for it.
+    this frame became one. moving: what moves, where this frame was searched for it. apart: whether
+    it was, at first, not known where in the map this is: `tracked` where it was recognised later.
     """
 
     index: int
@@ -99,3 +100,4 @@ class FrameResult:
     keyframe: Keyframe | None = None
     moving: MovingPoints | None = None
     blind: bool = False
+    apart: bool = False

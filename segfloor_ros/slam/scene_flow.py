@@ -16,14 +16,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.features import spread
 from segfloor_ros.slam.small_camera import TOLERANCE_PX, Disparity, SmallCamera
 
 AGES_NS = (300_000_000, 900_000_000)
 """How long ago an image was that corners are followed back to: in the first someone who walks has
 moved by a hand, in the second someone who walks just ahead of the camera stands out."""
 
-CORNERS = 300
-QUALITY, APART_PX = 0.01, 3
+CORNERS, CELL_PX = 300, 10
+"""Corners are spread over the image by cells: cloth in front has the strongest, and a plain wall or
+floor, which tells that it stands still, needs its own."""
+
+APART_PX = 3
+MIN_CORNER, SURE_CORNER = 3e-4, 1e-3
+"""Smaller eigenvalue of a corner, as OpenCV scales it. Between the two a corner may say that it
+stands still, which it hardly does by chance, but not that it moves."""
+
 WINDOW, LEVELS = (9, 9), 3
 MAX_RETURN_PX = 0.5
 """Distance up to which a corner that is followed back and forth comes to where it was."""
@@ -37,19 +45,22 @@ MIN_MOVING = 3
 """Fewest corners of a thing that moves."""
 
 MAX_MOVING_SHARE = 0.8
-"""Where more of all corners seem to move it is the pose that is wrong."""
+"""Where more of all corners seem to move the pose is in doubt: what moved before still does."""
 
 DISC_PX = 3
 
 
 @dataclass(frozen=True)
 class FlowView:
-    """An earlier image. left: shrunk (h, w). disparity: (h, w). T_odom_camera: (4, 4)."""
+    """An earlier image. left: shrunk (h, w). disparity: (h, w). T_odom_camera: (4, 4). moving: what
+    was found to move in it, (h, w), 255; None before the search.
+    """
 
     stamp_ns: int
     left: NDArray[np.uint8]
     disparity: Disparity
     T_odom_camera: Array
+    moving: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,19 +78,23 @@ class SceneFlow:
         self._camera = camera
         self._views: deque[FlowView] = deque()
 
-    def see(self, view: FlowView) -> FlowVotes:
-        """Take in an image and return what moved in it."""
-        earlier = self._earlier(view.stamp_ns)
-        uv = self._corners(view)
-        moved, still = np.zeros(len(uv), bool), np.zeros(len(uv), bool)
-        for then in earlier if len(uv) else []:
-            found, differs = self._compare(view, then, uv)
-            moved |= found & differs
-            still |= found & ~differs
-        still &= ~moved
+    def remember(self, view: FlowView) -> None:
+        """Compare later images with this one, of which is known what moves in it."""
         self._views.append(view)
+
+    def votes(self, view: FlowView) -> FlowVotes:
+        """Return what moved in an image."""
+        earlier = self._earlier(view.stamp_ns)
+        uv, sure = self._corners(view)
+        moved, still, moved_before = (np.zeros(len(uv), bool) for _ in range(3))
+        for then in earlier if len(uv) else []:
+            found, differs, moved_then = self._compare(view, then, uv)
+            moved |= found & differs & sure
+            still |= found & ~differs
+            moved_before = moved_then
+        still &= ~moved
         if moved.sum() > MAX_MOVING_SHARE * (moved | still).sum():
-            moved[:] = False
+            moved, still = moved_before, still & ~moved_before
         disparity = self._camera.at(view.disparity, uv)
         moved = _outvoting(uv, disparity, moved, still)
         return FlowVotes(
@@ -98,22 +113,28 @@ class SceneFlow:
         }
         return [self._views[i] for i in sorted(chosen)]
 
-    def _corners(self, view: FlowView) -> Array:
-        """Return corners (N, 2) px at which the disparity is known and has no edge."""
-        found = cv2.goodFeaturesToTrack(view.left, CORNERS, QUALITY, APART_PX)
-        if found is None:
-            return np.zeros((0, 2))
-        uv = found.reshape(-1, 2).astype(np.float64)
+    def _corners(self, view: FlowView) -> tuple[Array, NDArray[np.bool_]]:
+        """Return corners (N, 2) px at which the disparity is known and has no edge, and which of
+        them are sure to be found again.
+        """
+        strength = cv2.cornerMinEigenVal(view.left, 3)
+        strongest = cv2.dilate(strength, np.ones((2 * APART_PX - 1, 2 * APART_PX - 1), np.uint8))
+        v, u = np.nonzero((strength == strongest) & (strength > MIN_CORNER))
+        if len(u) == 0:
+            return np.zeros((0, 2)), np.zeros(0, bool)
+        uv = np.column_stack([u, v]).astype(np.float64)
+        uv = uv[spread(uv.astype(np.float32), strength[v, u], CELL_PX, CORNERS)]
         around = np.ones((5, 5), np.uint8)
         nearest = self._camera.at(cv2.dilate(view.disparity, around), uv)
         farthest = self._camera.at(cv2.erode(view.disparity, around), uv)
-        return uv[(farthest > 0) & (nearest - farthest < 2 * TOLERANCE_PX)]
+        uv = uv[(farthest > 0) & (nearest - farthest < 2 * TOLERANCE_PX)]
+        return uv, self._camera.at(strength, uv) > SURE_CORNER
 
     def _compare(
         self, now: FlowView, then: FlowView, uv: Array
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which corners (N, 2) are found in an earlier image, and which of them are not
-        where they would be if they stood still.
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which corners (N, 2) are found in an earlier image, which of them are not where
+        they would be if they stood still, and which moved already in that image.
         """
         disparity = self._camera.at(now.disparity, uv)
         T_then_now = invert(then.T_odom_camera) @ now.T_odom_camera
@@ -122,7 +143,11 @@ class SceneFlow:
             for step in (0.0, -TOLERANCE_PX, TOLERANCE_PX)
         )
         back, returned = _follow(now.left, then.left, uv, nominal[:, :2])
-        found = (np.hypot(*(returned - uv).T) < MAX_RETURN_PX) & (nominal[:, 2] > 0)
+        followed = np.hypot(*(returned - uv).T) < MAX_RETURN_PX
+        moved_then = np.zeros(len(uv), bool)
+        if then.moving is not None:
+            moved_then = followed & (self._camera.at(then.moving, back) > 0)
+        found = followed & (nominal[:, 2] > 0)
         found &= self._camera.contains(back) & self._camera.contains(nominal[:, :2])
         found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(MAX_ZOOM)
         found &= np.hypot(*(nominal[:, :2] - uv).T) < MAX_SHIFT_PX
@@ -130,7 +155,7 @@ class SceneFlow:
         differs = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) > FLOW_TOLERANCE_PX
         tolerance = TOLERANCE_PX * (1 + (nominal[:, 2] / np.maximum(disparity, 0.1)) ** 2)
         differs |= (there > 0) & (np.abs(there - nominal[:, 2]) > tolerance)
-        return found, differs
+        return found, differs, moved_then
 
 
 def _follow(

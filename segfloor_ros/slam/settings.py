@@ -16,60 +16,44 @@ class StereoSlamSettings(StageSettings):
     camera_height_m: float = setting(
         NAN,
         'Height of the left camera above the floor; not a number: measured from the floor seen.',
-        unit='m',
-        minimum=0.02,
-        maximum=10.0,
+        within=(0.02, 10.0),
     )
     camera_pitch_rad: float = setting(
         NAN,
         'Pitch of the camera, positive looks down; not a number: measured from the floor seen.',
-        unit='rad',
-        minimum=-1.4,
-        maximum=1.4,
+        within=(-1.4, 1.4),
     )
     camera_roll_rad: float = setting(
         NAN,
         'Roll of the camera, positive to its right; not a number: measured from the floor seen.',
-        unit='rad',
-        minimum=-0.8,
-        maximum=0.8,
+        within=(-0.8, 0.8),
     )
     camera_forward_m: float = setting(
         0.0,
         'Left camera ahead of the base.',
-        unit='m',
-        minimum=-10.0,
-        maximum=10.0,
+        within=(-10.0, 10.0),
     )
     camera_left_m: float = setting(
         0.0,
         'Left camera to the left of the middle of the base.',
-        unit='m',
-        minimum=-10.0,
-        maximum=10.0,
+        within=(-10.0, 10.0),
     )
-    num_features: int = setting(
-        1000, 'Features per image, spread over it.', minimum=200, maximum=10000
-    )
+    num_features: int = setting(1000, 'Features per image, spread over it.', within=(200, 10000))
     fast_threshold: int = setting(
         7,
         'Contrast of the weakest corner; low, so that plain floors get their share.',
         unit='grey levels',
-        minimum=2,
-        maximum=60,
+        within=(2, 60),
     )
     tracked_points: int = setting(
         400,
         'Map points, spread over the image, that are measured in a frame between keyframes.',
-        minimum=50,
-        maximum=5000,
+        within=(50, 5000),
     )
     max_speed_mps: float = setting(
         40.0,
         'A motion faster than this is implausible and ends tracking.',
-        unit='m/s',
-        minimum=0.1,
-        maximum=100.0,
+        within=(0.1, 100.0),
     )
     level_ground: bool = setting(
         False,
@@ -80,37 +64,29 @@ class StereoSlamSettings(StageSettings):
     mask_dilation_px: int = setting(
         5,
         'A mask of moving things (`dynamic_mask`, `--masks`) is widened by this much.',
-        unit='px',
-        minimum=0,
-        maximum=100,
+        within=(0, 100),
     )
     keyframe_max_frames: int = setting(
-        30, 'A new keyframe is due after this many frames (condition A1).', minimum=1, maximum=1000
+        30, 'A new keyframe is due after this many frames (condition A1).', within=(1, 1000)
     )
     keyframe_min_frames: int = setting(
         3,
         'Frames between keyframes while the mapper is idle (condition A2).',
-        minimum=1,
-        maximum=1000,
+        within=(1, 1000),
     )
     keyframe_motion_ratio: float = setting(
         0.04,
         'Motion since the last keyframe that makes a view new: as a fraction of the median depth.',
-        minimum=0.001,
-        maximum=1.0,
+        within=(0.001, 1.0),
     )
     keyframe_turn_rad: float = setting(
         0.06,
         'Rotation since the last keyframe that makes a view new.',
-        unit='rad',
-        minimum=0.005,
-        maximum=1.0,
+        within=(0.005, 1.0),
     )
     disparity_offset_sigma_px: float = setting(
         0.1,
         'Error that all disparities may share where the rectification is imperfect; it is '
         'estimated while driving. 0: disparities are taken as they are.',
-        unit='px',
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
     )

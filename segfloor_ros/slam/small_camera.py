@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +44,7 @@ class SmallCamera:
         at = np.rint(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0))
         return np.asarray((at >= 0).all(axis=1) & (at < self.size).all(axis=1))
 
-    def at(self, image: NDArray[np.floating], uv: Array) -> Array:
+    def at(self, image: NDArray[Any], uv: Array) -> Array:
         """Return the values (N,) of an image (h, w) at pixels (N, 2), 0 outside."""
         inside = self.contains(uv)
         u, v = np.where(inside[:, None], np.rint(uv), 0).astype(np.intp).T

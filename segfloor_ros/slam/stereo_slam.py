@@ -19,22 +19,27 @@ from segfloor_ros.slam.held_results import HeldResults
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.loops import Candidate
-from segfloor_ros.slam.map_arrays import fill_map, map_to_arrays
 from segfloor_ros.slam.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.mount_meter import MountMeter
 from segfloor_ros.slam.patch_alignment import sample_patches
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.snapshot import take_snapshot
+from segfloor_ros.slam.snapshot import in_joined_map, take_snapshot
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.track import Track
 from segfloor_ros.timing import StageTimes
 
-START_NS, RESUMING_NS = 1_000_000_000, 5_000_000_000
-"""For how long a drive, new or going on, is looked for in the map that was loaded."""
+START_NS, RESUMING_NS, LOST_NS = 1_000_000_000, 5_000_000_000, 1_500_000_000
+"""For how long the camera is looked for in the map: of a new drive in the map that was loaded, of
+one that goes on after a pause, and of one that got lost. After that it maps on its own.
+"""
 
 UNKNOWN_COVARIANCE = 1e6
 NOTHING_SEEN = 'too few known points in view'
+MAPPED_APART = ', mapped before the map was recognised'
+NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
+UNSURE_M = 0.005
+"""A place that the images leave more uncertain than this is said to be."""
 
 
 class StereoSlam:
@@ -67,9 +72,9 @@ class StereoSlam:
         self._back_end = BackEnd(camera, settings, self.map, self._front_end, background)
         self._held = HeldResults()
         self._moving = MotionSearch(camera) if settings.detect_moving else None
-        self._not_found_yet: Arrays | None = None
-        self._first_ns: int | None = None
-        self._patience_ns = START_NS
+        self._lost_ns: int | None = None
+        self._patience_ns = LOST_NS
+        self._is_shown = True
 
     @property
     def disparity_offset_px(self) -> float:
@@ -93,10 +98,13 @@ class StereoSlam:
 
     @property
     def is_in_loaded_map(self) -> bool:
-        """Whether the drive goes on in the map that was loaded, not in one of its own; also where
-        none was loaded.
-        """
-        return self._back_end.is_joined
+        """Whether the drive has been found in the map that was loaded, or none was loaded."""
+        return self._is_shown or not self._back_end.is_apart
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether the camera maps on its own since it got lost: its results are held back."""
+        return self._is_shown and self._back_end.is_apart
 
     @property
     def is_adjusting(self) -> bool:
@@ -113,7 +121,7 @@ class StereoSlam:
         """The newest pose while the mount is being measured, by the mount as it seems so far; None
         before the first frame, and once `process` returns results.
         """
-        if self._mount_meter is None:
+        if self.mount is not None or self._mount_meter is None:
             return None
         return self._held.newest(self._mount_meter.provisional)
 
@@ -134,10 +142,11 @@ class StereoSlam:
                 self._front_end.track(frame, images) if self.map.keyframes and not fault else None
             )
             if track is not None:
-                self._not_found_yet = None
+                self._lost_ns, self._patience_ns = None, LOST_NS
+                self._is_shown |= not self._back_end.is_apart
             elif self.map.keyframes:
                 self._front_end.bridge(frame, fault)
-                self._map_apart(frame.stamp_ns)
+                self._search_on(frame, images, fault)
         is_wanted = not fault and self._wants_keyframe(track)
         searched = None
         if self._moving is not None and self._moving.is_due(is_wanted, track is not None):
@@ -156,12 +165,21 @@ class StereoSlam:
         result = self._result(frame, track, fault, keyframe)
         if searched is not None:
             result = replace(result, moving=searched.points)
-        return self._held.release(result, self.mount)
+        self._held.add(result)
+        return [] if self.is_apart else self._held.release(self.mount)
+
+    def finish(self) -> list[FrameResult]:
+        """Return the results that are still held back after the last frame: as lost, for no place
+        of the map was recognised since.
+        """
+        if self.is_apart:
+            self._give_up_part()
+        return self._held.release(self.mount)
 
     def to_arrays(self) -> Arrays:
-        """Return the map, for a file."""
+        """Return the map, for a file; without a part that is apart from it."""
         self._take_adjustment(wait=True)
-        return map_to_arrays(self.map) | self._back_end.to_arrays()
+        return self._back_end.to_arrays(of_known=self._is_shown)
 
     def load(
         self, arrays: Arrays, mount: Mount, localize: bool, T_world_odom: Array | None = None
@@ -170,10 +188,9 @@ class StereoSlam:
         map stays as it is. T_world_odom: (4, 4), where the drive that made the map goes on. Raises
         KeyError or ValueError for arrays that are no map.
         """
-        fill_map(self.map, arrays)
         self._back_end.from_arrays(arrays)
         self.mount, self._front_end.is_fixed = mount, localize
-        self._not_found_yet = None if localize else arrays
+        self._is_shown = False
         self._patience_ns = START_NS if T_world_odom is None else RESUMING_NS
         self._front_end.start_lost(T_world_odom)
 
@@ -184,31 +201,66 @@ class StereoSlam:
         assert self.mount is not None
         T_left_base = invert(self.mount.T_base_left)
         T_world_camera = T_left_base @ T_map_base @ self.mount.T_base_left
+        if self.is_apart:
+            self._give_up_part()
         self._front_end.search_near(T_world_camera, reach_m, reach_rad)
 
     def close(self) -> None:
         """End the background threads, if there are any."""
         self._back_end.close()
 
-    def _map_apart(self, stamp_ns: int) -> None:
-        """Map on its own where the camera is not found in the map that was loaded."""
-        known = self._not_found_yet
-        if known is None:
+    def _search_on(self, frame: StereoFrame, images: Images, fault: str) -> None:
+        """Map on its own where the camera was looked for in vain for some time; or where it did so
+        before and is lost again, look for it in the known map.
+        """
+        front_end = self._front_end
+        if fault or not front_end.is_searching or self.mount is None:
+            self._lost_ns = None
             return
-        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
-        if stamp_ns - self._first_ns < self._patience_ns:
-            return
-        self._not_found_yet = None
-        self._back_end.map_apart(known)
-        self._front_end.reset()
-        self._body.reset_world()
+        self._lost_ns = frame.stamp_ns if self._lost_ns is None else self._lost_ns
+        is_long = frame.stamp_ns - self._lost_ns >= self._patience_ns
+        if self.is_apart:
+            features = front_end.extractor.extract(frame.left, images.excluded)
+            if is_long or self._back_end.sees_known(images, features):
+                self._give_up_part()
+        elif is_long and not (front_end.is_fixed or self._back_end.is_apart):
+            self._map_apart()
+
+    def _map_apart(self) -> None:
+        """Begin another part of the map: where the camera seems to be, or at the origin, where this
+        is all there is of the drive.
+        """
+        self._lost_ns = None
+        self._take_adjustment(wait=True)
+        self._back_end.map_apart()
+        if not self._is_shown:
+            self._front_end.motion.reset()
+            self._body.reset_world()
+        self._front_end.leave_map()
+        self._forget_views()
+
+    def _give_up_part(self) -> None:
+        """Look for the camera in the known map again; what was mapped beside it is lost."""
+        self._lost_ns = None
+        self._take_adjustment(wait=True)
+        self._back_end.give_up_part()
+        self._front_end.leave_map()
+        self._forget_views()
+        self._held.change(_lost)
+
+    def _forget_views(self) -> None:
+        """Look for what moves by what is seen from now on: earlier poses are of another world."""
+        self._moving = MotionSearch(self._camera) if self._moving is not None else None
 
     def _wants_keyframe(self, track: Track | None) -> bool:
         front_end, back_end = self._front_end, self._back_end
+        most = self._settings.keyframe_max_frames // 3
         if front_end.is_fixed or not back_end.takes_keyframes:
             return False
         if track is None:
             return not self.map.keyframes or front_end.is_new_place()
+        if front_end.is_poor and front_end.frames_since_keyframe < most:
+            return False
         return front_end.local.wants_keyframe(track, front_end.frames_since_keyframe, back_end.idle)
 
     def _add_keyframe(
@@ -243,8 +295,9 @@ class StereoSlam:
         self._follow_map(partial(self._back_end.take_in, keyframe, images, self.mount, up))
         if self.map.keyframes[-1] is not keyframe:  # it has become part of the loaded map
             keyframe = self.map.keyframes[-1]
-            self._moving = MotionSearch(self._camera) if self._moving is not None else None
+            self._forget_views()
             self._body.reset_world()
+            self._held.change(in_joined_map(self.map, self.T_world_odom))
         self._front_end.continue_from(images, keyframe)
         self._measure_mount(frame, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
@@ -273,9 +326,13 @@ class StereoSlam:
     ) -> FrameResult:
         """Return the outcome of a frame in optical axes."""
         motion, why = self._front_end.motion, fault or NOTHING_SEEN
+        sigma_m = self._front_end.seen_sigma_m
+        unsure = f'what is seen leaves the place uncertain by {1000 * sigma_m:.0f} mm'
         tracked = track is not None or keyframe is not None or motion.is_blind
         state = f'on {motion.carried_by}: {why}' if motion.is_blind else 'tracking'
-        state += '' if self._back_end.is_joined else ', outside the loaded map'
+        state += f': {unsure}' if sigma_m > UNSURE_M and not motion.is_blind else ''
+        if self._back_end.is_apart:
+            state += MAPPED_APART if self._is_shown else ', outside the loaded map'
         unknown: Array = np.eye(6) * UNKNOWN_COVARIANCE
         return FrameResult(
             frame.index,
@@ -289,4 +346,18 @@ class StereoSlam:
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
             keyframe,
             blind=motion.is_blind,
+            apart=self.is_apart,
         )
+
+
+def _lost(result: FrameResult) -> FrameResult:
+    """Return what is left of a frame where the map was, in the end, not recognised."""
+    return replace(
+        result,
+        tracked=False,
+        covariance=np.eye(6) * UNKNOWN_COVARIANCE,
+        state=f'lost: {NOT_RECOGNISED}',
+        keyframe=None,
+        moving=None,
+        blind=False,
+    )

@@ -99,9 +99,11 @@ class Tracker:
         T_camera_world: Array,
         offset_px: float = 0.0,
         known: PoseEstimate | None = None,
+        is_given: bool = False,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
-        `track` for the rest. known: the pose as the same images told it before.
+        `track` for the rest. known: the pose as the same images told it before; or, with is_given,
+        where the camera is, and only its points are looked for.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -116,8 +118,10 @@ class Tracker:
         guess_px = seen.uvd_px[points, 2] + offset_px
         measure_disparity(images, observations, rows, guess_px)
         measured = observations.take(rows).without_offset(offset_px)
-        found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
-        if not self._agree(found):
+        found = None
+        if not is_given:
+            found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
+        if found is None or not self._agree(found):
             if known is None:
                 return None
             found = self._consensus.at(known, sparse_map, ids, measured)

@@ -119,10 +119,11 @@ def test_wheels_alone_bridge_as_well(frames):
     assert errors_m(results).max() < 0.03
 
 
-def test_a_gyroscope_alone_bridges_a_second_and_no_more(frames):
+def test_a_gyroscope_alone_bridges_a_second(frames):
     _, results = drive(frames, imu_samples())
-    assert [r.index for r in results if not r.tracked][:4] == [20, 21, 22, 23]
     assert results[19].tracked and results[19].state.startswith('on gyroscope')
+    sigma_m = np.sqrt(np.diag(results[19].covariance)[:3].max())
+    assert sigma_m > 2 * errors_m(results)[19] and sigma_m > 0.1
 
 
 def test_wheels_that_slip_while_the_camera_sees_are_found_out_and_cost_nothing(frames):

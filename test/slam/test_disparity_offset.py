@@ -17,6 +17,8 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 FRAMES, TURNED_FRAMES = 40, 21
+BENT = {'textured': (0, 60.0, 0.25), 'weaker texture, bent the other way': (5, 35.0, -0.25)}
+"""Seed and contrast of a room, and the offset of the rig in it."""
 
 
 def with_offset(problem, offset_px):
@@ -85,9 +87,9 @@ def test_the_filter_never_runs_away_nor_grows_sure():
 
 
 @cache
-def frames(step_m, step_rad, offset_px):
+def frames(step_m, step_rad, offset_px, seed, contrast):
     """Return the frames of a drive whose right image is shifted so that disparities are off."""
-    room = StereoRoom()
+    room = StereoRoom(seed, contrast)
     shifted = replace(CAMERA, cx=CAMERA.cx - offset_px)
     right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
     seen = []
@@ -98,10 +100,11 @@ def frames(step_m, step_rad, offset_px):
     return seen
 
 
-def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, **settings):
+def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, seed=0, contrast=60.0, **settings):
     """Drive through the room, straight ahead if not told otherwise."""
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800, **settings), MOUNT)
-    results = [slam.process(frame)[0] for frame in frames(step_m, step_rad, offset_px)]
+    seen = frames(step_m, step_rad, offset_px, seed, contrast)
+    results = [slam.process(frame)[0] for frame in seen]
     return slam, results
 
 
@@ -110,10 +113,12 @@ def length(results):
     return float(np.linalg.norm(last[:3, 3]))
 
 
-def test_a_bent_rig_is_found_and_its_distances_put_right():
-    slam, results = room_drive(0.25)
-    switched_off, believed = room_drive(0.25, disparity_offset_sigma_px=0.0)
-    assert slam.disparity_offset_px == pytest.approx(0.25, abs=0.1)
+@pytest.mark.parametrize(('seed', 'contrast', 'offset_px'), BENT.values(), ids=BENT)
+def test_a_bent_rig_is_found_and_its_distances_put_right(seed, contrast, offset_px):
+    room = {'seed': seed, 'contrast': contrast}
+    slam, results = room_drive(offset_px, **room)
+    switched_off, believed = room_drive(offset_px, disparity_offset_sigma_px=0.0, **room)
+    assert slam.disparity_offset_px == pytest.approx(offset_px, abs=0.1)
     assert switched_off.disparity_offset_px == 0.0
     assert abs(length(results) - 1.95) < 0.5 * abs(length(believed) - 1.95)
 

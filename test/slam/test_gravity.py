@@ -17,6 +17,7 @@ UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 
 BIAS = np.array([0.06, -0.04, 0.08])
 RATE_HZ = 200
+BESIDE = (0.2, 0.05, -0.3)
 
 
 def pose(t, turns):
@@ -27,19 +28,21 @@ def pose(t, turns):
     return make_transform(R, 0.3 * (1 - np.cos(1.5 * t)) * forward)
 
 
-def felt(t, turns, bias=BIAS):
-    h = 1e-3
-    before, now, after = (pose(t + d, turns) for d in (-h, 0.0, h))
+def felt(t, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
+    """Return what an IMU at a place on the camera feels."""
+    h, beside = 1e-3, make_transform(np.eye(3), np.array(place_m))
+    before, now, after = (pose(t + d, turns) @ beside for d in (-h, 0.0, h))
     turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec() / (2 * h)
     accel = (after[:3, 3] - 2 * now[:3, 3] + before[:3, 3]) / h**2
-    return ImuSample(round(t * 1e9), turn, now[:3, :3].T @ (accel + 9.81 * UP) + bias)
+    lifted = now[:3, :3].T @ (accel + 9.81 * UP) + bias
+    return ImuSample(round(t * 1e9), turn, lifted, beside[:3, 3])
 
 
-def driven(seconds, turns, bias=BIAS):
+def driven(seconds, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
     gyroscope = Gyroscope()
     gravity = Gravity(gyroscope)
     for k in range(round(seconds * RATE_HZ) + 1):
-        gyroscope.add(felt(k / RATE_HZ, turns, bias))
+        gyroscope.add(felt(k / RATE_HZ, turns, bias, place_m))
         if k % 20 == 0:
             gravity.see(round(k / RATE_HZ * 1e9), pose(k / RATE_HZ, turns), np.eye(3))
     return gravity
@@ -60,6 +63,14 @@ def test_the_bias_is_told_from_gravity_where_the_camera_turns():
     assert degrees_between(straight.direction, UP) > 0.3
     assert degrees_between(turning.direction, UP) < 0.15
     assert turning.sigma_rad < 0.5 * straight.sigma_rad
+
+
+def test_an_imu_beside_the_camera_feels_its_own_circle_which_is_not_taken_for_gravity():
+    beside, at_camera = (
+        driven(20.0, True, place_m=place).up_world for place in (BESIDE, (0, 0, 0))
+    )
+    assert degrees_between(beside.direction, UP) < 0.15
+    assert beside.sigma_rad == pytest.approx(at_camera.sigma_rad, rel=0.1)
 
 
 def test_nothing_is_told_before_enough_was_felt_or_without_an_imu():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_mapping import CAMERA, POINTS, seen
+from test_mapping import CAMERA, SCENES, seen
 from test_places import row_of_views
 from test_sparse_map import add, keyframe
 
@@ -17,6 +17,7 @@ from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sparse_map import SparseMap
 
 MOUNT = Mount(0.4, 0.15)
+POINTS, _ = SCENES['wall']
 ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
 
@@ -27,7 +28,7 @@ def objection(centre, drift, own=ROWS, apart=0.0):
     further away than these the place's points are.
     """
     sparse_map = SparseMap()
-    add(sparse_map, seen(0, [NO_POINT] * len(POINTS), 15.0), ROWS, POINTS)
+    add(sparse_map, seen(POINTS, 0, [NO_POINT] * len(POINTS)), ROWS, POINTS)
     centre, drift = np.array(centre), np.array(drift)
     now = keyframe(1, [NO_POINT] * len(POINTS))
     uvd = CAMERA.project(POINTS - centre)

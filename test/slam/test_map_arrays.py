@@ -110,6 +110,31 @@ def test_another_room_is_not_this_one(mapped):
         assert result.covariance[0, 0] > 1e3
 
 
+def test_frames_in_a_row_must_find_who_is_lost(mapped):
+    slam = loaded(mapped, localize=True)
+    here, other = there(25)[10], StereoRoom(seed=77)
+    rooms = [ROOM, other, ROOM, other, ROOM, ROOM, ROOM]
+    tracked = [slam.process(room.frame(k, here))[0].tracked for k, room in enumerate(rooms)]
+    assert tracked == [False] * 5 + [True] * 2
+
+
+def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch):
+    slam = loaded(mapped, localize=False, ends_ns=None)
+    here, other = there(25)[-1], StereoRoom(seed=77)
+    assert slam.process(ROOM.frame(30, here))[0].tracked
+    monkeypatch.setattr('segfloor_ros.slam.front_end.RECOVERY_RATIO', 1.0)  # the whole map alone
+    monkeypatch.setattr('segfloor_ros.slam.relocalisation.MIN_AGREEMENT', 1.01)
+    assert not slam.process(other.frame(31, here))[0].tracked
+    assert slam.process(ROOM.frame(32, here))[0].tracked
+
+
+def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkeypatch):
+    monkeypatch.setattr('segfloor_ros.slam.relocalisation.MIN_AGREEMENT', 1.01)
+    slam = loaded(mapped, localize=True)
+    results = [slam.process(ROOM.frame(k, there(25)[10]))[0] for k in range(5)]
+    assert not any(result.tracked for result in results)
+
+
 def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
     mapped._front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
     slam = loaded(mapped, localize=False, ends_ns=None)

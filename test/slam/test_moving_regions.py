@@ -7,6 +7,7 @@ import pytest
 from stereo_room import CAMERA
 
 from segfloor_ros.slam.moving_regions import MovingRegions
+from segfloor_ros.slam.scene_flow import FlowVotes
 
 FACTOR = 2
 """The images are twice as wide as those that are searched."""
@@ -62,6 +63,23 @@ def test_a_pattern_that_repeats_does_not_move(regions):
     tile = noise(round(FACTOR * (NEARER_PX - WALL_PX)))
     inside, _ = found_share(regions, np.tile(tile, 40)[:, :600], NEARER_PX)
     assert inside == 0
+
+
+def test_a_thing_of_which_most_corners_moved_moves_as_a_whole_where_it_stood_before():
+    made = MovingRegions(CAMERA)
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:100] = NEARER_PX
+    for _ in range(5):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), seen)
+    made.measure(*pair(noise(600), NEARER_PX))
+    moving, still = np.zeros(seen.shape, np.uint8), np.zeros(seen.shape, np.uint8)
+    moving[50:60, 75:85] = still[50:60, 120:130] = 1
+    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
+    assert (found[30:90, 64:96] > 0).mean() > 0.95
+    assert not found[:, 110:].any()
+    still[25:45, 62:98] = 1
+    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
+    assert (found[30:90, 64:96] > 0).mean() < 0.2
 
 
 def test_a_strip_no_wider_than_a_block_does_not_move(regions):

@@ -68,16 +68,17 @@ def test_a_retired_keyframe_keeps_its_place_beside_the_one_it_follows():
     assert 1 not in order and 2 not in order
 
 
-def test_driving_to_and_fro_makes_its_views_once():
-    room = StereoRoom()
-    x = np.concatenate([np.arange(0, 12), np.arange(12, 0, -1)])
+@pytest.mark.parametrize(('seed', 'contrast', 'turn_rad'), [(0, 60.0, 0.0), (9, 35.0, 0.02)])
+def test_driving_to_and_fro_makes_its_views_once(seed, contrast, turn_rad):
+    room = StereoRoom(seed, contrast)
+    x = np.concatenate([np.arange(0, 10), np.arange(10, 0, -1)])
     images = {}
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
     stamps, views_per_turn = [], []
-    for k in range(4 * len(x)):
+    for k in range(3 * len(x)):
         at = int(x[k % len(x)])
         if at not in images:
-            images[at] = room.frame(0, planar_pose(0.05 * at, 0.0, 0.0))
+            images[at] = room.frame(0, planar_pose(0.06 * at, 0.0, turn_rad * at))
         frame = StereoFrame(k, k * 100_000_000, images[at].left, images[at].right)
         result = slam.process(frame)[0]
         assert result.tracked

@@ -1,5 +1,7 @@
 """Corners followed back to earlier images."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from stereo_room import CAMERA
@@ -39,7 +41,9 @@ def view(index: int, thing_at_px: int = 0, wall_at_px: int = 0, x_m: float = 0.0
 
 def votes(*views: FlowView) -> FlowVotes:
     flow = SceneFlow(SMALL)
-    return [flow.see(v) for v in views][-1]
+    for v in views[:-1]:
+        flow.remember(v)
+    return flow.votes(views[-1])
 
 
 def shift_px(disparity: float, x_m: float) -> int:
@@ -78,3 +82,14 @@ def test_where_everything_seems_to_move_nothing_does():
     first, second = view(0), view(1)
     lifted = FlowView(second.stamp_ns, second.left, second.disparity, wrong)
     assert not votes(first, lifted).moving.any()
+
+
+def test_where_the_pose_is_in_doubt_what_moved_still_does():
+    wrong: Array = make_transform(np.eye(3), np.array([0.0, 0.15, 0.0]))
+    first, second = view(0), view(1, thing_at_px=5)
+    moving = np.zeros(first.left.shape, np.uint8)
+    moving[THING] = 255
+    lifted = replace(second, T_odom_camera=wrong)
+    found = votes(replace(first, moving=moving), lifted)
+    assert share(found.moving, slice(65, 95)) > 0.1
+    assert not found.moving[:, 100:].any()

@@ -1,0 +1,106 @@
+"""A camera that got lost, maps on its own, and recognises the map again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.geometry import invert
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+SETTINGS = StereoSlamSettings(num_features=600)
+ROOM = StereoRoom()
+KNOWN = [planar_pose(0.04 * k, 0.0, 0.03 * k) for k in range(20)]
+BEHIND = [planar_pose(0.0, 0.06 * min(k, 5), 2.6) for k in range(24)]
+"""Away from what is known, for longer than the camera is looked for there."""
+
+TURN = [planar_pose(0.02 * k, 0.3, 2.6 - 0.11 * k) for k in range(25)]
+ON = [planar_pose(0.5 + 0.03 * k, 0.3 - 0.02 * k, -0.1 + 0.03 * k) for k in range(10)]
+
+
+def drive(slam, poses, first=0, room=ROOM):
+    """Return what comes of each frame, a list of results each."""
+    return [slam.process(room.frame(first + k, pose)) for k, pose in enumerate(poses)]
+
+
+def errors(results, poses):
+    """Return the errors in metres of results, by the true poses of all frames."""
+    apart = [invert(poses[r.index]) @ r.T_map_odom @ r.T_odom_base for r in results]
+    return np.linalg.norm(np.array(apart)[:, :3, 3], axis=1)
+
+
+@pytest.fixture(scope='module')
+def joined():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    return slam, drive(slam, KNOWN + BEHIND + TURN + ON), KNOWN + BEHIND + TURN + ON
+
+
+def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(joined):
+    slam, batches, poses = joined
+    sizes = [len(batch) for batch in batches]
+    held = sizes.index(0)
+    at = held + np.argmax(np.array(sizes[held:]) > 0)
+    assert len(KNOWN) + 10 < held < len(KNOWN) + 20
+    assert sizes[at] == at - held + 1 > 20
+    assert sizes[at + 1 :] == [1] * (len(sizes) - at - 1)
+    results = [r for batch in batches for r in batch]
+    assert [r.index for r in results] == list(range(len(poses)))
+    lost = [r.index for r in results if not r.tracked]
+    assert lost == list(range(len(KNOWN), held))
+    assert errors(batches[at] + batches[-1], poses).max() < 0.04
+    assert not slam.is_apart
+
+
+def test_keyframes_that_were_mapped_apart_are_told_in_the_map(joined):
+    _, batches, poses = joined
+    batch = max(batches, key=len)
+    keyframes = [r.keyframe for r in batch if r.keyframe]
+    assert len(keyframes) > 4
+    for keyframe in keyframes:
+        assert keyframe.path.stamp_ns[-1] == keyframe.stamp_ns
+        assert keyframe.path.stamp_ns[0] == 0
+        np.testing.assert_allclose(keyframe.T_map_base, poses[keyframe.frame_index], atol=0.04)
+        np.testing.assert_array_equal(keyframe.path.T_map_base[-1], keyframe.T_map_base)
+        known = keyframe.features.point_id >= 0
+        assert known.sum() > 50
+        row = np.searchsorted(keyframe.cloud.point_id, keyframe.features.point_id[known])
+        xyz = keyframe.features.xyz_map[known]
+        np.testing.assert_array_equal(keyframe.cloud.xyz_map[row], xyz)
+
+
+def test_the_odometry_goes_on_where_the_camera_got_lost(joined):
+    _, batches, _ = joined
+    odom = np.array([r.T_odom_base for batch in batches for r in batch if r.tracked])
+    assert np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1).max() < 0.1
+
+
+def test_a_part_that_is_never_recognised_is_no_part_of_the_map():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    drive(slam, KNOWN)
+    before = slam.to_arrays()
+    batches = drive(slam, KNOWN, len(KNOWN), StereoRoom(seed=77))
+    assert slam.is_apart and batches[-1] == []
+    np.testing.assert_array_equal(
+        slam.to_arrays()['keyframe_stamp_ns'], before['keyframe_stamp_ns']
+    )
+    rest = slam.finish()
+    assert rest and not any(r.tracked or r.keyframe for r in rest)
+    assert [r.index for r in rest][-1] == 2 * len(KNOWN) - 1
+    np.testing.assert_allclose(
+        [k.T_camera_world for k in slam.map.keyframes], before['keyframe_T_camera_world']
+    )
+
+
+def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    drive(slam, KNOWN)
+    drive(slam, KNOWN, 20, StereoRoom(seed=77))
+    batches = drive(slam, [KNOWN[10]] * 20, 40)
+    results = [r for batch in batches for r in batch]
+    assert results[-1].tracked and not slam.is_apart
+    assert errors(results[-1:], [KNOWN[10]] * 60).max() < 0.02
+    # It is not looked for in the part alone.
+    found = next(r.index for r in results if r.tracked)
+    assert found <= 40 + 5

@@ -1,0 +1,80 @@
+"""How well points tell the pose, in images drawn for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.slam.pose_information import pose_covariance
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+RNG = np.random.default_rng(3)
+V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
+MIDDLE = np.array([CAMERA.cx, CAMERA.cy])
+
+
+def noisy(image):
+    return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+
+def sigmas_m(image, uv_px, depth_m=2.0):
+    """Return the standard deviations of the place along x, y and z, of points in one plane."""
+    points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
+    return np.sqrt(np.diag(pose_covariance(CAMERA, image, uv_px, points)))[:3]
+
+
+def anywhere(count):
+    return RNG.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (count, 2))
+
+
+@pytest.mark.parametrize('contrast', [12, 30, 80])
+@pytest.mark.parametrize('slope', [0.0, 0.6, -1.3])
+def test_points_on_an_edge_tell_nothing_along_it(contrast, slope):
+    image = noisy(np.where(U - MIDDLE[0] > slope * (V - MIDDLE[1]), 100 + contrast, 100.0))
+    rows = np.arange(30, CAMERA.height - 30, 2)
+    on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
+    points = CAMERA.back_project(on_edge, np.full(len(rows), 2.0))
+    covariance = pose_covariance(CAMERA, image, on_edge, points)[:3, :3]
+    along = np.array([slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
+    assert np.sqrt(along @ covariance @ along) > 0.03
+
+
+def test_a_plain_face_tells_nothing():
+    assert sigmas_m(noisy(np.full(U.shape, 90.0)), anywhere(200)).min() > 0.1
+
+
+def test_corners_and_weak_textures_tell_the_place_to_millimetres():
+    corners = noisy(100 + 40.0 * ((U // 40 + V // 40) % 2))
+    columns, rows = (np.arange(40, n - 20, 40) - 0.5 for n in (CAMERA.width, CAMERA.height))
+    at = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    assert sigmas_m(corners, at).max() < 0.003
+    weak = noisy(100 + 6 * np.sin(U * 0.9) * np.sin(V * 1.1))
+    assert sigmas_m(weak, anywhere(100)).max() < 0.003
+
+
+def test_points_whose_patches_overlap_count_as_one():
+    texture = noisy(RNG.uniform(60, 160, U.shape))
+    places = anywhere(30)
+    once = sigmas_m(texture, places)
+    often = sigmas_m(texture, np.repeat(places, 10, axis=0) + RNG.uniform(-1, 1, (300, 2)))
+    np.testing.assert_allclose(often, once, rtol=0.3)
+
+
+def test_no_point_tells_nothing():
+    assert sigmas_m(noisy(np.full(U.shape, 90.0)), np.zeros((0, 2))).min() == pytest.approx(1.0)
+
+
+def test_a_pose_that_the_images_hardly_tell_is_said_to_be_uncertain(monkeypatch):
+    room = StereoRoom()
+    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
+    seen = [result.state for frame in frames[:2] for result in slam.process(frame)]
+    monkeypatch.setattr('segfloor_ros.slam.front_end.PLENTY', 10_000)
+    seen += [result.state for result in slam.process(frames[2])]
+    covariance = np.eye(6) * 0.02**2
+    monkeypatch.setattr('segfloor_ros.slam.front_end.pose_covariance', lambda *_: covariance)
+    seen += [result.state for result in slam.process(frames[3])]
+    assert seen[:3] == ['tracking'] * 3
+    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
