@@ -15,22 +15,18 @@ class CloudLabellingSettings(RobotSettings):
     height_sigma_m: float = setting(
         0.02,
         'Error of a point height close to the robot, one sigma.',
-        unit='m',
-        minimum=0.001,
-        maximum=0.5,
+        within=(0.001, 0.5),
         live=True,
     )
     max_mask_log_odds: float = setting(
         3.0,
         'Limit of the summed evidence of the mask, so that it can change its mind.',
-        minimum=0.1,
-        maximum=20.0,
+        within=(0.1, 20.0),
         live=True,
     )
     max_height_log_odds: float = setting(
         2.0,
         'Limit of the evidence of the height.',
-        minimum=0.0,
-        maximum=20.0,
+        within=(0.0, 20.0),
         live=True,
     )

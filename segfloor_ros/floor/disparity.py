@@ -159,10 +159,10 @@ class TwoScaleMatcher:
     """
 
     def __init__(self, num_disparities: int, settings: FloorSegmentationSettings) -> None:
-        fine = -(-math.ceil(settings.coarse_above_px) // STEP) * STEP + STEP
+        fine = math.ceil((settings.coarse_above_px + _OVERLAP_PX) / STEP) * STEP
         self._coarse: DisparityMatcher | None = None
         self.num_disparities = num_disparities
-        if fine < num_disparities:
+        if fine + STEP < num_disparities:
             halved = -(-num_disparities // (2 * STEP)) * STEP
             self._coarse = DisparityMatcher(halved, COARSE_BLOCK_PX, SPECKLE_PX // 4)
             self.num_disparities = 2 * self._coarse.num_disparities

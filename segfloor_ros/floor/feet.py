@@ -11,13 +11,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.floor.texture import MIN_TEXTURE_GREY, NOISE_TEXTURE, noise_grey, texture_grey
+from segfloor_ros.floor.texture import (
+    EDGE_SLOPE,
+    MIN_TEXTURE_GREY,
+    NOISE_TEXTURE,
+    noise_grey,
+    row_slope,
+    texture_grey,
+)
 
 COLUMN_STEP_PX = 2
 """Every other column is looked at."""
 _TEXTURE_WINDOW_PX = 11
-_EDGE_SLOPE = 24
-"""Sobel response of the weakest edge that counts: 3 grey levels per row."""
 _AROUND_ROWS = 15
 """An edge is the strongest of so many rows."""
 _BLANK_GAP, _BLANK_ROWS = 7, 12
@@ -38,10 +43,9 @@ def find_feet(
     image, disparity = left[:, ::COLUMN_STEP_PX], disparity_px[:, ::COLUMN_STEP_PX]
     enough = max(MIN_TEXTURE_GREY, NOISE_TEXTURE * noise_grey(left))
     texture = texture_grey(left, _TEXTURE_WINDOW_PX)[:, ::COLUMN_STEP_PX]
-    smooth = cv2.GaussianBlur(image, (3, 5), 0)
-    slope = np.abs(cv2.Sobel(smooth, cv2.CV_16S, 0, 1))
+    slope = row_slope(image)
     strongest = cv2.dilate(slope, np.ones((_AROUND_ROWS, 1), np.uint8))
-    foot = (slope == strongest) & (slope >= _EDGE_SLOPE)
+    foot = (slope == strongest) & (slope >= EDGE_SLOPE)
     foot &= _below((texture < 1.5 * enough).astype(np.float32))
     counted = ((disparity >= 1) & (texture > 2 * enough)).astype(np.float32)
     share = _mean_above(counted)

@@ -11,6 +11,7 @@ from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.pixel_evidence import Comparison
 from segfloor_ros.floor.profile import FloorProfile
 from segfloor_ros.floor.runs import Runs, pixels_where
+from segfloor_ros.floor.texture import EDGE_SLOPE
 from segfloor_ros.floor.view import FloorView
 
 _STEP_PX = 2
@@ -30,8 +31,6 @@ _HOLE_ROWS = 12
 _TEXTURED_SHARE = 0.7
 _UNMATCHED_PX = 12
 """So wide a strip at the border of what both cameras see may be without matches."""
-_EDGE_SLOPE = 24
-"""Sobel response of the weakest edge that counts: 3 grey levels per row."""
 
 
 def fill_regions(
@@ -78,7 +77,8 @@ def fill_regions(
     fill &= ~barred[part]
     mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
-    to_contact = fill_to_contact(view, mask, agreed & (slope < _STRONG_SLOPE), disparity, compared)
+    no_border = agreed & (slope < _STRONG_SLOPE)
+    to_contact = fill_to_contact(view, mask, no_border, disparity, compared, textured)
     return with_floor(mask, _enlarged(to_contact, mask))
 
 
@@ -143,7 +143,7 @@ def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.boo
     """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
     not lie beside floor that both cameras see: what stands there is taken to go on.
     """
-    floor_px = view.line.slope * (view.derolled - view.line.horizon)
+    floor_px = view.plane_px
     first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
     begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
     begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
@@ -225,9 +225,10 @@ def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def trim_to_edges(
-    mask: NDArray[np.uint8], image: NDArray[np.uint8], reach_px: int
+    mask: NDArray[np.uint8], slope: NDArray[np.int16], reach_px: int
 ) -> NDArray[np.uint8]:
     """Return the mask (R, W) without floor that only borrowed its texture from the floor below it.
+    slope: `row_slope` of the image (R, W).
 
     Texture is measured over a window, so below a blank wall floor reaches up to `reach_px` rows
     too high. There it is cut off at the strongest edge between the two, and where there is none,
@@ -242,11 +243,9 @@ def trim_to_edges(
     below_blank = cv2.dilate(nothing, upward, anchor=(0, reach_px)) & floor
     if not below_blank.any():
         return mask
-    smooth = cv2.GaussianBlur(image, (3, 5), 0)
-    slope = np.abs(cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE))
-    slope[below_blank == 0] = 0
+    slope = np.where(below_blank > 0, slope, np.int16(0))
     strongest = cv2.dilate(slope, np.ones((2 * reach_px + 1, 1), np.uint8))
-    edge = ((slope == strongest) & (slope >= _EDGE_SLOPE)).astype(np.uint8)
+    edge = ((slope == strongest) & (slope >= EDGE_SLOPE)).astype(np.uint8)
     under_edge = cv2.dilate(edge, upward, anchor=(0, reach_px))
     trimmed = mask.copy()
     trimmed[(below_blank > 0) & (under_edge == 0)] = NO_EVIDENCE

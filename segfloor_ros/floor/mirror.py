@@ -39,6 +39,8 @@ _TEXTURED = 0.5
 _ALIKE = 0.6
 """Normalized correlation of a patch with its mirror image."""
 _PATCH = np.stack(np.meshgrid(np.arange(-6.0, 7.0), np.arange(-3.0, 4.0)), -1).reshape(-1, 2)
+_OUTLINE = np.array([[0, 0], [-6, -3], [6, -3], [-6, 3], [6, 3]], np.float64)
+"""Middle and corners of a patch: where these are, all of it is."""
 _SMOOTH_PX = 1.0
 _MARGIN_PX = 2.0
 
@@ -127,44 +129,43 @@ def _tested_and_found(view: MirrorView, angles_height: Array, count: int) -> tup
     if len(chosen) == 0:
         return 0, 0
     chosen = chosen[:: max(1, len(chosen) // count)]
-    patch_px, depth_m = _patches(view, chosen)
-    mirrored = _reflected(view, patch_px, depth_m, angles_height)
-    ahead = mirrored[..., 2].min(axis=1) > 0.05
-    at = np.where(ahead[:, None, None], mirrored, 1.0)
-    at_px = camera.project(at.reshape(-1, 3))[:, :2].reshape(patch_px.shape)
+    outline, _ = _mirrored(view, chosen, _OUTLINE, angles_height)
+    ahead = outline[..., 2].min(axis=1) > 0.05
+    at = np.where(ahead[:, None, None], outline, 1.0)
+    at_px = camera.project(at.reshape(-1, 3))[:, :2].reshape((*at.shape[:2], 2))
     size = np.array([camera.width, camera.height]) - 1 - _MARGIN_PX
     inside = ahead & ((at_px > _MARGIN_PX) & (at_px < size)).all(axis=(1, 2))
-    patch_px, at_px = patch_px[inside], at_px[inside]
-    middle = len(_PATCH) // 2
-    expected = camera.disparity_times_depth / at[inside, middle, 2]
-    columns, rows = np.rint(at_px[:, middle]).astype(int).T
+    expected = camera.disparity_times_depth / at[inside, 0, 2]
+    columns, rows = np.rint(at_px[inside, 0]).astype(int).T
     seen = view.disparity_px[rows, columns]
     play = 1.5 + 0.05 * expected
     tested = (seen >= 1) & (seen < expected + play)
-    found = tested & (seen > expected - play) & (_alike(view.grey, patch_px, at_px) > _ALIKE)
+    fits = tested & (seen > expected - play)
+    if fits.sum() <= _QUICK_SHARE * tested.sum():
+        return int(tested.sum()), 0
+    mirrored, patch_px = _mirrored(view, chosen[inside][fits], _PATCH, angles_height)
+    to_px = camera.project(mirrored.reshape(-1, 3))[:, :2].reshape(patch_px.shape)
+    found = _alike(view.grey, patch_px, to_px) > _ALIKE
     return int(tested.sum()), int(found.sum())
 
 
-def _patches(view: MirrorView, chosen: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return pixels (N, P, 2) around the chosen samples and the depths (N,) of these in metres."""
-    rays = view.samples.rays[chosen] @ view.T_world_left[:3, :3]
-    pixels = view.camera.project(rays)[:, :2]
-    depth_m = view.samples.disparity_m / view.samples.disparity_px[chosen]
-    return pixels[:, None] + _PATCH, depth_m
-
-
-def _reflected(view: MirrorView, pixels: Array, depth_m: Array, angles_height: Array) -> Array:
-    """Return the mirror images (N, P, 3), in the camera's frame, of what is seen at pixels
-    (N, P, 2), the patches of which face the camera.
+def _mirrored(
+    view: MirrorView, chosen: NDArray[np.intp], offsets_px: Array, angles_height: Array
+) -> tuple[Array, Array]:
+    """Return the mirror images (N, P, 3), in the camera's frame, of what is seen around the chosen
+    samples (N,), as patches that face the camera, and their pixels (N, P, 2).
     """
+    camera, samples = view.camera, view.samples
+    R_world_left, position = view.T_world_left[:3, :3], view.T_world_left[:3, 3]
+    pixels = camera.project(samples.rays[chosen] @ R_world_left)[:, None, :2] + offsets_px
+    depth_m = samples.disparity_m / samples.disparity_px[chosen]
+    depths = np.repeat(depth_m, len(offsets_px))
     height = float(angles_height[2])
     normal = plane_of(angles_height) * height
-    R_world_left, position = view.T_world_left[:3, :3], view.T_world_left[:3, 3]
-    depths = np.repeat(depth_m, pixels.shape[1])
-    points = view.camera.back_project(pixels.reshape(-1, 2), depths)
+    points = camera.back_project(pixels.reshape(-1, 2), depths)
     points = points @ R_world_left.T + position
     points -= 2 * (points @ normal + height)[:, None] * normal
-    return ((points - position) @ R_world_left).reshape(*pixels.shape[:2], 3)
+    return ((points - position) @ R_world_left).reshape(*pixels.shape[:2], 3), pixels
 
 
 def _alike(grey: NDArray[np.float32], first: Array, second: Array) -> Array:

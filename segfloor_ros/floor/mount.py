@@ -57,6 +57,8 @@ _SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
+_MIRROR_FIRST, _MIRROR_EVERY = 3, 4
+"""A mirror is looked for in so many keyframes, and then in every so-manyth until one is found."""
 _NEARER = 0.8
 """A mirror at so much of the height of what looks like the floor lies clearly above it."""
 
@@ -154,8 +156,7 @@ class MountEstimator:
         fit = self._on_surfaces.find(self._frames, self._travel(), proposals, [])
         if fit is None:
             return
-        # Below the feet of things a mirror shows these things, not a blank floor.
-        if not self._feet or not self._fits:
+        if self._may_mirror():
             fit = self._mirror(fit) or fit
         self._fits.append(fit)
         if self._is_plain(fit):
@@ -166,6 +167,15 @@ class MountEstimator:
     @property
     def _frames(self) -> list[Samples]:
         return [view.samples for view in self._views]
+
+    def _may_mirror(self) -> bool:
+        """Tell whether to look for a mirror: that is slow, and most floors are none. Below the feet
+        of things a mirror shows these things, not a blank floor.
+        """
+        if len(self._fits) < _MIRROR_FIRST:
+            return not self._feet or not self._fits
+        found = any(fit.is_mirror for fit in self._fits)
+        return not self._feet and (found or len(self._fits) % _MIRROR_EVERY == 0)
 
     def _mirror(self, ordinary: PlaneFit) -> PlaneFit | None:
         """Return the plane that best mirrors what stands on it: of what is seen below it none

@@ -28,6 +28,8 @@ _MIN_ROWS = 16
 _BLOCK_PX = 3
 _SAME_SURFACE_SHARE = 0.06
 _TEXTURE_WINDOW_PX = 7
+_BOARD_SHARE = 0.04
+"""So much of a board must have texture of its own: its ends have."""
 
 
 class OverheadMatcher:
@@ -73,7 +75,8 @@ class OverheadMatcher:
             disparity = self._matcher.compute(halves[0], halves[1])
             # A slope along the row gets steeper as the image gets smaller.
             textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
-            telling = (disparity > 0) & textured & ~_fringes(disparity)
+            known = (disparity > 0) & ~_fringes(disparity)
+            telling = _with_boards(disparity, known, known & textured)
         else:
             disparity = shrunk(measured[first:last], size)
             telling = disparity > 0
@@ -93,6 +96,29 @@ class OverheadMatcher:
         height_m = in_base[:, 2]
         way = (height_m > settings.step_height_m) & (height_m < settings.robot_height_m)
         return in_base[way, :2].T.astype(np.float32)
+
+
+def _with_boards(
+    disparity: NDArray[np.float32], known: NDArray[np.bool_], telling: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return what tells (H, W) where to `telling` comes all of a board: above and below it
+    something farther is seen. known: where the disparity counts.
+
+    The edge and the grain of a board run along the rows and match anywhere. Its ends do not, and
+    the matching carries their disparity along the board.
+    """
+    near = disparity * np.float32(1 - _SAME_SURFACE_SHARE)
+    farther = np.where(disparity > 0, disparity, np.float32(np.inf))
+    board = known & (np.minimum.accumulate(farther, axis=0) < near)
+    board &= np.minimum.accumulate(farther[::-1], axis=0)[::-1] < near
+    for axis in (0, 1):
+        step = np.abs(np.diff(disparity, axis=axis, prepend=0))
+        board &= step <= _SAME_SURFACE_SHARE * np.maximum(disparity, 1)
+    count, label = cv2.connectedComponents(board.astype(np.uint8), connectivity=4)
+    size = np.bincount(label[board], minlength=count)
+    share = np.bincount(label[board & telling], minlength=count) / np.maximum(size, 1)
+    found: NDArray[np.bool_] = telling | (board & (share >= _BOARD_SHARE)[label])
+    return found
 
 
 def _fringes(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -80,10 +80,10 @@ class HeightTable:
 
 @dataclass(frozen=True)
 class Evidence:
-    """mask: (R, W) uint8. height_m: (R, W) float32 above the floor, NaN without a match."""
+    """mask: (R, W) uint8. above: (R, W) bool, what is matched above the floor."""
 
     mask: NDArray[np.uint8]
-    height_m: NDArray[np.float32]
+    above: NDArray[np.bool_]
 
 
 def judge(
@@ -118,7 +118,7 @@ def judge(
     low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    return Evidence(mask, height)
+    return Evidence(mask, height > 0)
 
 
 def _below_contact(

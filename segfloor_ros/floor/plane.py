@@ -37,8 +37,8 @@ _SWAY_M = 0.03
 @dataclass(frozen=True)
 class Samples:
     """Disparities of one frame: rays (N, 3) turned into the world, the camera's position (3,) in
-    the world in metres, disparities (N,) in pixels, weights (N,) in [0, 1]. disparity_m:
-    fx * baseline.
+    the world in metres, disparities (N,) in pixels, weights (N,) in [0, 1], times `every`.
+    disparity_m: fx * baseline.
     """
 
     rays: Array
@@ -48,12 +48,12 @@ class Samples:
     disparity_m: float
 
     def every(self, step: int) -> Samples:
-        """Return only one of every so many."""
+        """Return only one of every so many, which weighs as much as these."""
         return Samples(
             self.rays[::step],
             self.position_m,
             self.disparity_px[::step],
-            self.weight[::step],
+            self.weight[::step] * step,
             self.disparity_m,
         )
 

@@ -22,9 +22,10 @@ from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import Up
 
 _KEPT = 60
-_SCORED_EVERY = 5
-_SCORED = 200
-"""A few samples of each frame tell which guess is best; all of them refine it."""
+_SCORED, _REFINED = 6000, 60000
+"""So many samples of all frames together tell which guess is best, and refine it: neighbours err
+together.
+"""
 _LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
 """Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
 _FLOOR_SLOPE = math.radians(1.5)
@@ -59,8 +60,8 @@ class PlaneSearch:
         guesses = np.concatenate([with_known(self._guesses, self._known), fresh])
         if len(guesses) == 0:
             return None
-        total = np.sum([scores(_few(frame), guesses) for frame in frames], axis=0)
-        for frame in map(_few, contrary):
+        total = np.sum([scores(few, guesses) for few in _thinned(frames, _SCORED)], axis=0)
+        for frame in _thinned(contrary, _SCORED):
             total -= frame.weight @ on_and_below(frame, plane_of(guesses))[1]
         total = np.maximum(total, 0) * self._preference(guesses, travel)
         order = np.argsort(-total, kind='stable')[:_KEPT]
@@ -72,7 +73,8 @@ class PlaneSearch:
     def refined(self, frames: list[Samples], start: Array, travel: Array) -> PlaneFit:
         """Return the plane near `start`, (3,), that fits all samples best."""
         mean, sigma = self._prior(len(frames))
-        return refine(frames, start, self._known, travel, prior_sigma=sigma, prior_mean=mean)
+        some = _thinned(frames, _REFINED)
+        return refine(some, start, self._known, travel, prior_sigma=sigma, prior_mean=mean)
 
     def _preference(self, guesses: Array, travel: Array) -> Array:
         if self._up is None:
@@ -90,5 +92,7 @@ class PlaneSearch:
         return np.array([pitch, roll, 0.0]), np.array([sigma, sigma, np.inf])
 
 
-def _few(samples: Samples) -> Samples:
-    return samples.every(int(np.clip(len(samples.weight) // _SCORED, 1, _SCORED_EVERY)))
+def _thinned(frames: list[Samples], most: int) -> list[Samples]:
+    """Return frames with so many samples at most."""
+    step = math.ceil(sum(len(frame.weight) for frame in frames) / most)
+    return [frame.every(max(1, step)) for frame in frames]

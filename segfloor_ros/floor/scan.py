@@ -24,6 +24,8 @@ _CONTACT_ROWS = 2.5
 _FADING_ROWS = 1.5
 """So many rows are taken off where nothing shows why the floor ends."""
 _DIP_BEARINGS = 5
+_NARROW_M, _GAP_BEARINGS = 0.2, (5, 9, 17, 33)
+"""Gaps between things are closed up to this width, in these numbers of bearings."""
 _SPREAD = 0.06
 """What stands upright is measured within this share of its range."""
 _UPRIGHT_M = 0.08
@@ -79,10 +81,11 @@ class FloorScanner:
         floor: NDArray[np.bool_],
         shared: NDArray[np.bool_],
         upright_xy: NDArray[np.float32],
+        feet_xy: NDArray[np.float32],
         density: float,
     ) -> FloorScan:
-        """Return the scan of floor, (N,) at `cells_xy`, and of points that stand up, (2, M) in the
-        base's x-y plane.
+        """Return the scan of floor, (N,) at `cells_xy`, of points that stand up, (2, M) in the
+        base's x-y plane, and of the feet of what is blank, (2, F).
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
         what is tolerated, and never beyond the last floor that both cameras saw: at the image's
@@ -93,8 +96,12 @@ class FloorScanner:
         shape = (self._count, len(self._middle))
         floor, seen_by_both = floor.reshape(shape), (floor & shared).reshape(shape)
         upright_m = self._upright(self._polar_counts(upright_xy), density)
+        feet_m = self._feet(feet_xy)
+        # Both measure the same face equally well.
+        same = np.abs(upright_m - feet_m) < _SPREAD * feet_m
+        upright_m = np.where(same, 0.5 * (upright_m + feet_m), np.fmin(upright_m, feet_m))
         middle = self._middle
-        limit = np.where(np.isnan(upright_m), np.inf, upright_m)
+        limit = self._limit(upright_m)
         seen = floor & (middle < limit[:, None])
         # A dip of a few bearings in which nothing stands up is a hole in the mask, a spike is floor
         # that has crept up a blank wall.
@@ -117,6 +124,18 @@ class FloorScanner:
             upright_m.astype(np.float32),
             self._range_max_m,
         )
+
+    def _limit(self, upright_m: Array) -> Array:
+        """Return how far floor can be (N,) before what stands (N,): things and boards are seen in
+        part, and no robot fits through a narrow gap.
+        """
+        near = 1 / np.where(np.isnan(upright_m), np.inf, upright_m)
+        for bearings in _GAP_BEARINGS:
+            closed = grey_closing(near, size=(bearings,), mode='constant')
+            near = np.where(closed * _NARROW_M >= bearings * self._step, closed, near)
+        with np.errstate(divide='ignore'):
+            limit: Array = 1 / near
+        return limit
 
     def _tolerance(self, range_m: Array) -> Array:
         """Return how long a gap in the floor may be at a range."""
@@ -150,10 +169,10 @@ class FloorScanner:
         wide = camera.fx * self._step * density
         needed = np.maximum(2.0, 0.5 * wide * _UPRIGHT_M * camera.fy / middle)
         last = len(middle)
-        total = np.zeros((self._count, last + 1))
+        total = np.zeros((self._count, last + 1), np.int32)
         np.cumsum(counts, axis=1, out=total[:, 1:])
         within = total[:, np.minimum(self._log_bins + _SPREAD_BINS, last)] - total[:, :-1]
-        enough = within >= needed
+        enough = within >= np.ceil(needed).astype(np.int32)
         found = np.flatnonzero(enough.any(axis=1))
         total, begin = total[found], enough[found].argmax(axis=1)
         end = np.minimum(begin + _SPREAD_BINS, last)
@@ -165,6 +184,13 @@ class FloorScanner:
         upright_m = np.full(self._count, np.nan)
         upright_m[found] = _NEAREST_M * np.exp(_LOG_STEP * _median_bin(total, begin, end))
         return upright_m
+
+    def _feet(self, xy: NDArray[np.float32]) -> Array:
+        """Return the mean range (N,) of points (2, F) by bearing, NaN where there is none."""
+        at = self._bearing_index(xy)
+        count = np.bincount(at, minlength=self._count)
+        total = np.bincount(at, np.hypot(xy[0], xy[1]), minlength=self._count)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def _bearing_index(self, xy: NDArray[np.floating]) -> NDArray[np.intp]:
         bearing = np.arctan2(xy[1], xy[0])
@@ -183,7 +209,7 @@ class FloorScanner:
         return np.bincount(cell, minlength=n * m).reshape(n, m)
 
 
-def _median_bin(total: Array, begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
+def _median_bin(total: NDArray[np.int32], begin: NDArray[np.intp], end: NDArray[np.intp]) -> Array:
     """Return where, in bins (N,), half of what lies in the bins from begin to end (N,) is passed.
 
     total: (N, M + 1), how much lies in all bins before one.

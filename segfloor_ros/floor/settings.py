@@ -16,15 +16,12 @@ class FloorSegmentationSettings(RobotSettings):
         0,
         'Disparities searched, a multiple of 16; 0 derives it from camera and mount.',
         unit='px',
-        minimum=0,
-        maximum=512,
+        within=(0, 512),
     )
     coarse_above_px: float = setting(
-        32.0,
+        28.0,
         'Where the floor has a larger disparity, images are matched at half the resolution.',
-        unit='px',
-        minimum=8.0,
-        maximum=512.0,
+        within=(8.0, 512.0),
     )
     disparity_above_horizon: bool = setting(
         False, 'Match the rows above the horizon too; the floor does not need them.'
@@ -32,38 +29,29 @@ class FloorSegmentationSettings(RobotSettings):
     obstacle_height_m: float = setting(
         0.2,
         'An upright surface of this height is taken out before the profile is fitted.',
-        unit='m',
-        minimum=0.02,
-        maximum=2.0,
+        within=(0.02, 2.0),
         live=True,
     )
     fill_gap_m: float = setting(
         0.5,
         'Gaps of this size between floor pixels are filled where nothing speaks against it.',
-        unit='m',
-        minimum=0.0,
-        maximum=3.0,
+        within=(0.0, 3.0),
         live=True,
     )
     fill_support: float = setting(
         0.3,
         'Part of the columns of a weakly textured region that must show floor to fill it.',
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
         live=True,
     )
     scan_range_m: float = setting(
         0.0,
         'Longest range of the floor scan; 0 derives it from focal length and baseline.',
-        unit='m',
-        minimum=0.0,
-        maximum=60.0,
+        within=(0.0, 60.0),
     )
     scan_gap_m: float = setting(
         0.15,
         'A gap in the floor longer than this ends the scan.',
-        unit='m',
-        minimum=0.02,
-        maximum=2.0,
+        within=(0.02, 2.0),
         live=True,
     )

@@ -12,6 +12,8 @@ MIN_TEXTURE_GREY = 0.2
 NOISE_TEXTURE = 0.1
 """Texture per grey level of noise that is surely no noise: its own is 0.04."""
 _LAPLACIAN_GAIN = 6.0
+EDGE_SLOPE = 24
+"""Sobel response of the weakest edge that counts: 3 grey levels per row."""
 
 
 def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32]:
@@ -41,3 +43,14 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     response = cv2.filter2D(part, cv2.CV_32F, kernel)
     return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / _LAPLACIAN_GAIN
+
+
+def row_slope(image: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """Return how steep the image (H, W) is from row to row, as Sobel's response: 8 times the grey
+    levels per row.
+    """
+    smooth = cv2.GaussianBlur(image, (3, 5), 0)
+    slope: NDArray[np.int16] = np.abs(
+        cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE)
+    )
+    return slope

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,12 @@ class FloorView:
         rows = np.arange(first_row, camera.height, dtype=np.float32)
         return cls(camera, mount, line, first_row, step, columns, shear, rows[:, None] + shear)
 
-    def rays(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.float32]:
+    @cached_property
+    def plane_px(self) -> NDArray[np.float32]:
+        """Disparity (R, W) of a floor that does not bend."""
+        return np.float32(self.line.slope) * (self.derolled - np.float32(self.line.horizon))
+
+    def rays(self, rows: NDArray[np.number], columns: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return the rays (3, N) of pixels of the view at depth 1, in the base's axes."""
         camera = self.camera
         x = (self.columns[columns] - np.float32(camera.cx)) / np.float32(camera.fx)
@@ -57,7 +63,7 @@ class FloorView:
 
     def positions(
         self,
-        rows: NDArray[np.integer],
+        rows: NDArray[np.number],
         columns: NDArray[np.integer],
         disparity_px: NDArray[np.float32],
     ) -> NDArray[np.float32]:

@@ -14,10 +14,19 @@ from numpy.typing import NDArray
 
 from segfloor_ros.grid.blocking import nearest_cells
 from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
-from segfloor_ros.grid.hits import draw_hits, draw_rays
+from segfloor_ros.grid.hits import draw_bands, draw_hits, draw_rays
 from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
-from segfloor_ros.grid.log_odds import FREE, HIT, LEAST, MOST, OCCUPIED_FROM, ZERO, steps
-from segfloor_ros.grid.placing import PlacedEvidence, Pose2d, place
+from segfloor_ros.grid.log_odds import (
+    FREE,
+    HIT,
+    LEAST,
+    MOST,
+    OCCUPIED_FROM,
+    SURE,
+    ZERO,
+    steps,
+)
+from segfloor_ros.grid.placing import BEHIND_M, PlacedEvidence, Pose2d, place
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
 _BODY_M = 0.05
@@ -37,10 +46,12 @@ class EvidenceFolder:
         most = ZERO + steps(MOST)
         self._raised = np.minimum(value + hit, most).astype(np.uint8)
         self._lowered = np.maximum(value - free, self._least).astype(np.uint8)
+        undone = np.minimum(value + free, np.maximum(value, ZERO))
+        self._undone = undone.astype(np.uint8)
         # What is seen from too far to be placed within its cell, or in a part of a cell, counts as
         # long as nothing was seen from nearer: it does not count for much, and changes nothing that
         # does.
-        sure = self._sure = self._occupied + hit
+        sure = self._sure = ZERO + steps(SURE)
         lowered = np.minimum(value, np.maximum(value - free, ZERO - free))
         self._lowered_tentatively = np.where(value > sure, value, lowered).astype(np.uint8)
         raised = np.maximum(value, np.minimum(value + hit, sure))
@@ -73,9 +84,20 @@ class EvidenceFolder:
         partly &= visible
         _replace(cells, free & near, self._lowered)
         _replace(cells, partly & ~(free & near), self._lowered_tentatively)
+        behind = self._draw_behind(cells.shape, placed) & near & (1 - (partly | hits))
+        _replace(cells, behind, self._undone)
         _replace(cells, hits & near, self._raised)
         _replace(cells, hits & ~near, self._raised_tentatively)
         self._drive(cells, placed)
+
+    def _draw_behind(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
+        """Return the cells right behind the faces that are seen, 1. What was found to be free there
+        was placed wrongly, by a path that had drifted.
+        """
+        behind = np.zeros(shape, np.uint8)
+        depth = np.full(len(placed.thickness), max(1.0, BEHIND_M / self._resolution_m))
+        draw_bands(behind, placed, depth)
+        return behind
 
     def _draw_partly_free(
         self, free: NDArray[np.uint8], placed: PlacedEvidence

@@ -20,7 +20,7 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
     hang above free floor then, and mark the cell below them.
     """
     hits = np.zeros_like(free)
-    _draw_bands(hits, placed)
+    draw_bands(hits, placed, placed.thickness)
     hits &= 1 - free
     step = 0.5 * placed.outward
     num = placed.faces.shape[1]
@@ -38,9 +38,9 @@ def draw_hits(free: NDArray[np.uint8], placed: PlacedEvidence) -> NDArray[np.uin
     return hits
 
 
-def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
-    """Mark what stands behind the faces: a cell, and what the error of the distance may add."""
-    num = len(placed.thickness)
+def draw_bands(raster: NDArray[np.uint8], placed: PlacedEvidence, thickness: Array) -> None:
+    """Set the cells behind the faces to 1, up to a depth (C,) in cells."""
+    num = len(thickness)
     if num == 0:
         return
     start, outward = placed.faces[:, :num], placed.outward[:, :num]
@@ -48,10 +48,10 @@ def _draw_bands(hits: NDArray[np.uint8], placed: PlacedEvidence) -> None:
     num_along = int(np.abs(along).max()) + 2
     share = np.arange(num_along) * (1 / (num_along - 1))
     lines = start[:, :, None] + along[:, :, None] * share
-    layers = np.arange(0.5, placed.thickness.max())
-    behind = outward[:, :, None] * np.minimum(layers, placed.thickness[:, None] - 0.5)
+    layers = np.arange(0.5, thickness.max())
+    behind = outward[:, :, None] * np.minimum(layers, thickness[:, None] - 0.5)
     column, row = (lines[:, :, :, None] + behind[:, :, None, :]).astype(np.intp)
-    hits[row, column] = 1
+    raster[row, column] = 1
 
 
 def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: float) -> None:

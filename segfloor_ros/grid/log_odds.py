@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 QUANTUM = 0.05
 HIT, FREE = 0.7, 0.4
 """Evidence of one keyframe that sees an obstacle, or floor, in a cell."""
-MOST, LEAST = 3.5, -2.0
-"""Limits of the evidence: how much it takes to clear what has left, and to mark what has come."""
 OCCUPIED_FROM, FREE_FROM = 1.2, 0.4
 """Cells with more evidence than this are occupied, and rays end there; with so much for floor they
 are free."""
+SURE = OCCUPIED_FROM + HIT
+"""Occupied cells with more evidence than this are not beside what is seen now, but in its way."""
+MOST, LEAST = SURE + QUANTUM, -2.0
+"""Limits of the evidence: how much it takes to clear what has left, and to mark what has come. Once
+something is sure, one look at floor makes it doubtful: more would keep what people leave.
+"""
 ZERO = 128
 CHUNK = 64
 """The stored part grows by whole blocks of this many cells."""

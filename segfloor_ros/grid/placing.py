@@ -12,6 +12,8 @@ from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""
+BEHIND_M = 0.1
+"""Nothing is free so close behind a face: walls are no thinner."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def place(
     positions += way[:, :1]
     thickness = np.maximum(evidence.thickness_m.astype(np.float64) * scale, 1.0)
     margin = margin_m * scale + 2
-    body = int(np.ceil(thickness.max(initial=1.0))) + 1
+    body = int(np.ceil(thickness.max(initial=BEHIND_M * scale))) + 1
     ends = directions * lengths + way[:, :1]
     touched = np.concatenate([ends, positions, way - margin, way + margin], axis=1)
     low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - body

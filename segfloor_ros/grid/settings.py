@@ -14,31 +14,24 @@ class OccupancyGridSettings(StageSettings):
     resolution_m: float = setting(
         0.05,
         'Side of a cell.',
-        unit='m',
-        minimum=0.01,
-        maximum=0.2,
+        within=(0.01, 0.2),
     )
     max_range_m: float = setting(
         0.0,
         'Longest ray that marks free cells; 0 is as far as the camera can tell where floor ends.',
-        unit='m',
-        minimum=0.0,
-        maximum=50.0,
+        within=(0.0, 50.0),
         live=True,
     )
     max_hit_error_m: float = setting(
         0.05,
         'Obstacles whose distance is less certain than this mark no cell.',
-        unit='m',
-        minimum=0.005,
-        maximum=1.0,
+        within=(0.005, 1.0),
         live=True,
     )
     occupied_share: float = setting(
         0.2,
         'A cell into which an obstacle reaches by more than this share of its side is occupied.',
-        minimum=0.0,
-        maximum=0.5,
+        within=(0.0, 0.5),
     )
     use_points: bool = setting(
         True, 'Obstacle points mark cells, and rays to floor points mark free cells.'
@@ -47,15 +40,12 @@ class OccupancyGridSettings(StageSettings):
     footprint_radius_m: float = setting(
         0.15,
         'The base has driven over the floor this far around it; 0 leaves it to what was seen.',
-        unit='m',
-        minimum=0.0,
-        maximum=2.0,
+        within=(0.0, 2.0),
     )
     opening_cells: int = setting(
         0,
         'Post-process: free areas narrower than this become unknown (opening); 0 is off.',
-        minimum=0,
-        maximum=21,
+        within=(0, 21),
         live=True,
     )
     probabilistic: bool = setting(

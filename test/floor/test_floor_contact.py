@@ -14,10 +14,12 @@ FIRST_ROW = 200
 SEEN_ROW, CONTACT_ROW = 160, 80  # of the view: floor is seen from the one, a wall up to the other
 
 
-def filled(wall_px_of_floor: float, seen_row: int = SEEN_ROW) -> np.ndarray:
+def filled(
+    wall_px_of_floor: float, seen_row: int = SEEN_ROW, has_texture: bool = True
+) -> np.ndarray:
     """Return what is filled below a wall, its disparity as a multiple of the floor's there.
 
-    seen_row: from where on floor is seen.
+    seen_row: from where on floor is seen. has_texture: the wall.
     """
     view = FloorView.of(CAMERA, MOUNT, FIRST_ROW)
     line = FloorLine.of(CAMERA, MOUNT)
@@ -33,7 +35,7 @@ def filled(wall_px_of_floor: float, seen_row: int = SEEN_ROW) -> np.ndarray:
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
     compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
-    result = fill_to_contact(view, mask, plain, disparity, compared)
+    result = fill_to_contact(view, mask, plain, disparity, compared, wall & has_texture)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 
@@ -54,3 +56,8 @@ def test_it_may_begin_at_the_lower_edge_of_the_image():
 
 def test_not_below_what_has_no_disparity():
     assert not filled(0.0).any()
+
+
+def test_not_below_a_blank_wall():
+    """Its disparities are of noise, and its foot may be anywhere below it."""
+    assert not filled(1.0, has_texture=False).any()

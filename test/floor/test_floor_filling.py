@@ -1,10 +1,13 @@
-"""What is filled in and what is dropped, on masks drawn by hand."""
+"""What is filled in and what is dropped, on masks drawn by hand and in a scene."""
 
 import numpy as np
-from floor_scenes import CAMERA, MOUNT
+import pytest
+from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
 from segfloor_ros.floor.filling import beside_something, beyond_texture, drop_islands
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.floor.view import FloorView
 
 
@@ -58,3 +61,16 @@ def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it():
         inner = slice(rows.start + 8, rows.stop - 8)
         assert beside[inner][strip[inner]].all()
     assert not beside[145:170].any()
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_blank_board_of_the_shade_of_the_floor_is_not_filled(floor_kind):
+    """Floor is seen left and right of it, and nothing tells the two apart but the texture."""
+    width_m, ahead_m, grey = 1.6, 1.5, floor_kind.get('grey', 120.0)
+    corner = (ahead_m, -width_m / 2, 0.0)
+    board = Patch(corner, (0, width_m, 0), (0, 0, 1.5), False, grey=grey, contrast=0.0)
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), board])
+    left, right, floor, _ = scene.render()
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    # No more than three rows at its foot.
+    assert ((mask == FLOOR) & ~floor).sum() < 3 * CAMERA.fx * width_m / ahead_m

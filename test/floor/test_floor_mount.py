@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from floor_scenes import Patch, Scene, box, floor_patch, wall
+from floor_scenes import SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.mount import MountEstimator, disagreement
@@ -71,30 +71,51 @@ def blank_floored(mount: Mount, *things: Patch) -> Scene:
     return Scene(patches, mount=mount, noise_grey=1.0)
 
 
-def estimate_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> MountEstimator:
-    """Return what a robot measures that drives ahead over the floor."""
+def mounts_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> list[Mount | None]:
+    """Return what a robot that drives ahead over the floor has measured after each frame."""
     estimator = MountEstimator(scene.camera)
     T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    mounts = []
     for i in range(frames):
         here = replace(scene.mount, forward_m=i * step_m)
         left, right, _, _ = replace(scene, mount=here).render()
         estimator.add(left, right, T_left_base @ here.T_base_left)
-    return estimator
+        mounts.append(estimator.mount)
+    return mounts
 
 
 @pytest.mark.parametrize(('height_m', 'pitch_deg', 'roll_deg'), [(0.35, 8.0, 0.0), (0.2, 5.0, 2.0)])
 def test_a_floor_of_one_colour_is_where_things_stand(height_m, pitch_deg, roll_deg):
     true = Mount(height_m, np.radians(pitch_deg), np.radians(roll_deg))
     scene = blank_floored(true, *box(1.6, 0.5, 0.4, 0.3))
-    mount = estimate_on_the_way(scene, 4).mount
+    mount = mounts_on_the_way(scene, 4)[-1]
     assert mount is not None
     assert mount.height_m == pytest.approx(height_m, rel=0.03)
     assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.3)
     assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.5)
 
 
+SWAYING = [(0.35, 8.0), (0.31, 11.0), (0.39, 6.0), (0.33, 12.0), (0.38, 5.0), (0.32, 10.0)]
+"""Heights in m and pitches in degrees of a camera that is carried in a hand."""
+
+
+@pytest.mark.parametrize('poses_sway', [True, False], ids=['seen by SLAM', 'not seen by SLAM'])
+def test_a_camera_that_a_hand_holds_has_no_mount(poses_sway):
+    """Where the poses sway, it keeps no place above the plane; else planes do not repeat."""
+    scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
+    estimator = MountEstimator(scene.camera)
+    T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    for i, (height_m, pitch_deg) in enumerate(SWAYING):
+        seen_from = Mount(height_m, np.radians(pitch_deg), forward_m=0.15 * i)
+        left, right, _, _ = replace(scene, mount=seen_from).render()
+        told = seen_from if poses_sway else replace(scene.mount, forward_m=0.15 * i)
+        estimator.add(left, right, T_left_base @ told.T_base_left)
+    assert estimator.mount is None
+
+
 def test_poses_come_before_the_mount_is_known():
     scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
+    scene = replace(scene, camera=SMALL_CAMERA)
     slam = make_slam(scene.camera, StereoSlamSettings(keyframe_max_frames=1))
     come, positions = [], []
     for i in range(8):
@@ -116,8 +137,9 @@ def test_after_a_while_the_best_plane_will_do():
     rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=20.0, seed=5)
     floor, blank = floor_patch(grey=175.0, contrast=0.0), wall(4.0, contrast=0.0)
     scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=2.0)
-    assert estimate_on_the_way(scene, 15, step_m=0.01).mount is None
-    mount = estimate_on_the_way(scene, 24, step_m=0.01).mount
+    mounts = mounts_on_the_way(scene, 24, step_m=0.01)
+    mount = mounts[-1]
+    assert mounts[14] is None
     assert mount is not None
     assert mount.height_m == pytest.approx(0.3, rel=0.05)
 
@@ -131,7 +153,7 @@ def test_posters_on_a_blank_wall_are_not_the_floor():
     floor = floor_patch(grey=175.0, contrast=0.0)
     blank = wall(3.0, grey=175.0, contrast=0.0)
     scene = Scene([floor, blank, *poster], mount=Mount(0.35, np.radians(8.0)), noise_grey=1.0)
-    assert estimate_on_the_way(scene, 8).mount is None
+    assert mounts_on_the_way(scene, 8) == [None] * 8
 
 
 def test_disagreement_names_both_numbers():

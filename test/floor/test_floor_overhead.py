@@ -10,10 +10,11 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 BOARD_M, WALL_M = 2.0, 4.0
 
 
-def board(bottom_m: float, width_m: float = 1.0, height_m: float = 0.08) -> Patch:
+def board(bottom_m: float, width_m: float = 1.0, height_m: float = 0.08, **looks: float) -> Patch:
     """The front of a board across the way."""
     corner = (BOARD_M, -width_m / 2, bottom_m)
-    return Patch(corner, (0.0, width_m, 0.0), (0.0, 0.0, height_m), False, grey=90.0, seed=8)
+    looks = {'grey': 90.0, 'seed': 8, **looks}
+    return Patch(corner, (0.0, width_m, 0.0), (0.0, 0.0, height_m), False, **looks)
 
 
 def scan_of(scene: Scene, **settings: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,11 +37,22 @@ def test_a_board_at_the_robots_height_ends_the_scan(floor_kind):
     assert np.median(floor_m[beside]) > 3.4
 
 
-def test_a_table_top_of_six_centimetres_ends_the_scan():
-    scene = Scene([floor_patch(), wall(WALL_M), board(0.55, height_m=0.06)])
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_table_top_of_six_centimetres_ends_the_scan(floor_kind):
+    scene = Scene([floor_patch(**floor_kind), wall(WALL_M), board(0.55, height_m=0.06)])
     bearing, floor_m, _ = scan_of(scene)
     below = np.abs(bearing) < 12
     assert (np.abs(floor_m[below] - BOARD_M) < 0.1).mean() > 0.9
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_board_of_one_colour_is_known_by_its_ends(floor_kind):
+    patches = [floor_patch(**floor_kind), wall(WALL_M), board(0.5, height_m=0.3, contrast=0.0)]
+    bearing, floor_m, _ = scan_of(Scene(patches))
+    below = np.abs(bearing) < 12
+    assert (floor_m[below] < BOARD_M + 0.15).mean() > 0.9
+    beside = (np.abs(bearing) > 17) & (np.abs(bearing) < 30)
+    assert np.median(floor_m[beside]) > 3.4
 
 
 def test_what_hangs_higher_than_the_robot_does_not():

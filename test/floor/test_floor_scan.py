@@ -20,9 +20,10 @@ def fan(first_m, last_m, bearings_deg=(-10, 10), per_m=100):
     return np.stack([(r * np.cos(b)).ravel(), (r * np.sin(b)).ravel()]).astype(np.float32)
 
 
-def scan(*stretches_m, upright=None, blind_from_deg=90.0):
+def scan(*stretches_m, upright=None, feet=None, blind_from_deg=90.0):
     """The scan of floor in stretches of range within 10 degrees of straight ahead; to the left of
-    blind_from_deg one camera alone sees it.
+    blind_from_deg one camera alone sees it. upright, feet: (2, N), what stands, and where blank
+    faces do.
     """
     scanner = FloorScanner(CAMERA, MOUNT, SETTINGS)
     x, y = scanner.cells_xy
@@ -30,8 +31,9 @@ def scan(*stretches_m, upright=None, blind_from_deg=90.0):
     floor = np.zeros(len(x), bool)
     for first_m, last_m in stretches_m:
         floor |= (ranges > first_m) & (ranges < last_m) & (np.abs(bearings_deg) < 10)
-    points = np.zeros((2, 0), np.float32) if upright is None else upright
-    return scanner.scan(floor, bearings_deg < blind_from_deg, points, 0.5)
+    nothing = np.zeros((2, 0), np.float32)
+    points, lines = (nothing if given is None else given for given in (upright, feet))
+    return scanner.scan(floor, bearings_deg < blind_from_deg, points, lines, 0.5)
 
 
 def at(result, values, bearing_deg=0.0):
@@ -83,7 +85,8 @@ def test_the_range_follows_the_camera(focal, baseline, range_max_m):
     def made_by(camera):
         scanner = FloorScanner(camera, MOUNT, SETTINGS)
         nothing = np.zeros(scanner.cells_xy.shape[1], bool)
-        made = scanner.scan(nothing, nothing, np.zeros((2, 0), np.float32), 0.5)
+        none = np.zeros((2, 0), np.float32)
+        made = scanner.scan(nothing, nothing, none, none, 0.5)
         return made, np.hypot(*scanner.cells_xy).max()
 
     other = dataclasses.replace(
@@ -117,3 +120,23 @@ def test_floor_that_one_camera_sees_does_not_end_a_ray():
     result = scan((0.35, 3.0), blind_from_deg=4.0)
     assert at(result, result.ranges_m) > 2.6
     assert np.isnan(at(result, result.ranges_m, 7.0))
+
+
+def test_the_floor_ends_at_the_foot_of_a_blank_face():
+    result = scan((0.35, 2.05), feet=fan(2.0, 2.005))
+    assert at(result, result.ranges_m) == pytest.approx(2.0, abs=0.03)
+    assert at(result, result.obstacle_m) == pytest.approx(2.0, abs=0.03)
+
+
+def test_what_stands_in_front_of_it_is_nearer():
+    board = np.repeat(fan(1.5, 1.505), 40, axis=1)
+    result = scan((0.35, 2.05), upright=board, feet=fan(2.0, 2.005))
+    assert at(result, result.obstacle_m) == pytest.approx(1.5, abs=0.03)
+
+
+@pytest.mark.parametrize(('gap_deg', 'reaches_m'), [(8, 1.0), (16, 3.0)])
+def test_nothing_is_seen_through_a_gap_too_narrow_for_a_robot(gap_deg, reaches_m):
+    half = gap_deg / 2
+    sides = [fan(1.0, 1.005, bearings_deg=ends) for ends in ((-14, -half), (half, 14))]
+    result = scan((0.35, 3.2), upright=np.repeat(np.hstack(sides), 60, axis=1))
+    assert at(result, result.ranges_m) == pytest.approx(reaches_m, abs=0.25)

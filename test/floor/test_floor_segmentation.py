@@ -21,6 +21,7 @@ from floor_scenes import (
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 
@@ -95,6 +96,19 @@ def test_a_blank_wall_is_not_floor():
 def test_a_blank_wall_right_ahead_is_no_floor():
     observation, floor, _ = segment(Scene([wall(0.4, contrast=0.0), floor_patch(far_m=0.4)]))
     assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
+
+
+@pytest.mark.parametrize('seed', [0, 8, 10])
+def test_where_nothing_has_texture_the_floor_is_where_the_mount_says(seed):
+    floor = Patch((0, -3, 0), (2.5, 0, 0), (0, 6, 0), is_floor=True, contrast=0.0)
+    standing = Patch(
+        (1.2, -1.5, 0), (1.6, 3, 0), (0, 0, 2), is_floor=False, contrast=0.0, grey=100.0
+    )
+    observation, _, _ = segment(Scene([floor, standing], SMALL_CAMERA, seed=seed))
+    rows = np.arange(140, SMALL_CAMERA.height)
+    line = FloorLine.of(SMALL_CAMERA, MOUNT)
+    expected_px = line.slope * (rows - line.horizon)
+    np.testing.assert_allclose(observation.profile_px[rows], expected_px, rtol=0.01)
 
 
 @pytest.mark.parametrize('floor_kind', FLOORS)

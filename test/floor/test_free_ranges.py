@@ -7,7 +7,7 @@ import pytest
 from costmap import Costmap
 from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_pose
 
-from segfloor_ros.camera.shrinking import shrink_factor, shrunk, shrunk_camera
+from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.floor.free_ranges import MARGIN_M, free_ranges
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
@@ -36,7 +36,7 @@ def test_a_shrunk_camera_sees_a_point_where_its_pixel_has_gone() -> None:
     # The centre of the small pixel (0, 0) is that of the four pixels (0, 0) to (1, 1).
     np.testing.assert_allclose((uv[:2] + 0.5) / 2 - 0.5, uv_small[:2])
     image = np.arange(20, dtype=np.uint8).reshape(4, 5)
-    np.testing.assert_array_equal(shrunk(image, 2), [[3, 5], [13, 15]])
+    np.testing.assert_array_equal(shrunk_image(image, 2), [[3, 5], [13, 15]])
     assert shrink_factor(CAMERA) == 1
     assert shrink_factor(shrunk_camera(CAMERA, 2)) == 1
 
