@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from segfloor_ros.camera.ros_messages import NOT_MEASURED
 from segfloor_ros.geometry import Array, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 IMU = 'sensor_msgs/msg/Imu'
-NOT_MEASURED = -1.0
-"""First element of a covariance of what an IMU does not measure (sensor_msgs/Imu)."""
+TF = 'tf2_msgs/msg/TFMessage'
+IMU_FRAME = 'imu_link'
+"""Of an IMU that is not where the left camera is; its axes are those of the raw left images."""
 
 
 class BagMessages:
@@ -55,6 +57,14 @@ class BagMessages:
             linear_acceleration=self._vector(R_frame_left @ sample.accel_m_s2),
             linear_acceleration_covariance=no_covariance,
         )
+
+    def transform(self, frame_id: str, child: str, T_frame_child: Array) -> Any:
+        """Return a fixed transform (4, 4) as tf2_msgs/TFMessage."""
+        turn = self._quaternion(quaternion_xyzw(T_frame_child[:3, :3]))
+        types, shift = self.types, self._vector(T_frame_child[:3, 3])
+        transform = types['geometry_msgs/msg/Transform'](shift, turn)
+        stamped = types['geometry_msgs/msg/TransformStamped']
+        return types[TF]([stamped(self.header(0, frame_id), child, transform)])
 
     def _vector(self, values: Array) -> Any:
         return self.types['geometry_msgs/msg/Vector3'](*(float(v) for v in values))

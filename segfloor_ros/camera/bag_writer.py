@@ -7,24 +7,25 @@ import tempfile
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.bag_messages import IMU, ODOMETRY, BagMessages
+from segfloor_ros.camera.bag_messages import IMU, IMU_FRAME, ODOMETRY, TF, BagMessages
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.sources.bag_file import MISSING_LIBRARY
 from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import ImuSample, Measurement, MeasurementLog, WheelPose
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
+TF_TOPIC = '/tf_static'
 JPEG_QUALITY = 90
 WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
 WHEELS_FRAME = 'wheel_odom'
@@ -121,11 +122,9 @@ class BagWriter:
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise InputError(f'{self._out}: {MISSING_LIBRARY}') from None
-        try:
+        with os_errors(f'{self._out}: cannot be written'):
             self._out.parent.mkdir(parents=True, exist_ok=True)
             self._staging = Path(tempfile.mkdtemp(prefix='.bag-', dir=self._out.parent))
-        except OSError as error:
-            raise InputError(f'{self._out}: cannot be written ({error.strerror})') from None
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._writer = rosbag2.Writer(
             self._staging / self._out.stem, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
@@ -138,12 +137,7 @@ class BagWriter:
         self.messages = BagMessages(self._typestore.types)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         try:
             if kind is not None:
                 self._writer.abort()
@@ -193,8 +187,18 @@ class BagWriter:
             odometry = self.messages.odometry(stamp_ns, WHEELS_FRAME, measurement.T_wheels_base)
             self.write_message(WHEELS_TOPIC, ODOMETRY, stamp_ns, odometry)
         elif isinstance(measurement, ImuSample):
-            imu = self.messages.imu(measurement, FRAME_IDS[0], self._turn_imu)
+            imu = self.messages.imu(measurement, self._imu_frame(measurement), self._turn_imu)
             self.write_message(IMU_TOPIC, IMU, stamp_ns, imu)
+
+    def _imu_frame(self, sample: ImuSample) -> str:
+        """Return the frame of an IMU, which is written before its first sample."""
+        if not sample.place_m.any():
+            return FRAME_IDS[0]
+        if TF_TOPIC not in self._connections:
+            T_raw_imu = make_transform(np.eye(3), self._turn_imu @ sample.place_m)
+            transform = self.messages.transform(FRAME_IDS[0], IMU_FRAME, T_raw_imu)
+            self.write_message(TF_TOPIC, TF, sample.stamp_ns, transform)
+        return IMU_FRAME
 
     def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
         """Append a message of a type to a topic, recorded at stamp_ns."""

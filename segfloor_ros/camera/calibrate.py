@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.calibration_files import write_ros_calibration
-from segfloor_ros.camera.chessboard import find_corners
+from segfloor_ros.camera.images import CorruptImageError
+from segfloor_ros.camera.sources.files import read_grey
 from segfloor_ros.camera.sources.image_folders import find_image_pairs
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.geometry import Array, make_transform
@@ -23,6 +24,8 @@ MIN_PAIRS = 5
 """Fewer views do not hold the intrinsics (Zhang needs 3; distortion needs more)."""
 
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
+
+SUBPIX_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 
 logger = logging.getLogger(__name__)
 
@@ -158,3 +161,30 @@ def _solve(
 def _raw_eye(K: Array, D: Array, size: tuple[int, int], name: str) -> EyeCalibration:
     P = np.hstack([K, np.zeros((3, 1))])
     return EyeCalibration(*size, K, D.ravel()[:5], np.eye(3), P, origin=name)
+
+
+def find_corners(
+    path: Path, board: tuple[int, int]
+) -> tuple[NDArray[np.float32], tuple[int, int]] | None:
+    """Return the inner corners (n, 1, 2) of the board in an image file, row by row, and the image
+    size (width, height); None, with a warning for a damaged file, where the board is not seen.
+
+    board: corners along the long and the short side.
+    """
+    try:
+        image = read_grey(path)
+    except CorruptImageError as error:
+        logger.warning('%s', error)
+        return None
+    if image.dtype != np.uint8:
+        image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    found, corners = cv2.findChessboardCorners(image, board)
+    if not found:
+        return None
+    corners = corners.reshape(-1, 1, 2).astype(np.float32)
+    # The window stays within the squares, or it would catch the next corner.
+    grid = corners.reshape(board[1], board[0], 2)
+    spacing_px = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min())
+    half = int(np.clip(spacing_px / 3, 2, 11))
+    cv2.cornerSubPix(image, corners, (half, half), (-1, -1), SUBPIX_END)
+    return corners, (image.shape[1], image.shape[0])

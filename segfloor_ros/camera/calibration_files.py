@@ -1,10 +1,10 @@
-"""Reading and writing calibration files: ROS camera calibration YAML, EuRoC sensor.yaml, KITTI
-calib.txt.
+"""Calibration files: of ROS camera_calibration, EuRoC (sensor.yaml) and KITTI (calib.txt); read,
+written, and found beside a recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,20 @@ import numpy as np
 import yaml
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.geometry import Array, invert
+
+FILE_NAMES = (
+    ('left.yaml', 'right.yaml'),
+    ('left.yml', 'right.yml'),
+    ('left_camera.yaml', 'right_camera.yaml'),
+    ('camera_left.yaml', 'camera_right.yaml'),
+    ('left/left.yaml', 'right/right.yaml'),
+    ('left/camera.yaml', 'right/camera.yaml'),
+    ('calibration/left.yaml', 'calibration/right.yaml'),
+    ('calib/left.yaml', 'calib/right.yaml'),
+)
 
 
 def read_calibration(left: Path, right: Path) -> StereoCalibration:
@@ -61,7 +73,10 @@ def read_body_pose(path: Path) -> Array:
 
     Raises CalibrationError.
     """
-    document = _read_yaml(path)
+    return _body_pose(_read_yaml(path), path)
+
+
+def _body_pose(document: Mapping[str, Any], path: Path) -> Array:
     if 'T_BS' not in document:
         raise CalibrationError(f'{path}: T_BS is missing; an EuRoC sensor.yaml has it')
     return _matrix(document['T_BS'], 16, f'{path}, T_BS').reshape(4, 4)
@@ -116,8 +131,7 @@ def _from_euroc(
     eyes, poses = [], []
     for path, document in ((left, left_document), (right, right_document)):
         eyes.append(_euroc_eye(document, str(path)))
-        T_body_eye = _matrix(document['T_BS'], 16, f'{path}, T_BS').reshape(4, 4)
-        poses.append(T_body_eye)
+        poses.append(_body_pose(document, path))
     return StereoCalibration.from_extrinsics(eyes[0], eyes[1], invert(poses[1]) @ poses[0])
 
 
@@ -178,3 +192,47 @@ def _whole(value: Any, where: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise CalibrationError(f'{where} = {value!r}: expected a whole number')
     return value
+
+
+def given_calibration(settings: StereoCameraSettings) -> StereoCalibration | None:
+    """Return the calibration that the settings name, or None when they name none.
+
+    Raises CalibrationError, also when only one of the two files is given.
+    """
+    left, right = settings.left_calibration, settings.right_calibration
+    if not left and not right:
+        return None
+    if not left or not right:
+        raise CalibrationError(
+            'stereo_camera.left_calibration and stereo_camera.right_calibration belong together; '
+            f'only {left or right} is given'
+        )
+    return read_calibration(Path(left), Path(right))
+
+
+def given_left_calibration(settings: StereoCameraSettings) -> EyeCalibration | None:
+    """Return the calibration that the settings name for the left camera alone, of a depth camera;
+    None when they name none. Raises CalibrationError.
+    """
+    name = settings.left_calibration
+    return read_eye_calibration(Path(name)) if name else None
+
+
+def find_calibration(
+    name: str, folders: Sequence[Path], settings: StereoCameraSettings
+) -> StereoCalibration:
+    """Return the calibration the settings name, else the first found in `folders`.
+
+    Raises CalibrationError saying where one was expected.
+    """
+    given = given_calibration(settings)
+    if given is not None:
+        return given
+    for folder in folders:
+        for left, right in FILE_NAMES:
+            if (folder / left).exists() or (folder / right).exists():
+                return read_calibration(folder / left, folder / right)
+    raise CalibrationError(
+        f'{name}: no calibration; put left.yaml and right.yaml (ROS camera_calibration) into '
+        f'{folders[0]}, or give stereo_camera.left_calibration and right_calibration'
+    )

@@ -36,92 +36,84 @@ CHANNELS = {
 
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
+MAX_PIXELS = 50_000_000
+"""Larger images are refused: a damaged header must not take all memory."""
+
 
 class CorruptImageError(InputError):
     """The data of one image is damaged; the rest of the recording may be fine."""
 
 
-def decode_compressed(data: bytes) -> Grey:
+def grey_image(message: Any, name: str) -> Grey:
+    """Return the grey image (H, W) of a sensor_msgs Image or CompressedImage, of `rclpy` or of
+    `rosbags`; colour becomes grey.
+
+    Raises, naming the topic or file, InputError for an encoding that is no picture and
+    CorruptImageError when the data is damaged or not of the size the header says.
+    """
+    if not hasattr(message, 'encoding'):
+        return decode_file(bytes(message.data), name)
+    encoding = message.encoding
+    if encoding not in CHANNELS:
+        raise InputError(
+            f'{name}: image encoding {encoding} is not supported; known are mono8, rgb8, …'
+        )
+    dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
+    return _grey_of(_unpacked(message, name, CHANNELS[encoding], dtype), encoding)
+
+
+def depth_image(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return the depth image (H, W) of a sensor_msgs Image (REP-118): uint16 in mm or float32 in
+    metres. Raises as `grey_image`.
+    """
+    if message.encoding not in DEPTH_TYPES:
+        raise InputError(
+            f'{name}: encoding {message.encoding} is no depth; depth images are 16UC1 (mm) or '
+            '32FC1 (m)'
+        )
+    return _unpacked(message, name, 1, np.dtype(DEPTH_TYPES[message.encoding]))[:, :, 0]
+
+
+def decode_file(data: bytes, name: str) -> Grey:
     """Return the grey image of the bytes of a PNG, JPEG or other image file.
 
-    Raises CorruptImageError when it is truncated or damaged, also where a decoder would make
-    up the missing part.
+    Raises CorruptImageError, naming it, when it is truncated or damaged, also where a decoder would
+    make up the missing part.
     """
-    _check_complete(data)
+    _check_complete(data, name)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
-        raise CorruptImageError('the image cannot be decoded')
+        raise CorruptImageError(f'{name}: the image cannot be decoded')
     if image.dtype not in (np.uint8, np.uint16):
-        raise CorruptImageError(f'pixels are {image.dtype}, expected 8 or 16 bits')
+        raise CorruptImageError(f'{name}: pixels are {image.dtype}, expected 8 or 16 bits')
+    _check_size(image.shape[1], image.shape[0], name)
     return image
 
 
-def decode_raw(
-    data: bytes | NDArray[np.uint8],
-    *,
-    width: int,
-    height: int,
-    encoding: str,
-    step: int,
-    is_bigendian: bool = False,
-) -> Grey:
-    """Return the grey image of the raw pixels of a ROS `Image`.
-
-    step: bytes from one row to the next, padding included. Raises InputError for an encoding
-    that is no picture, CorruptImageError when the data is not of the size the header says.
-    """
-    channels = CHANNELS.get(encoding)
-    if channels is None:
-        raise InputError(f'image encoding {encoding} is not supported; known are mono8, rgb8, …')
-    dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
-    pixels = _unpacked(data, (width, height, channels), dtype, encoding, step, is_bigendian)
-    return _grey_of(pixels, encoding)
-
-
-def decode_depth(
-    data: bytes | NDArray[np.uint8],
-    *,
-    width: int,
-    height: int,
-    encoding: str,
-    step: int,
-    is_bigendian: bool = False,
-) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Return the depth image (H, W) of the raw pixels of a ROS `Image` (REP-118): uint16 in mm or
-    float32 in metres. Raises as `decode_raw`.
-    """
-    if encoding not in DEPTH_TYPES:
-        raise InputError(
-            f'encoding {encoding} is no depth; depth images are 16UC1 (mm) or 32FC1 (m)'
-        )
-    dtype = np.dtype(DEPTH_TYPES[encoding])
-    return _unpacked(data, (width, height, 1), dtype, encoding, step, is_bigendian)[:, :, 0]
-
-
-def _unpacked(
-    data: bytes | NDArray[np.uint8],
-    size: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    encoding: str,
-    step: int,
-    is_bigendian: bool,
-) -> NDArray[Any]:
-    """Return the pixels (H, W, channels) of a message. size: width, height, channels."""
-    width, height, channels = size
+def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the pixels (H, W, channels) of a message; rows may be padded up to its `step`."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    _check_size(width, height, name)
     row_bytes = width * channels * dtype.itemsize
-    buffer = np.frombuffer(data, np.uint8)
+    buffer = np.frombuffer(message.data, np.uint8)
     if width <= 0 or height <= 0 or step < row_bytes or buffer.size != step * height:
         raise CorruptImageError(
-            f'{buffer.size} bytes do not make a {width}x{height} {encoding} image with a row '
-            f'step of {step}'
+            f'{name}: {buffer.size} bytes do not make a {width}x{height} {message.encoding} image '
+            f'with a row step of {step}'
         )
     rows = np.ascontiguousarray(buffer.reshape(height, step)[:, :row_bytes])
-    pixels = rows.view(dtype.newbyteorder('>' if is_bigendian else '<')).astype(dtype, copy=False)
+    sent = dtype.newbyteorder('>' if message.is_bigendian else '<')
+    pixels = rows.view(sent).astype(dtype, copy=False)
     return np.asarray(pixels.reshape(height, width, channels))
+
+
+def _check_size(width: int, height: int, name: str) -> None:
+    if width * height > MAX_PIXELS:
+        raise InputError(f'{name}: an image of {width}x{height} pixels is not taken')
 
 
 def to_grey(image: Grey) -> Grey:
@@ -173,17 +165,17 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
     return to_grey(pixels)
 
 
-def _check_complete(data: bytes) -> None:
+def _check_complete(data: bytes, name: str) -> None:
     if not data:
-        raise CorruptImageError('the image is empty')
+        raise CorruptImageError(f'{name}: the image is empty')
     # Cameras pad their JPEGs with zeros.
     if data.startswith(JPEG_START) and JPEG_END not in data.rstrip(b'\0')[-64:]:
-        raise CorruptImageError('the JPEG is truncated')
+        raise CorruptImageError(f'{name}: the JPEG is truncated')
     if data.startswith(PNG_SIGNATURE):
-        _check_png(data)
+        _check_png(data, name)
 
 
-def _check_png(data: bytes) -> None:
+def _check_png(data: bytes, name: str) -> None:
     """Walk over the chunks (length, type, data, CRC; ISO/IEC 15948) up to the end mark."""
     position = len(PNG_SIGNATURE)
     while position + 12 <= len(data):
@@ -193,8 +185,8 @@ def _check_png(data: bytes) -> None:
             break
         checksum = int.from_bytes(data[end : end + 4], 'big')
         if zlib.crc32(data[position + 4 : end]) != checksum:
-            raise CorruptImageError('the PNG is damaged')
+            raise CorruptImageError(f'{name}: the PNG is damaged')
         if data[position + 4 : position + 8] == b'IEND':
             return
         position = end + 4
-    raise CorruptImageError('the PNG is truncated')
+    raise CorruptImageError(f'{name}: the PNG is truncated')

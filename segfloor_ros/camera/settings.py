@@ -19,16 +19,12 @@ class StereoCameraSettings(StageSettings):
     rate_hz: float = setting(
         0.0,
         'Frame rate of a recording without time stamps; 0 takes 10 Hz.',
-        unit='Hz',
-        minimum=0.0,
-        maximum=1000.0,
+        within=(0.0, 1000.0),
     )
     pairing_tolerance_s: float = setting(
         0.01,
         'Largest difference of stamps at which a left and a right image are one pair.',
-        unit='s',
-        minimum=0.0,
-        maximum=1.0,
+        within=(0.0, 1.0),
     )
     left_calibration: str = setting(
         '', 'Calibration file of the left camera; empty: the one that lies with the recording.'
@@ -40,8 +36,7 @@ class StereoCameraSettings(StageSettings):
         0,
         'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
         unit='bits',
-        minimum=0,
-        maximum=16,
+        within=(0, 16),
     )
     left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
     right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')

@@ -9,9 +9,7 @@ from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
-from segfloor_ros.messages.images import MAX_PIXELS
 
 
 def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
@@ -27,25 +25,6 @@ def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> Ca
         k=np.asarray(eye.K, np.float64).ravel(),
         r=np.asarray(eye.R, np.float64).ravel(),
         p=np.asarray(eye.P, np.float64).ravel(),
-    )
-
-
-def eye_calibration(message: CameraInfo, topic: str) -> EyeCalibration:
-    """Return the calibration of one eye. Raises CalibrationError or MessageError, naming the
-    topic.
-    """
-    if int(message.width) * int(message.height) > MAX_PIXELS:
-        size = f'{message.width}x{message.height}'
-        raise MessageError(f'{topic}: a calibration of images of {size} pixels is not taken')
-    return EyeCalibration(
-        int(message.width),
-        int(message.height),
-        np.array(message.k, np.float64),
-        np.array(message.d, np.float64),
-        np.array(message.r, np.float64),
-        np.array(message.p, np.float64),
-        message.distortion_model,
-        topic,
     )
 
 

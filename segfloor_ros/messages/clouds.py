@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField
 
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.messages.errors import MessageError
+from segfloor_ros.errors import InputError
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.slam.results import KeyframeFeatures, MovingPoints, SparseCloud
 
@@ -61,14 +61,14 @@ def cloud_message(stamp_ns: int, frame_id: str, points: NDArray[np.void]) -> Poi
 def cloud_array(message: PointCloud2, wanted: np.dtype, topic: str) -> NDArray[np.void]:
     """Return the fields of `wanted` of a cloud as a structured array (N,).
 
-    Raises MessageError, naming the topic, when fields are missing or the sizes contradict.
+    Raises InputError, naming the topic, when fields are missing or the sizes contradict.
     """
     order = '>' if message.is_bigendian else '<'
     by_name = {field.name: field for field in message.fields}
     names = [name for name in (wanted.names or ()) if name != '_']
     missing = [name for name in names if name not in by_name]
     if missing:
-        raise MessageError(f'{topic}: the cloud has no field {", ".join(missing)}')
+        raise InputError(f'{topic}: the cloud has no field {", ".join(missing)}')
     layout = np.dtype(
         {
             'names': names,
@@ -80,7 +80,7 @@ def cloud_array(message: PointCloud2, wanted: np.dtype, topic: str) -> NDArray[n
     raw = np.frombuffer(message.data, np.uint8)
     used = message.width * message.point_step
     if len(raw) != message.row_step * message.height or used > message.row_step:
-        raise MessageError(
+        raise InputError(
             f'{topic}: {len(raw)} bytes do not make {message.height} rows of {message.width} '
             f'points of {message.point_step} bytes'
         )
@@ -90,15 +90,13 @@ def cloud_array(message: PointCloud2, wanted: np.dtype, topic: str) -> NDArray[n
 
 def features_message(stamp_ns: int, frame_id: str, features: KeyframeFeatures) -> PointCloud2:
     """Return a keyframe's features as a cloud with x y z (NaN where unknown), u v and id."""
-    points = np.zeros(len(features.point_id), FEATURE_DTYPE)
-    _set_xyz(points, features.xyz_map)
-    points['u'], points['v'] = features.uv_px[:, 0], features.uv_px[:, 1]
-    points['id'] = features.point_id
+    u, v = features.uv_px.T
+    points = _points(FEATURE_DTYPE, features.xyz_map, u=u, v=v, id=features.point_id)
     return cloud_message(stamp_ns, frame_id, points)
 
 
 def features_arrays(message: PointCloud2, topic: str) -> KeyframeFeatures:
-    """Return the features of a cloud. Raises MessageError."""
+    """Return the features of a cloud. Raises InputError."""
     points = cloud_array(message, FEATURE_DTYPE, topic)
     uv = np.stack([points['u'], points['v']], axis=1).astype(np.float32)
     return KeyframeFeatures(uv, points['id'].astype(np.int32), _xyz(points))
@@ -106,38 +104,32 @@ def features_arrays(message: PointCloud2, topic: str) -> KeyframeFeatures:
 
 def moving_points_message(stamp_ns: int, frame_id: str, moving: MovingPoints) -> PointCloud2:
     """Return points of what moves with their velocities."""
-    points = np.zeros(len(moving.xyz_map), MOVING_DTYPE)
-    for column, (place, speed) in enumerate(zip('xyz', ('vx', 'vy', 'vz'), strict=True)):
-        points[place] = moving.xyz_map[:, column]
-        points[speed] = moving.velocity_m_s[:, column]
+    vx, vy, vz = moving.velocity_m_s.T
+    points = _points(MOVING_DTYPE, moving.xyz_map, vx=vx, vy=vy, vz=vz)
     return cloud_message(stamp_ns, frame_id, points)
 
 
 def sparse_cloud_message(stamp_ns: int, frame_id: str, cloud: SparseCloud) -> PointCloud2:
     """Return the sparse map as a cloud with x y z and id."""
-    points = np.zeros(len(cloud.point_id), MAP_POINT_DTYPE)
-    _set_xyz(points, cloud.xyz_map)
-    points['id'] = cloud.point_id
+    points = _points(MAP_POINT_DTYPE, cloud.xyz_map, id=cloud.point_id)
     return cloud_message(stamp_ns, frame_id, points)
 
 
 def sparse_cloud_arrays(message: PointCloud2, topic: str) -> SparseCloud:
-    """Return the sparse map of a cloud. Raises MessageError."""
+    """Return the sparse map of a cloud. Raises InputError."""
     points = cloud_array(message, MAP_POINT_DTYPE, topic)
     return SparseCloud(points['id'].astype(np.int32), _xyz(points))
 
 
 def labelled_message(stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> PointCloud2:
     """Return the labelled points as a cloud with x y z id label confidence."""
-    points = np.zeros(len(labelled.point_id), LABELLED_DTYPE)
-    _set_xyz(points, labelled.xyz_map)
-    points['id'], points['label'] = labelled.point_id, labelled.label
+    points = _points(LABELLED_DTYPE, labelled.xyz_map, id=labelled.point_id, label=labelled.label)
     points['confidence'] = labelled.confidence
     return cloud_message(stamp_ns, frame_id, points)
 
 
 def labelled_arrays(message: PointCloud2, topic: str) -> LabelledPoints:
-    """Return the labelled points of a cloud. Raises MessageError."""
+    """Return the labelled points of a cloud. Raises InputError."""
     points = cloud_array(message, LABELLED_DTYPE, topic)
     return LabelledPoints(
         points['id'].astype(np.int32),
@@ -157,8 +149,12 @@ def points_of_label(
     return sparse_cloud_message(stamp_ns, frame_id, cloud)
 
 
-def _set_xyz(points: NDArray[np.void], xyz: NDArray[np.floating]) -> None:
-    points['x'], points['y'], points['z'] = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+def _points(dtype: np.dtype, xyz: NDArray[np.floating], **columns: NDArray) -> NDArray[np.void]:
+    points = np.zeros(len(xyz), dtype)
+    points['x'], points['y'], points['z'] = xyz.T
+    for name, values in columns.items():
+        points[name] = values
+    return points
 
 
 def _xyz(points: NDArray[np.void]) -> NDArray[np.float32]:
@@ -167,5 +163,5 @@ def _xyz(points: NDArray[np.void]) -> NDArray[np.float32]:
 
 def _field_type(datatype: int, topic: str) -> str:
     if datatype not in _FIELD_TYPES:
-        raise MessageError(f'{topic}: unknown field type {datatype} in the cloud')
+        raise InputError(f'{topic}: unknown field type {datatype} in the cloud')
     return _FIELD_TYPES[datatype]

@@ -9,9 +9,9 @@ from sensor_msgs.msg import LaserScan
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.errors import InputError
 from segfloor_ros.floor.free_ranges import free_ranges
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
-from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.images import image_message
 
@@ -64,15 +64,15 @@ def free_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserSca
 
 
 def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
-    """Return the floor scan of a message. Raises MessageError, naming the topic."""
+    """Return the floor scan of a message. Raises InputError, naming the topic."""
     if not message.range_max > 0:
-        raise MessageError(f'{topic}: range_max of the scan is {message.range_max:g} m')
+        raise InputError(f'{topic}: range_max of the scan is {message.range_max:g} m')
     if not np.isfinite([message.angle_min, message.angle_increment]).all():
-        raise MessageError(f'{topic}: the angles of the scan are not finite')
+        raise InputError(f'{topic}: the angles of the scan are not finite')
     ranges = np.frombuffer(message.ranges, np.float32).copy()
     obstacles = np.frombuffer(message.intensities, np.float32).copy()
     if len(obstacles) not in (0, len(ranges)):
-        raise MessageError(f'{topic}: {len(ranges)} ranges, but {len(obstacles)} intensities')
+        raise InputError(f'{topic}: {len(ranges)} ranges, but {len(obstacles)} intensities')
     return FloorScan(
         float(message.angle_min),
         float(message.angle_increment),

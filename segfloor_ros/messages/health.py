@@ -73,9 +73,11 @@ class Health:
         topic = max(waits, key=lambda name: waits[name], default='')
         return topic, waits.get(topic, 0.0)
 
-    def skipped(self) -> None:
-        """Note that something was left out because newer things waited."""
-        self._counts['skipped'] += 1
+    def count(self, what: str) -> None:
+        """Note that something `failed`, was `dropped`, because a part of it did not come, or was
+        `skipped`, because newer things waited.
+        """
+        self._counts[what] += 1
 
     def processed(self, milliseconds: float, state: str) -> None:
         """Note that something was processed, and the words for how it is."""
@@ -86,14 +88,6 @@ class Health:
     def waits(self, state: str) -> None:
         """Note the words for what is waited for with something that is not processed yet."""
         self._state = state
-
-    def failed(self) -> None:
-        """Note that something could not be processed."""
-        self._counts['failed'] += 1
-
-    def dropped(self) -> None:
-        """Note that something was given up because a part of it did not come."""
-        self._counts['dropped'] += 1
 
     def found(self, about: str, level: Level, text: str, lasts_s: float) -> None:
         """Note a problem; it is over when it is not found again for a while."""

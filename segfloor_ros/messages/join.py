@@ -71,14 +71,6 @@ class StampJoiner:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def waiting_for(self) -> tuple[str, ...]:
-        """Return the parts that every waiting set lacks; () when nothing waits."""
-        lacking = [set(self._missing(parts)) for parts in self._waiting.values()]
-        if not lacking:
-            return ()
-        everywhere = set.intersection(*lacking)
-        return tuple(part for part in self.parts if part in everywhere)
-
     def clear(self) -> None:
         """Forget everything."""
         self._waiting.clear()

@@ -19,8 +19,8 @@ from geometry_msgs.msg import (
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 
+from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, make_transform, se3_log
-from segfloor_ros.messages.errors import MessageError
 from segfloor_ros.messages.headers import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
 
@@ -33,11 +33,11 @@ def pose_message(T_a_b: Array) -> Pose:
 
 
 def pose_array(pose: Pose) -> Array:
-    """Return the (4, 4) transform of a pose message. Raises MessageError for impossible numbers."""
+    """Return the (4, 4) transform of a pose message. Raises InputError for impossible numbers."""
     p, q = pose.position, pose.orientation
     values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
     if not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 0.5:
-        raise MessageError(f'a pose of {values.tolist()} is impossible (x y z qx qy qz qw)')
+        raise InputError(f'a pose of {values.tolist()} is impossible (x y z qx qy qz qw)')
     return make_transform(rotations_of(values[None, 3:])[0], values[:3])
 
 
@@ -104,11 +104,6 @@ def at_least(covariance: Array, variance: float) -> Array:
     return covariance + np.diag(np.maximum(variance - np.diag(covariance), 0.0))
 
 
-def path_message(stamp_ns: int, frame_id: str, path: KeyframePath) -> Path:
-    """Return the path of all keyframes; its header carries the stamp of the latest keyframe."""
-    return PathMessages(frame_id).next(stamp_ns, path)
-
-
 class PathMessages:
     """Makes the messages of a path that grows. A path of an hour holds thousands of poses, each of
     six objects; those that have not moved since the last message are used again.
@@ -137,27 +132,20 @@ class PathMessages:
 
 
 def path_arrays(message: Path) -> KeyframePath:
-    """Return stamps and poses of a path message. Raises MessageError for impossible poses."""
+    """Return stamps and poses of a path message. Raises InputError for impossible poses."""
     stamps = np.array([to_ns(pose.header.stamp) for pose in message.poses], np.int64)
     values = array.array('d')
     for stamped in message.poses:
         p, q = stamped.pose.position, stamped.pose.orientation
         values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-    return path_of_numbers(stamps, np.frombuffer(values, np.float64).reshape(-1, 7))
-
-
-def path_of_numbers(stamp_ns: NDArray[np.int64], numbers: Array) -> KeyframePath:
-    """Return the path of stamps (N,) and numbers (N, 7), x y z qx qy qz qw. Raises MessageError for
-    impossible poses.
-    """
+    numbers = np.frombuffer(values, np.float64).reshape(-1, 7)
     if not np.isfinite(numbers).all() or (np.linalg.norm(numbers[:, 3:], axis=1) < 0.5).any():
-        raise MessageError('a path holds poses that are impossible')
+        raise InputError('a path holds poses that are impossible')
     T_map_base = np.zeros((len(numbers), 4, 4))
-    if len(numbers):
-        T_map_base[:, :3, :3] = rotations_of(numbers[:, 3:])
+    T_map_base[:, :3, :3] = rotations_of(numbers[:, 3:])
     T_map_base[:, :3, 3] = numbers[:, :3]
     T_map_base[:, 3, 3] = 1.0
-    return KeyframePath(stamp_ns, T_map_base)
+    return KeyframePath(stamps, T_map_base)
 
 
 def transform_message(
@@ -174,15 +162,13 @@ def transform_message(
 
 
 def transform_array(message: TransformStamped) -> Array:
-    """Return the (4, 4) transform of a transform message. Raises MessageError when impossible."""
+    """Return the (4, 4) transform of a transform message. Raises InputError when impossible."""
     t, q = message.transform.translation, message.transform.rotation
     return pose_array(Pose(position=Point(x=t.x, y=t.y, z=t.z), orientation=q))
 
 
 def pose_numbers(T_a_b: Array) -> Array:
     """Return transforms (N, 4, 4) as numbers (N, 7): x y z qx qy qz qw, with qw >= 0."""
-    if len(T_a_b) == 0:
-        return np.zeros((0, 7))
     quaternions = quaternions_of(T_a_b[:, :3, :3])
     return np.concatenate([T_a_b[:, :3, 3], quaternions], axis=1)
 

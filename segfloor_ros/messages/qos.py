@@ -6,32 +6,27 @@ the camera images of other drivers may be taken best effort, by parameter.
 
 from __future__ import annotations
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 IMAGE_DEPTH = 30
 KEYFRAME_DEPTH = 100
 
 
 def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
-    )
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+def _lossy(depth: int) -> QoSProfile:
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 IMAGES = _reliable(IMAGE_DEPTH)
 """Camera images and their calibrations."""
 
-IMAGES_BEST_EFFORT = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+IMAGES_BEST_EFFORT = _lossy(10)
 """Camera images of drivers that publish best effort; frames may be lost."""
 
-SENSORS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=400, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+SENSORS = _lossy(400)
 """Wheel odometry and IMU of drivers that publish best effort."""
 
 SENSORS_RELIABLE = _reliable(400)

@@ -45,18 +45,16 @@ PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic. about: what its messages hold, with units and frames. instead_of: the topic that
-    it replaces by parameter, where it does. is_optional: its subscribers do without it where nobody
-    publishes it. on_demand_by: who subscribes only while somebody needs what it makes of it.
-    also_by: further publishers.
+    """One topic. instead_of: the topic that it replaces by parameter, where it does. is_optional:
+    its subscribers do without it where nobody publishes it. on_demand_by: who subscribes only while
+    somebody needs what it makes of it. also_by: further publishers.
     """
 
     name: str
     type: type[Any]
     profile: QoSProfile
     publisher: str
-    subscribers: tuple[str, ...]
-    about: str
+    subscribers: tuple[str, ...] = ()
     instead_of: str = ''
     is_optional: bool = False
     on_demand_by: tuple[str, ...] = ()
@@ -68,357 +66,93 @@ class Topic:
         return f'{self.type.__module__.split(".")[0]}/msg/{self.type.__name__}'
 
 
-def _images() -> list[Topic]:
-    topics = []
-    for side in ('left', 'right'):
-        raw, rectified, info = f'{side}/image_raw', f'{side}/image_rect', f'{side}/camera_info'
-        name = f'{side.capitalize()} image'
-        topics += [
-            Topic(raw, Image, qos.IMAGES, CAMERA, (SLAM,), f'{name}, raw.'),
-            _compressed(raw, CAMERA, f'{name}, raw, as JPEG or PNG'),
-            Topic(
-                rectified,
-                Image,
-                qos.IMAGES,
-                OTHERS,
-                (SLAM,),
-                f'{name}, rectified; taken instead of {raw} by parameter.',
-                instead_of=raw,
-            ),
-            _compressed(rectified, OTHERS, f'{name}, rectified, as JPEG or PNG'),
-            Topic(info, CameraInfo, qos.IMAGES, CAMERA, (SLAM,), f'Calibration for {raw}.'),
-        ]
-    return topics
-
-
-def _compressed(image: str, publisher: str, what: str) -> Topic:
-    """Return the topic of an image for thin links, named as image_transport does."""
-    about = f'{what}; instead of {image} by parameter.'
-    name = f'{image}/compressed'
-    return Topic(name, CompressedImage, qos.IMAGES, publisher, (SLAM,), about, instead_of=image)
-
-
+SIDES = ('left', 'right')
 FRAME_PARTS = tuple(
-    f'frame/{side}/{what}' for side in ('left', 'right') for what in ('image_rect', 'camera_info')
+    f'frame/{side}/{what}' for side in SIDES for what in ('image_rect', 'camera_info')
 )
 
 
-def _frame_images() -> list[Topic]:
-    about = 'Every tracked frame, rectified, some 240 pixels wide; published while someone listens'
+def _images(side: str) -> list[Topic]:
+    """Return the topics of one camera; those for thin links are named as image_transport does."""
+    raw, rectified = f'{side}/image_raw', f'{side}/image_rect'
+    packed = '/compressed'
     return [
+        Topic(raw, Image, qos.IMAGES, CAMERA, (SLAM,)),
+        Topic(raw + packed, CompressedImage, qos.IMAGES, CAMERA, (SLAM,), instead_of=raw),
+        Topic(rectified, Image, qos.IMAGES, OTHERS, (SLAM,), instead_of=raw),
         Topic(
-            name,
-            CameraInfo if name.endswith('camera_info') else Image,
-            qos.FRAMES,
-            SLAM,
-            (),
-            f'Calibration for {name.replace("camera_info", "image_rect")}.'
-            if name.endswith('camera_info')
-            else f'{about}.',
-            is_optional=True,
-            on_demand_by=(FLOOR,),
-        )
-        for name in FRAME_PARTS
+            rectified + packed, CompressedImage, qos.IMAGES, OTHERS, (SLAM,), instead_of=rectified
+        ),
+        Topic(f'{side}/camera_info', CameraInfo, qos.IMAGES, CAMERA, (SLAM,)),
     ]
 
 
-def _keyframe_images() -> list[Topic]:
-    topics = []
-    for side in ('left', 'right'):
-        image, info = f'keyframe/{side}/image_rect', f'keyframe/{side}/camera_info'
-        about = f'{side.capitalize()} image of the keyframe, rectified, mono8.'
-        topics += [
-            Topic(image, Image, qos.KEYFRAMES, SLAM, (FLOOR,), about),
-            Topic(info, CameraInfo, qos.KEYFRAMES, SLAM, (FLOOR,), f'Calibration for {image}.'),
-        ]
-    return topics
+def _keyframe_images(side: str) -> list[Topic]:
+    return [
+        Topic(f'keyframe/{side}/image_rect', Image, qos.KEYFRAMES, SLAM, (FLOOR,)),
+        Topic(f'keyframe/{side}/camera_info', CameraInfo, qos.KEYFRAMES, SLAM, (FLOOR,)),
+    ]
+
+
+def _frame_images() -> list[Topic]:
+    kinds = {name: CameraInfo if name.endswith('camera_info') else Image for name in FRAME_PARTS}
+    return [
+        Topic(name, kind, qos.FRAMES, SLAM, is_optional=True, on_demand_by=(FLOOR,))
+        for name, kind in kinds.items()
+    ]
 
 
 _ALL = [
-    *_images(),
+    *(topic for side in SIDES for topic in _images(side)),
+    Topic('wheel_odometry', Odometry, qos.SENSORS_RELIABLE, OTHERS, (SLAM,), is_optional=True),
+    Topic('depth/image_raw', Image, qos.IMAGES, OTHERS, (SLAM,), instead_of='right/image_raw'),
+    Topic('imu', Imu, qos.SENSORS_RELIABLE, OTHERS, (SLAM,), is_optional=True),
+    Topic('odometry', Odometry, qos.ODOMETRY, SLAM, is_optional=True, on_demand_by=(CLOUD,)),
     Topic(
-        'wheel_odometry',
-        Odometry,
-        qos.SENSORS_RELIABLE,
-        OTHERS,
-        (SLAM,),
-        'Where the wheels have base_link, in any frame of their own. stereo_camera publishes that '
-        'of a recording.',
-        is_optional=True,
+        'initialpose', PoseWithCovarianceStamped, qos.ODOMETRY, OTHERS, (SLAM,), is_optional=True
     ),
-    Topic(
-        'depth/image_raw',
-        Image,
-        qos.IMAGES,
-        OTHERS,
-        (SLAM,),
-        'Depth aligned with the left image, 16UC1 (mm) or 32FC1 (m); taken instead of right images '
-        'by parameter, or where nobody publishes those.',
-        instead_of='right/image_raw',
-    ),
-    Topic(
-        'imu',
-        Imu,
-        qos.SENSORS_RELIABLE,
-        OTHERS,
-        (SLAM,),
-        'Angular velocity and acceleration, in a frame that tf ties to the camera. stereo_camera '
-        'publishes those of a recording.',
-        is_optional=True,
-    ),
-    Topic(
-        'odometry',
-        Odometry,
-        qos.ODOMETRY,
-        SLAM,
-        (),
-        'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
-        'lost.',
-        is_optional=True,
-        on_demand_by=(CLOUD,),
-    ),
-    Topic(
-        'initialpose',
-        PoseWithCovarianceStamped,
-        qos.ODOMETRY,
-        OTHERS,
-        (SLAM,),
-        'About where base_link is in map, as RViz publishes it: the camera is looked for there.',
-        is_optional=True,
-    ),
-    Topic(
-        'pose',
-        PoseWithCovarianceStamped,
-        qos.ODOMETRY,
-        SLAM,
-        (),
-        'Every tracked frame: base_link in map. Published while someone listens.',
-    ),
+    Topic('pose', PoseWithCovarianceStamped, qos.ODOMETRY, SLAM),
     Topic(
         'dynamic_mask',
         Image,
         qos.IMAGES_BEST_EFFORT,
         OTHERS,
         (SLAM,),
-        'mono8, 255 where something moves, of the left image that stereo_slam receives, with its '
-        'stamp; from a segmentation network. Used when there, never waited for.',
         is_optional=True,
         also_by=(CAMERA,),
     ),
+    Topic('moving_points', PointCloud2, qos.ODOMETRY, SLAM),
+    Topic(MOVING_MASK, Image, qos.KEYFRAMES, SLAM, (FLOOR,), is_optional=True),
+    Topic(FRAME_DONE, Header, qos.ODOMETRY, SLAM),
+    Topic('camera_mount', TransformStamped, qos.LATCHED, SLAM, (FLOOR,)),
+    Topic('keyframe/odometry', Odometry, qos.KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID)),
+    Topic(MAP_START, TimeReference, qos.KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID), is_optional=True),
+    Topic(MAP_LOADED, UInt8MultiArray, qos.LATCHED, SLAM, (CLOUD, GRID), is_optional=True),
+    Topic(MAP_WANTED, Header, qos.KEYFRAMES, SLAM, (CLOUD, GRID), is_optional=True),
     Topic(
-        'moving_points',
-        PointCloud2,
-        qos.ODOMETRY,
-        SLAM,
-        (),
-        'What moves, every few frames: x y z in map (m), vx vy vz (m/s, NaN where not known). '
-        'Empty where nothing does.',
+        MAP_PART, UInt8MultiArray, qos.KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)
     ),
-    Topic(
-        MOVING_MASK,
-        Image,
-        qos.KEYFRAMES,
-        SLAM,
-        (FLOOR,),
-        'mono8 on the rectified left image of the keyframe: 255 where something moves.',
-        is_optional=True,
-    ),
-    Topic(
-        FRAME_DONE,
-        Header,
-        qos.ODOMETRY,
-        SLAM,
-        (),
-        'The header of every frame that SLAM has done with: tracked, skipped or refused.',
-    ),
-    Topic(
-        'camera_mount',
-        TransformStamped,
-        qos.LATCHED,
-        SLAM,
-        (FLOOR,),
-        'Left optical frame in base_link: given, from tf, or measured from the floor.',
-    ),
-    Topic(
-        'keyframe/odometry',
-        Odometry,
-        qos.KEYFRAMES,
-        SLAM,
-        (FLOOR, CLOUD, GRID),
-        'base_link in map at the keyframe.',
-    ),
-    Topic(
-        MAP_START,
-        TimeReference,
-        qos.KEYFRAMES,
-        SLAM,
-        (FLOOR, CLOUD, GRID),
-        'The keyframe, and as time_ref when its map began: another time_ref is another map.',
-        is_optional=True,
-    ),
-    Topic(
-        MAP_LOADED,
-        UInt8MultiArray,
-        qos.LATCHED,
-        SLAM,
-        (CLOUD, GRID),
-        'What the nodes behind need of a map that was loaded, as the bytes of a map file.',
-        is_optional=True,
-    ),
-    Topic(
-        MAP_WANTED,
-        Header,
-        qos.KEYFRAMES,
-        SLAM,
-        (CLOUD, GRID),
-        'The header of the latest keyframe of a map that is to be saved.',
-        is_optional=True,
-    ),
-    Topic(
-        MAP_PART,
-        UInt8MultiArray,
-        qos.KEYFRAMES,
-        CLOUD,
-        (SLAM,),
-        'What a node knows of the map at that keyframe, as the bytes of a map file.',
-        is_optional=True,
-        also_by=(GRID,),
-    ),
-    *_keyframe_images(),
+    *(topic for side in SIDES for topic in _keyframe_images(side)),
     *_frame_images(),
-    Topic(
-        'keyframe/features',
-        PointCloud2,
-        qos.KEYFRAMES,
-        SLAM,
-        (CLOUD, GRID),
-        'Features of the keyframe: x y z in map (m, NaN where unknown), u v (px), id (-1: none).',
-    ),
-    Topic(
-        'keyframe/path',
-        Path,
-        qos.KEYFRAMES,
-        SLAM,
-        (GRID,),
-        'base_link in map of all keyframes as now optimised; each pose with its own stamp.',
-    ),
-    Topic(
-        'map_points',
-        PointCloud2,
-        qos.KEYFRAMES,
-        SLAM,
-        (CLOUD,),
-        'The whole sparse map: x y z in map (m) and id; a removed point disappears.',
-    ),
-    Topic(
-        'keyframe/disparity',
-        DisparityImage,
-        qos.KEYFRAMES,
-        FLOOR,
-        (),
-        'Disparity of the keyframe, 0 where there is no match. Published while someone listens.',
-    ),
-    Topic(
-        'keyframe/floor_mask',
-        Image,
-        qos.KEYFRAMES,
-        FLOOR,
-        (CLOUD,),
-        'mono8 on the rectified left image: 255 floor, 127 no evidence, 0 not floor.',
-    ),
-    Topic(
-        'keyframe/floor_overlay',
-        Image,
-        qos.KEYFRAMES,
-        FLOOR,
-        (),
-        'bgr8, for people: the rectified left image tinted green for floor, blue for no evidence, '
-        'red for not floor. Published while someone listens.',
-    ),
-    Topic(
-        'keyframe/v_disparity',
-        Image,
-        qos.KEYFRAMES,
-        FLOOR,
-        (),
-        'bgr8, for people: the filtered v-disparity (rows: of the de-rolled image; columns: '
-        "half pixels) and the floor's profile in green. Published while someone listens.",
-    ),
-    Topic(
-        'keyframe/floor_scan',
-        LaserScan,
-        qos.KEYFRAMES,
-        FLOOR,
-        (GRID,),
-        "How far the floor was seen per bearing, in the base's plane (m); 0: blocked right in "
-        'front, NaN: not seen. Intensities: distance of the nearest upright thing (m) or NaN.',
-    ),
-    Topic(
-        'scan',
-        LaserScan,
-        qos.KEYFRAMES,
-        FLOOR,
-        (),
-        "How far the floor is free per bearing at every tracked frame, in the base's plane (m), "
-        'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
-        'not seen. Published while someone listens.',
-    ),
-    Topic(
-        'labelled_points',
-        PointCloud2,
-        qos.KEYFRAMES,
-        CLOUD,
-        (GRID,),
-        'The sparse map with labels: x y z in map (m), id, confidence (0 to 1), label (0 unknown, '
-        '1 floor, 2 obstacle).',
-    ),
-    Topic(
-        'floor_points',
-        PointCloud2,
-        qos.KEYFRAMES,
-        CLOUD,
-        (),
-        'The floor points alone: x y z id. Published while someone listens.',
-    ),
-    Topic(
-        'obstacle_points',
-        PointCloud2,
-        qos.KEYFRAMES,
-        CLOUD,
-        (),
-        'The obstacle points alone: x y z id. Published while someone listens: at every keyframe, '
-        'and twice a second while the camera is tracked but makes none.',
-    ),
-    Topic(
-        KEYFRAME_DONE,
-        Header,
-        qos.KEYFRAMES,
-        GRID,
-        (),
-        'The header of every keyframe that goes no further: it is in the map, or a node could not '
-        'process it.',
-        also_by=(FLOOR, CLOUD),
-    ),
-    Topic(
-        'map',
-        OccupancyGrid,
-        qos.LATCHED,
-        GRID,
-        (),
-        'The map: 0 free to 100 occupied, -1 unknown; its stamp is that of the latest keyframe.',
-    ),
+    Topic('keyframe/features', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD, GRID)),
+    Topic('keyframe/path', Path, qos.KEYFRAMES, SLAM, (GRID,)),
+    Topic('map_points', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD,)),
+    Topic('keyframe/disparity', DisparityImage, qos.KEYFRAMES, FLOOR),
+    Topic('keyframe/floor_mask', Image, qos.KEYFRAMES, FLOOR, (CLOUD,)),
+    Topic('keyframe/floor_overlay', Image, qos.KEYFRAMES, FLOOR),
+    Topic('keyframe/v_disparity', Image, qos.KEYFRAMES, FLOOR),
+    Topic('keyframe/floor_scan', LaserScan, qos.KEYFRAMES, FLOOR, (GRID,)),
+    Topic('scan', LaserScan, qos.KEYFRAMES, FLOOR),
+    Topic('labelled_points', PointCloud2, qos.KEYFRAMES, CLOUD, (GRID,)),
+    Topic('floor_points', PointCloud2, qos.KEYFRAMES, CLOUD),
+    Topic('obstacle_points', PointCloud2, qos.KEYFRAMES, CLOUD),
+    Topic(KEYFRAME_DONE, Header, qos.KEYFRAMES, GRID, also_by=(FLOOR, CLOUD)),
+    Topic('map', OccupancyGrid, qos.LATCHED, GRID),
 ]
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ALL}
 """All topics by name, in the order of the data flow."""
 
-DIAGNOSTICS = Topic(
-    '/diagnostics',
-    DiagnosticArray,
-    qos.DIAGNOSTICS,
-    '',
-    (),
-    'Status of the node; the header carries the stamp of the frame or keyframe it is about.',
-)
+DIAGNOSTICS = Topic('/diagnostics', DiagnosticArray, qos.DIAGNOSTICS, OTHERS)
 """Published by every node."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.camera.row_check import rows_apart_px
+from segfloor_ros.camera.rectification import rows_apart_px
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import NS_PER_S
 from segfloor_ros.node_settings import StereoSlamNodeSettings
@@ -54,7 +54,7 @@ class CameraWatch:
         has begun.
         """
         reporter = self._node.reporter
-        reporter.health.skipped()
+        reporter.health.count('skipped')
         if not is_ready:
             words = 'skipped: calibration or mount of the camera are not known yet'
             reporter.report(stamp_ns, Level.WARN, words)

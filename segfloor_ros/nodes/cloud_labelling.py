@@ -6,45 +6,74 @@ from collections.abc import Mapping
 from typing import Any
 
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
+from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.configuration import ROBOT_PARAMETERS
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.messages.clouds import (
-    features_arrays,
-    labelled_message,
-    points_of_label,
-    sparse_cloud_arrays,
-)
+from segfloor_ros.messages import clouds
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.map_part import MapPart
-from segfloor_ros.nodes.robot_check import RobotCheck
 from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.nodes.stage_node import AnyStageNode, StageNode
+from segfloor_ros.robot import RobotSettings
 from segfloor_ros.slam.results import SparseCloud
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
+
 POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
+
 KEEP_ALIVE_S = 0.5
 
 
-class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSettings]):
+class RobotCheck:
+    """Asks a node for the parameters of the robot and compares them with those of this one."""
+
+    def __init__(self, node: AnyStageNode, other: str) -> None:
+        self._node, self._other = node, other
+        client = node.create_client(GetParameters, f'{other}/get_parameters')
+        self._client = client
+        node.at_clean_up(lambda: node.destroy_client(client))
+        self._asked: Future | None = None
+        self._theirs: dict[str, Any] = {}
+
+    def difference(self, ours: RobotSettings) -> str | None:
+        """Return in words how the robots differ, as of the last answer, and ask anew."""
+        if self._asked is not None and self._asked.done():
+            values = map(parameter_value_to_python, self._asked.result().values)
+            self._theirs = dict(zip(ROBOT_PARAMETERS, values, strict=False))
+            self._asked = None
+        if self._asked is None and self._client.service_is_ready():
+            request = GetParameters.Request(names=ROBOT_PARAMETERS)
+            self._asked = self._client.call_async(request)
+        parts = [
+            f'{name} is {value:g} here and {self._theirs[name]:g} in {self._other}'
+            for name, value in ours.robot.items()
+            if self._theirs.get(name, value) != value
+        ]
+        if not parts:
+            return None
+        return '; '.join(parts) + ': there is one robot, set it under /** in the parameter file'
+
+
+class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     """Labels the sparse map at every keyframe."""
 
     works_on_demand = True
 
-    def __init__(self) -> None:
-        super().__init__(CloudLabellingSettings, CloudLabellingNodeSettings)
-        self._robot_check = RobotCheck(self, 'floor_segmentation')
+    settings_type = CloudLabellingNodeSettings
 
     def set_up(self) -> None:
         """Make the topics."""
+        self._robot_check = RobotCheck(self, 'floor_segmentation')
         self._labelled = self.output('labelled_points')
         self._by_label = {
             FLOOR: self.output('floor_points'),
@@ -58,7 +87,7 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
     def reset_stage(self) -> None:
         """Begin without points."""
         self._part.reset()
-        self._stage = CloudLabelling(self.parameters.stage)
+        self._stage = CloudLabelling(self.settings)
         self._obstacles: PointCloud2 | None = None
 
     def restore(self, saved: MapFile) -> None:
@@ -71,26 +100,26 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
             # Also for those who listen later: without keyframes it stays as it is.
-            self._obstacles = points_of_label(*at, labelled, OBSTACLE)
+            self._obstacles = clouds.points_of_label(*at, labelled, OBSTACLE)
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
-        difference = self._robot_check.difference(self.parameters.stage)
+        difference = self._robot_check.difference(self.settings)
         if difference is not None:
             self.reporter.diagnose('robot', difference)
 
     def on_settings_changed(self) -> None:
         """Label the next keyframe with the new settings."""
-        self._stage.settings = self.parameters.stage
+        self._stage.settings = self.settings
 
     def _label(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
-        cloud = sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
-        features = features_arrays(parts[FEATURES], FEATURES)
+        cloud = clouds.sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
+        features = clouds.features_arrays(parts[FEATURES], FEATURES)
         mask = grey8_image(parts[MASK], MASK)
         T_map_base = pose_array(parts[POSE].pose.pose)
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
-        self._labelled.publish(labelled_message(stamp_ns, frame_id, labelled))
+        self._labelled.publish(clouds.labelled_message(stamp_ns, frame_id, labelled))
         self._publish_by_label(stamp_ns, frame_id, labelled)
         self._part.note(stamp_ns, frame_id)
         return {'points': len(labelled.point_id)}
@@ -98,10 +127,10 @@ class CloudLabellingNode(StageNode[CloudLabellingSettings, CloudLabellingNodeSet
     def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
         """Publish floor and obstacles, each while someone listens."""
         if self._by_label[FLOOR].get_subscription_count():
-            floor = points_of_label(stamp_ns, frame_id, labelled, FLOOR)
+            floor = clouds.points_of_label(stamp_ns, frame_id, labelled, FLOOR)
             self._by_label[FLOOR].publish(floor)
         if self._obstacles_are_wanted():
-            self._obstacles = points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
+            self._obstacles = clouds.points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
             self._by_label[OBSTACLE].publish(self._obstacles)
 
     def _obstacles_are_wanted(self) -> bool:

@@ -2,41 +2,91 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.floor.mount_check import MountCheck
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.messages.camera_info import eye_calibration
-from segfloor_ros.messages.floor import disparity_message, scan_message
+from segfloor_ros.messages.floor import disparity_message, free_scan_message, scan_message
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message, right_image
 from segfloor_ros.messages.poses import pose_array, transform_array
-from segfloor_ros.messages.topics import MOVING_MASK
+from segfloor_ros.messages.topics import FRAME_PARTS, MOVING_MASK
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
-from segfloor_ros.nodes.free_scan import FreeScan
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.nodes.stage_node import AnyStageNode, StageNode
+from segfloor_ros.nodes.when_idle import WhenIdle
 
-LEFT, RIGHT = 'keyframe/left/image_rect', 'keyframe/right/image_rect'
-LEFT_INFO, RIGHT_INFO = 'keyframe/left/camera_info', 'keyframe/right/camera_info'
+LOOK_FOR_LISTENERS_S = 0.5
+CAPACITY = 10
+
+KEYFRAME_PARTS = tuple(f'key{part}' for part in FRAME_PARTS)
 POSE = 'keyframe/odometry'
 
 
-class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentationNodeSettings]):
+class FreeScan:
+    """Publishes `scan` while someone listens: of the newest frame that has come, from small images
+    and without memory, so that it keeps up with the camera.
+
+    mount: returns that of the camera and None while it is not known.
+    """
+
+    def __init__(self, node: AnyStageNode, mount: Callable[[], tuple[str, Mount] | None]) -> None:
+        self._node = node
+        self._mount = mount
+        self._output = node.output('scan')
+        self._work = WhenIdle(node, self._process)
+        self.reset()
+        node.inputs.join(FRAME_PARTS, self._take, is_wanted=self._is_wanted, capacity=CAPACITY)
+        node.inputs.every(LOOK_FOR_LISTENERS_S, node.inputs.update)
+
+    def reset(self) -> None:
+        """Begin without a camera."""
+        self._stage: FloorSegmentation | None = None
+        self._camera: StereoCamera | None = None
+        self._newest: tuple[int, dict[str, Any]] | None = None
+
+    def _is_wanted(self) -> bool:
+        return self._output.get_subscription_count() > 0
+
+    def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        self._newest = stamp_ns, parts
+        self._work.request()
+
+    def _process(self) -> None:
+        newest, self._newest = self._newest, None
+        mount = self._mount()
+        if newest is None or mount is None:
+            return
+        try:
+            self._publish(*newest, *mount)
+        except Exception as error:
+            self._node.reporter.log_fault('scan', error)
+
+    def _publish(self, stamp_ns: int, parts: dict[str, Any], base_frame: str, mount: Mount) -> None:
+        camera, left, right = _stereo(parts, FRAME_PARTS)
+        if self._stage is None or camera != self._camera:
+            self._camera = camera
+            self._stage = FloorSegmentation(camera, self._node.settings)
+        floor = self._stage.process(left, right, mount)
+        self._output.publish(free_scan_message(stamp_ns, base_frame, floor.scan))
+
+
+class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
     """Segments the floor of every keyframe."""
 
-    works_on_demand = True
+    settings_type = FloorSegmentationNodeSettings
 
-    def __init__(self) -> None:
-        super().__init__(FloorSegmentationSettings, FloorSegmentationNodeSettings)
+    works_on_demand = True
 
     def set_up(self) -> None:
         """Make the topics."""
@@ -50,7 +100,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         self._scan = self.output('keyframe/floor_scan')
         self._free_scan = FreeScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
-        parts = (LEFT, RIGHT, LEFT_INFO, RIGHT_INFO, POSE)
+        parts = (*KEYFRAME_PARTS, POSE)
         self._keyframes = KeyframeJoin(
             self, parts, self._segment, may_process=self._has_mount, optional=(MOVING_MASK,)
         )
@@ -66,7 +116,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
         """Segment the next keyframe with the new settings, and with what is remembered."""
         self._free_scan.reset()
         if self._stage is not None:
-            self._stage.change_settings(self.parameters.stage)
+            self._stage.change_settings(self.settings)
 
     def _take_mount(self, message: TransformStamped) -> None:
         self._mount = Mount.from_transform(transform_array(message))
@@ -88,9 +138,9 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
 
     def _segment(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         assert self._mount is not None
-        stage, camera = self._stage_for(parts)
-        frame_id = parts[LEFT].header.frame_id
-        left, right = grey8_image(parts[LEFT], LEFT), right_image(parts[RIGHT], RIGHT)
+        camera, left, right = _stereo(parts, KEYFRAME_PARTS)
+        stage = self._stage_for(camera)
+        frame_id = parts[KEYFRAME_PARTS[0]].header.frame_id
         T_map_base = pose_array(parts[POSE].pose.pose)
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
         floor = stage.process(left, right, self._mount, T_map_base, moving)
@@ -123,15 +173,23 @@ class FloorSegmentationNode(StageNode[FloorSegmentationSettings, FloorSegmentati
             text = 'no message on camera_mount; is stereo_slam running?'
             self.reporter.diagnose('camera_mount', text)
 
-    def _stage_for(self, parts: Mapping[str, Any]) -> tuple[FloorSegmentation, StereoCamera]:
-        eyes = (eye_calibration(parts[topic], topic) for topic in (LEFT_INFO, RIGHT_INFO))
-        camera = StereoCalibration(*eyes).camera
+    def _stage_for(self, camera: StereoCamera) -> FloorSegmentation:
         if self._stage is None or camera != self._camera:
             self._camera = camera
-            self._stage = FloorSegmentation(camera, self.parameters.stage)
+            self._stage = FloorSegmentation(camera, self.settings)
             assert self._mount is not None
             self._mount_check = self._mount_check or MountCheck(camera, self._mount)
-        return self._stage, camera
+        return self._stage
+
+
+def _stereo(
+    parts: Mapping[str, Any], topics: Sequence[str]
+) -> tuple[StereoCamera, NDArray[np.uint8], NDArray[Any]]:
+    """Return camera and rectified images. topics: left image and calibration, then the right."""
+    left, left_info, right, right_info = topics
+    eyes = (eye_calibration(parts[topic], topic) for topic in (left_info, right_info))
+    camera = StereoCalibration(*eyes).camera
+    return camera, grey8_image(parts[left], left), right_image(parts[right], right)
 
 
 def main() -> None:

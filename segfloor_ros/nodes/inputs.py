@@ -57,13 +57,23 @@ class Inputs:
         callback: Callable[[Any], None],
         choose_profile: Callable[[], QoSProfile] | None = None,
         is_wanted: Callable[[], bool] = lambda: True,
+        is_rapid: bool = False,
     ) -> None:
         """Receive a topic of `TOPICS`. choose_profile: asked whenever the subscription is made.
-        is_wanted: asked whenever the inputs open, and by `update`.
+        is_wanted: asked whenever the inputs open, and by `update`. is_rapid: with a message all
+        are taken that have come: to wait for each costs more than the message itself.
         """
         topic = TOPICS[name]
 
         def take(message: Any, info: Mapping[str, Any]) -> None:
+            take_one(message, info)
+            for _ in range(topic.profile.depth if is_rapid else 0):
+                more = _taken(self.subscriptions[name])
+                if more is None:
+                    return
+                take_one(*more)
+
+        def take_one(message: Any, info: Mapping[str, Any]) -> None:
             stamp_ns, subscription = stamp_of(message), self.subscriptions[name]
             self._reporter.note_received(topic, stamp_ns, info, subscription)
             try:
@@ -194,3 +204,12 @@ class Inputs:
         known = name in self.subscriptions
         infos = self._node.get_publishers_info_by_topic(name) if known else []
         return len({(info.node_namespace, info.node_name) for info in infos})
+
+
+def _taken(subscription: Subscription) -> tuple[Any, Mapping[str, Any]] | None:
+    """Return a message that has come, None without one."""
+    with subscription.handle:
+        message: tuple[Any, Mapping[str, Any]] | None = subscription.handle.take_message(
+            subscription.msg_type, subscription.raw
+        )
+    return message

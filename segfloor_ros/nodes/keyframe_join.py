@@ -10,7 +10,7 @@ from typing import Any
 from sensor_msgs.msg import TimeReference
 
 from segfloor_ros.messages.headers import make_header
-from segfloor_ros.messages.progress import is_of_loaded_map, map_start_ns
+from segfloor_ros.messages.map_files import is_of_loaded_map, map_start_ns
 from segfloor_ros.messages.topics import KEYFRAME_DONE, MAP_START
 from segfloor_ros.nodes.stage_node import AnyStageNode
 

@@ -8,16 +8,14 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from rclpy.timer import Timer
-from std_srvs.srv import Trigger
 
-from segfloor_ros.errors import SegfloorError
+from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.clouds import features_arrays, labelled_arrays
 from segfloor_ros.messages.floor import scan_arrays
-from segfloor_ros.messages.grids import grid_message
+from segfloor_ros.messages.map_files import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
@@ -30,11 +28,10 @@ POINTS, FEATURES = 'labelled_points', 'keyframe/features'
 PATH, POSE, SCAN = 'keyframe/path', 'keyframe/odometry', 'keyframe/floor_scan'
 
 
-class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettings]):
+class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
     """Builds the map at every keyframe and publishes it."""
 
-    def __init__(self) -> None:
-        super().__init__(OccupancyGridSettings, OccupancyGridNodeSettings)
+    settings_type = OccupancyGridNodeSettings
 
     def set_up(self) -> None:
         """Make the topics and the service."""
@@ -43,12 +40,12 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         parts = (POINTS, FEATURES, PATH, POSE, SCAN)
         self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
         self._part = MapPart(self, self._keyframes, 'grid', lambda: self._stage.to_arrays())
-        self.offer(Trigger, 'save_map', self._save)
+        self.offer_trigger('save_map', self._save)
 
     def reset_stage(self) -> None:
         """Begin with an empty map."""
         self._part.reset()
-        self._stage = OccupancyGridMapper(self.parameters.stage)
+        self._stage = OccupancyGridMapper(self.settings)
         self._published_s = -float('inf')
 
     def restore(self, saved: MapFile) -> None:
@@ -65,7 +62,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
 
     def on_settings_changed(self) -> None:
         """Map the next keyframe with the new settings."""
-        self._stage.change_settings(self.parameters.stage)
+        self._stage.change_settings(self.settings)
 
     def _update(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
         points = labelled_arrays(parts[POINTS], POINTS)
@@ -81,7 +78,7 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         """Publish now, or when the period since the last map is over."""
         if self._later is not None:
             return
-        wait_s = self._published_s + self.parameters.own.publish_period_s - time.monotonic()
+        wait_s = self._published_s + self.settings.publish_period_s - time.monotonic()
         if wait_s <= 0:
             self._publish()
         else:
@@ -95,25 +92,20 @@ class OccupancyGridNode(StageNode[OccupancyGridSettings, OccupancyGridNodeSettin
         last_ns, frame_id = self._part.last_ns, self._part.frame_id
         self._map.publish(grid_message(last_ns, frame_id, self._stage.grid()))
 
-    def _save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        name = self.parameters.own.map_file
-        if not self._part.frame_id or not name:
-            response.message = (
-                'there is no map yet: no keyframe has arrived'
-                if name
-                else 'map_file is empty; set it to the name of a file, e.g. map.yaml'
-            )
-            return response
+    def _save(self) -> str:
+        name = self.settings.map_file
+        if not name:
+            raise SettingsError('map_file is empty; set it to the name of a file, e.g. map.yaml')
+        if not self._part.frame_id:
+            raise MapError('there is no map yet: no keyframe has arrived')
         path = FilePath(name).expanduser().absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
         try:
             save_map(self._stage.grid(), path)
-        except (SegfloorError, OSError) as error:
-            response.message = f'{path}: {error}'
-            return response
-        response.success, response.message = True, str(path)
-        return response
+        except OSError as error:
+            raise MapError(f'{path}: {error}') from None
+        return str(path)
 
 
 def main() -> None:

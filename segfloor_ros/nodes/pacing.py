@@ -49,9 +49,12 @@ class ChainPace:
 
     What a node had in its queue is lost when it is paused, deactivated or killed: when nothing
     at all has happened for some seconds, what is under way is given up.
+
+    is_on: off, any number may be under way.
     """
 
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic, is_on: bool = True) -> None:
+        self.is_on = is_on
         self._clock_s = clock_s
         self._last_sign_s = clock_s()
         self._frames: set[int] = set()
@@ -68,7 +71,8 @@ class ChainPace:
     def sent(self, stamp_ns: int) -> None:
         """Wait for SLAM to be done with this frame from now on."""
         self._last_sign_s = self._clock_s()
-        self._frames.add(stamp_ns)
+        if self.is_on:
+            self._frames.add(stamp_ns)
 
     def frame_done(self, stamp_ns: int) -> None:
         """SLAM is done with a frame; it takes them in order, so earlier ones are done or lost."""

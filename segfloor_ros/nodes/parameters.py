@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
@@ -19,14 +18,12 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from segfloor_ros.configuration import ROS_PARAMETERS, STAGE_SETTINGS
+from segfloor_ros.configuration import ROS_PARAMETERS
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.node_settings import NODE_SETTINGS, NodeSettings
-from segfloor_ros.settings import SettingSpec, StageSettings, suggestion
+from segfloor_ros.node_settings import NODE_SETTINGS, NodeSettings, is_node_parameter
+from segfloor_ros.settings import SettingSpec, suggestion
 
-Settings = TypeVar('Settings', bound=StageSettings)
-Stage = TypeVar('Stage', bound=StageSettings)
-Own = TypeVar('Own', bound=NodeSettings)
+Settings = TypeVar('Settings', bound=NodeSettings)
 
 INT_RANGE = (-(2**63), 2**63 - 1)
 FLOAT_RANGE = (-sys.float_info.max, sys.float_info.max)
@@ -57,33 +54,32 @@ def descriptor(spec: SettingSpec) -> ParameterDescriptor:
     return result
 
 
-class NodeParameters(Generic[Stage, Own]):
-    """The parameters of one node: those of its stage and its own.
+class NodeParameters(Generic[Settings]):
+    """The parameters of one node.
 
     The node must have been created with `automatically_declare_parameters_from_overrides`, which
     is how unknown names are found. Raises SettingsError naming parameter, value and range.
     """
 
-    def __init__(self, node: Node, stage: Stage, own: Own) -> None:
-        self.stage = stage
-        self.own = own
+    def __init__(self, node: Node, settings: Settings) -> None:
+        self.settings = settings
         self._read_overrides(node)
-        both: tuple[StageSettings, StageSettings] = (self.stage, self.own)
-        for settings in both:
-            for spec in settings.specs():
-                node.declare_parameter(
-                    spec.name, getattr(settings, spec.name), descriptor(spec), True
-                )
+        for spec in settings.specs():
+            value = getattr(self.settings, spec.name)
+            node.declare_parameter(spec.name, value, descriptor(spec), True)
 
     def change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Take over new values of live parameters, or none of them with the reason."""
-        values = {parameter.name: parameter.value for parameter in parameters}
         try:
-            stage, own = _changed(self.stage, values), _changed(self.own, values)
+            self._replace({parameter.name: parameter.value for parameter in parameters})
         except SettingsError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self.stage, self.own = stage, own
         return SetParametersResult(successful=True)
+
+    def _replace(self, values: Mapping[str, Any]) -> None:
+        """Take over those of the values that are this node's."""
+        names = {spec.name for spec in self.settings.specs()} & values.keys()
+        self.settings = self.settings.replaced(**{name: values[name] for name in names})
 
     def _read_overrides(self, node: Node) -> None:
         names = [
@@ -94,7 +90,7 @@ class NodeParameters(Generic[Stage, Own]):
         given = {name: node.get_parameter(name).value for name in names}
         self._refuse_unknown(given)
         given.update(self._command_line())
-        self.stage, self.own = _changed(self.stage, given), _changed(self.own, given)
+        self._replace(given)
         for name in given:
             node.undeclare_parameter(name)
 
@@ -103,21 +99,16 @@ class NodeParameters(Generic[Stage, Own]):
         lets a file's section for the node win over a plain `-p name:=value` once any file has a
         section for all nodes.
         """
-        specs = {spec.name: spec for spec in (*self.stage.specs(), *self.own.specs())}
+        specs = {spec.name: spec for spec in self.settings.specs()}
         assigned = command_line_parameters(sys.argv)
         return {name: _parsed(assigned[name], specs[name]) for name in assigned & specs.keys()}
 
     def _refuse_unknown(self, given: Mapping[str, Any]) -> None:
-        known = [spec.name for spec in (*self.stage.specs(), *self.own.specs())]
-        # A section `/**` of a parameter file reaches every node; names of other nodes are fine.
-        of_all: tuple[type[StageSettings], ...] = (
-            *STAGE_SETTINGS.values(),
-            *NODE_SETTINGS.values(),
-        )
-        elsewhere = {spec.name for settings in of_all for spec in settings.specs()}
+        known = [spec.name for spec in self.settings.specs()]
         for name in given:
-            if name not in known and name not in elsewhere:
-                node = self.stage.stage_name()
+            # A section `/**` of a parameter file reaches every node; names of other nodes are fine.
+            if not any(is_node_parameter(node, name) for node in NODE_SETTINGS):
+                node = self.settings.stage_name()
                 raise SettingsError(f'unknown parameter {node}.{name}{suggestion(name, known)}')
 
 
@@ -143,11 +134,6 @@ def _parsed(text: str, spec: SettingSpec) -> Any:
         with contextlib.suppress(ValueError):
             return float(value)
     return '' if value is None and spec.type is str else value
-
-
-def _changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    names = {field.name for field in dataclasses.fields(settings)}
-    return settings.replaced(**{name: values[name] for name in names & values.keys()})
 
 
 def _bounds(spec: SettingSpec, widest: tuple[float, float]) -> tuple[float, float]:

@@ -8,20 +8,59 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.messages.diagnostics import HEALTH, Level, Status, status_message
 from segfloor_ros.messages.health import Health
 from segfloor_ros.messages.join import StampJoiner
-from segfloor_ros.messages.losses import LossCounter, loss_in_words
 from segfloor_ros.messages.topics import DIAGNOSTICS, Topic
-from segfloor_ros.resident_memory import rss_mb
+from segfloor_ros.timing import rss_mb
 
 LOSS_LASTS_S = 10.0
+
 PROBLEM_LASTS_S = 3.0
+
 REPEAT_S = 5.0
+
+
+class LossCounter:
+    """Counts the gaps in the numbers of one topic. A number that does not grow is that of another
+    publisher, or of one that was started again: counting starts over.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._last: int | None = None
+
+    def note(self, number: int | None) -> int:
+        """Take in the number of a message, None where the middleware knows none; returns how many
+        are missing before it.
+        """
+        last, self._last = self._last, number
+        if last is None or number is None or number <= last:
+            return 0
+        self.total += number - last - 1
+        return number - last - 1
+
+    def skip(self) -> None:
+        """Let the numbers of the next messages be any: nothing was to be received meanwhile."""
+        self._last = None
+
+
+def loss_in_words(topic: str, lost: int, node: str, profile: QoSProfile) -> str:
+    """Return what was lost, why, and what to do about it."""
+    if profile.reliability == ReliabilityPolicy.BEST_EFFORT:
+        return (
+            f'{lost} messages lost on {topic}, which is taken best effort; set image_reliability '
+            'to reliable where the driver offers it, or lower the rate or the size of the images'
+        )
+    return (
+        f'{lost} messages lost on {topic}: {node} was too slow for its queue of {profile.depth}, '
+        'or the link is; lower the rate or the size of the images, let stereo_slam make fewer '
+        'keyframes, or play a recording with lossless set on stereo_camera'
+    )
 
 
 class Reporter:
@@ -80,7 +119,7 @@ class Reporter:
 
     def report_fault(self, stamp_ns: int, error: Exception) -> None:
         """Log a fault and publish a status about it."""
-        self.health.failed()
+        self.health.count('failed')
         self.log_fault(f'stamp {stamp_ns}', error)
         self.report(stamp_ns, Level.ERROR, one_line(error))
 
@@ -95,7 +134,7 @@ class Reporter:
                 if count > 1
             )
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
-            self.health.dropped()
+            self.health.count('dropped')
             self.warn(text, about=names + crowded)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 

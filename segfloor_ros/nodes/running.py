@@ -1,10 +1,11 @@
-"""Runs nodes until they are interrupted."""
+"""Runs nodes until they are interrupted, on a middleware that is set up for stereo images."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -15,15 +16,33 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from segfloor_ros.configuration import STAGE_SETTINGS
 from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.node_settings import NODE_SETTINGS
-from segfloor_ros.nodes.middleware import prepare_middleware
+
+PROFILES = Path(__file__).with_name('fastdds.xml')
+"""Shared memory for stereo images and prompt repetition of what was lost, for Fast DDS, the
+default middleware of ROS 2 Jazzy. Other middlewares do not read it.
+"""
+
+NAMED_BY = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_OTHERS = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
+_IN_FOLDER = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 INTERRUPT_HEARD_S = 0.2
+
 HELP = ('-h', '--help')
+
 M_ARENA_MAX = -8
 """Of glibc's malloc.h."""
+
+
+def prepare_middleware() -> None:
+    """Let Fast DDS take `PROFILES` in this process, unless the user has chosen otherwise. Before
+    `rclpy.init`.
+    """
+    is_chosen = any(os.environ.get(name) for name in (NAMED_BY, *_OTHERS))
+    if not is_chosen and not any(Path(name).exists() for name in _IN_FOLDER):
+        os.environ[NAMED_BY] = str(PROFILES)
 
 
 def run_node(make_node: Callable[[], Node]) -> None:
@@ -56,9 +75,9 @@ def help_text(program: str) -> str:
         f'usage: {program} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO]]',
         '',
     ]
-    for node in [program] if program in STAGE_SETTINGS else STAGE_SETTINGS:
+    for node in [program] if program in NODE_SETTINGS else NODE_SETTINGS:
         lines.append(f'parameters of {node}:')
-        for spec in (*STAGE_SETTINGS[node].specs(), *NODE_SETTINGS[node].specs()):
+        for spec in NODE_SETTINGS[node].specs():
             unit = f' {spec.unit}' if spec.unit else ''
             lines.append(f'  {spec.name} (default {spec.default!r}{unit}): {spec.description}')
     return '\n'.join(lines)

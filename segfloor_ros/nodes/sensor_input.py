@@ -1,4 +1,6 @@
-"""Wheel odometry and IMU as messages: for the node `stereo_slam`."""
+"""What the node `stereo_slam` takes besides images: wheel odometry, an IMU, masks of what moves,
+and about where the robot is.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +9,34 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Image, Imu
 
-from segfloor_ros.geometry import Array
+from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.ros_messages import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.camera.sources.sensor_files import is_upright
+from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import Measurement, WheelPose
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.sensors import NOT_MEASURED, imu_sample, wheel_pose
-from segfloor_ros.nodes.qos_check import offered_best_effort
+from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.connections import offered_best_effort
 from segfloor_ros.nodes.stage_node import AnyStageNode
 from segfloor_ros.nodes.transforms import Transforms
+from segfloor_ros.slam.stereo_slam import StereoSlam
 
 WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
+MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'
 MAX_LATE_S = 0.05
 """So long an image waits for what sensors measured up to its time."""
+
+NEAR_NS = 5_000_000
+"""Over so short a time what was measured before tells as well."""
 
 LIVE_S = 0.5
 """A sensor that has said nothing for so long is not waited for."""
@@ -32,16 +46,23 @@ TF_AFTER_S = 3.0
 """A topic is waited for so long before tf is taken for the wheels' odometry: it takes a while to
 connect."""
 
-UPRIGHT = 0.8
-"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
+
+KEPT = 30
+"""Masks that are kept for frames that have not been processed yet."""
+
+
+SIGMAS = 3.0
+
+LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.5, 0.26
+"""Nobody points more exactly than RViz says by itself: half a metre and 15 degrees."""
 
 
 class SensorInput:
     """Receives what wheels and IMU measure, in the axes of the rectified left camera.
 
     on_message: called after each. Where nobody publishes `wheel_odometry` and another node owns
-    odom → base_link, that is taken for it. Samples of an IMU are turned by tf; without it, one for
-    which up is up in the image is taken to be in the frame of the left images, others are not used.
+    odom → base_link, that is taken for it. Where an IMU is, tf tells; without it, one for which
+    up is up in the image is taken to be in the frame of the left images, others are not used.
     """
 
     def __init__(
@@ -52,13 +73,13 @@ class SensorInput:
         self._on_message = on_message
         self._takes_best_effort = False
         self.reset()
-        node.inputs.subscribe(WHEELS, self._take_wheels, self._choose_profile)
-        node.inputs.subscribe(IMU, self._take_imu, self._choose_profile)
+        for name, take in ((WHEELS, self._take_wheels), (IMU, self._take_imu)):
+            node.inputs.subscribe(name, take, self._choose_profile, is_rapid=True)
 
     def reset(self) -> None:
         """Know no camera and no measurement."""
         self._camera: tuple[str, Array] | None = None
-        self._R_left_imu: Array | None = None
+        self._T_left_imu: Array | None = None
         self._measured: deque[Measurement] = deque(maxlen=MAX_WAITING)
         self._latest: dict[str, tuple[int, float]] = {}
         self._asked: tuple[int, float] = (0, 0.0)
@@ -98,7 +119,7 @@ class SensorInput:
             return False
         self._look_at_tf(now_s)
         return any(
-            latest_ns < stamp_ns + lag_ns and now_s < heard_s + LIVE_S
+            latest_ns < stamp_ns + lag_ns - NEAR_NS and now_s < heard_s + LIVE_S
             for latest_ns, heard_s in self._latest.values()
         )
 
@@ -124,35 +145,97 @@ class SensorInput:
         self._note(WHEELS, message)
 
     def _take_imu(self, message: Imu) -> None:
-        if self._camera is not None and self._measures(message):
-            R_left_imu = self._rotation(message)
-            if R_left_imu is None:
+        if self._camera is not None and measures_motion(message):
+            T_left_imu = self._place(message)
+            if T_left_imu is None:
                 self._node.reporter.diagnose(
                     IMU,
                     f'no tf from {self._camera[0]} to {message.header.frame_id or "its frame"}: '
                     f'{IMU} is not used; let another node publish where the IMU is',
                 )
                 return
-            self._measured.append(imu_sample(message, R_left_imu))
+            self._measured.append(imu_sample(message, T_left_imu))
         self._note(IMU, message)
 
-    def _measures(self, message: Imu) -> bool:
-        covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
-        return all(covariance[0] != NOT_MEASURED for covariance in covariances)
-
-    def _rotation(self, message: Imu) -> Array | None:
+    def _place(self, message: Imu) -> Array | None:
+        """Return where the IMU is in the rectified left optical frame (4, 4); tf may come late."""
         assert self._camera is not None
-        if self._R_left_imu is None:
+        if self._T_left_imu is None:
             left_frame, R_rectified_left = self._camera
-            R = self._transforms.rotation(left_frame, message.header.frame_id)
-            if R is None:
-                felt = message.linear_acceleration
-                length = np.linalg.norm([felt.x, felt.y, felt.z])
-                R = np.eye(3) if -felt.y > UPRIGHT * length else None
-            self._R_left_imu = None if R is None else R_rectified_left @ R
-        return self._R_left_imu
+            T_rectified_left = make_transform(R_rectified_left, np.zeros(3))
+            T = self._transforms.between(left_frame, message.header.frame_id)
+            if T is None:
+                return T_rectified_left if is_upright(xyz(message.linear_acceleration)) else None
+            self._T_left_imu = T_rectified_left @ T
+        return self._T_left_imu
 
     def _note(self, name: str, message: Odometry | Imu) -> None:
         latest_ns = max(to_ns(message.header.stamp), self._latest.get(name, (0, 0.0))[0])
         self._latest[name] = latest_ns, time.monotonic()
         self._on_message()
+
+
+class MaskInput:
+    """Receives masks and gives each frame the one of its stamp, or the latest that is not too old:
+    a network is slower than the camera, and no frame waits for it.
+    """
+
+    def __init__(self, node: AnyStageNode, timeout_s: float) -> None:
+        self._timeout_ns = round(timeout_s * 1e9)
+        self.reset()
+        node.inputs.subscribe(MASKS, self.take)
+
+    def reset(self) -> None:
+        """Forget the masks."""
+        self._masks: dict[int, Image] = {}
+
+    def take(self, message: Image) -> None:
+        """Keep a mask."""
+        self._masks[to_ns(message.header.stamp)] = message
+        while len(self._masks) > KEPT:
+            del self._masks[min(self._masks)]
+
+    def mask_for(self, stamp_ns: int, rectifier: StereoRectifier) -> NDArray[np.uint8] | None:
+        """Return the mask (H, W) uint8 on the rectified left image of a frame, None where there is
+        none. Raises InputError for one that is no grey image, CalibrationError for a wrong size.
+        """
+        fitting = [at for at in self._masks if stamp_ns - self._timeout_ns <= at <= stamp_ns]
+        if not fitting:
+            return None
+        mask = grey8_image(self._masks[max(fitting)], MASKS)
+        return rectifier.rectify_mask(mask)
+
+
+class InitialPose:
+    """Narrows the search of the camera in a known map to the surroundings of a pose."""
+
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+        self._node = node
+        self._map_frame = own.map_frame
+        self.reset()
+        node.inputs.subscribe(INITIAL_POSE, self._take)
+
+    def reset(self) -> None:
+        """Know no pose."""
+        self._given: tuple[Array, float, float] | None = None
+
+    def apply(self, slam: StereoSlam) -> None:
+        """Have SLAM look around a pose that was given since the last call, once it has a map."""
+        if self._given is not None and slam.mount is not None and slam.map.keyframes:
+            slam.search_near(*self._given)
+            self._given = None
+
+    def _take(self, message: PoseWithCovarianceStamped) -> None:
+        if message.header.frame_id not in ('', self._map_frame):
+            self._node.reporter.warn(
+                f'{INITIAL_POSE} is in frame {message.header.frame_id}; give it in '
+                f'{self._map_frame}'
+            )
+            return
+        T_map_base = pose_array(message.pose.pose)
+        sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
+        reach_m = SIGMAS * max(float(sigma[:3].max()), LEAST_SIGMA_M)
+        reach_rad = SIGMAS * max(float(sigma[3:].max()), LEAST_SIGMA_RAD)
+        self._given = T_map_base, reach_m, reach_rad
+        x, y = T_map_base[:2, 3].tolist()
+        self._node.get_logger().info(f'looks within {reach_m:.1f} m around x {x:.2f}, y {y:.2f}')

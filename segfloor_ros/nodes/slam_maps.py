@@ -10,10 +10,9 @@ from pathlib import Path
 from rclpy.task import Future
 from rclpy.timer import Timer
 from std_msgs.msg import UInt8MultiArray
-from std_srvs.srv import Trigger
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.errors import MapError, SegfloorError, SettingsError
+from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.map_files import map_file_message, map_file_of
@@ -52,13 +51,12 @@ class SlamMaps:
         self._loaded = node.output(MAP_LOADED)
         self._wanted = node.output(MAP_WANTED)
         node.inputs.subscribe(MAP_PART, self._take_part)
-        node.offer(Trigger, '~/save_map', self._answer_save)
-        node.offer(Trigger, '~/load_map', self._answer_load)
+        node.offer_trigger('~/save_map', self._save)
+        node.offer_trigger('~/load_map', self._load)
 
     @property
     def _own(self) -> StereoSlamNodeSettings:
-        own = self._node.parameters.own
-        assert isinstance(own, StereoSlamNodeSettings)
+        own: StereoSlamNodeSettings = self._node.settings
         return own
 
     def read(self) -> MapFile | None:
@@ -98,32 +96,13 @@ class SlamMaps:
         saved.header['start_ns'] = start_ns
         return saved
 
-    def _answer_load(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        name = self._own.load_map
-        try:
-            if not name:
-                raise SettingsError('load_map is empty; set it to the name of a saved map')
-            self._on_load()
-        except SegfloorError as error:
-            response.message = str(error)
-            return response
-        response.success, response.message = True, name
-        return response
+    def _load(self) -> str:
+        if not self._own.load_map:
+            raise SettingsError('load_map is empty; set it to the name of a saved map')
+        self._on_load()
+        return self._own.load_map
 
-    async def _answer_save(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        try:
-            response.message = str(await self._save())
-        except SegfloorError as error:
-            response.message = str(error)
-            return response
-        response.success = True
-        return response
-
-    async def _save(self) -> Path:
+    async def _save(self) -> str:
         """Gather the map and write it beside tracking, which goes on meanwhile."""
         name = self._own.save_map
         if not name:
@@ -148,7 +127,7 @@ class SlamMaps:
             await _in_background(partial(write_map_file, path, saved))
         finally:
             self._stop(give_up)
-        return path
+        return str(path)
 
     def _refuse_to_overwrite(self, path: Path) -> None:
         """Raise MapError where a map would be replaced that the drive has not recognised."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -23,19 +23,16 @@ from segfloor_ros.node_settings import NodeSettings
 from segfloor_ros.nodes.connections import Connections
 from segfloor_ros.nodes.inputs import Inputs
 from segfloor_ros.nodes.kept_state import KeptState
-from segfloor_ros.nodes.life_cycle import refuse_impossible_transitions
 from segfloor_ros.nodes.parameters import NodeParameters
 from segfloor_ros.nodes.reporter import Reporter
-from segfloor_ros.settings import StageSettings
 
-Stage = TypeVar('Stage', bound=StageSettings)
-Own = TypeVar('Own', bound=NodeSettings)
+Settings = TypeVar('Settings', bound=NodeSettings)
 
 CONNECTION_CHECK_S = 0.1
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class StageNode(LifecycleNode, Generic[Stage, Own]):
+class StageNode(LifecycleNode, Generic[Settings]):
     """A managed node (REP-2002 in rclpy's form) around one stage, with the services `~/pause` and
     `~/reset`.
 
@@ -45,19 +42,23 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
     other; the depth of the subscriptions is the queue.
     """
 
+    settings_type: type[Settings]
+    """Of the node's parameters; the nodes fill it in."""
+
     works_on_demand = False
     """Whether messages that nobody needs the results of may be missed."""
 
-    def __init__(self, stage: type[Stage], own: type[Own]) -> None:
-        super().__init__(stage.stage_name(), automatically_declare_parameters_from_overrides=True)
-        self.parameters: NodeParameters[Stage, Own] = NodeParameters(self, stage(), own())
+    def __init__(self) -> None:
+        settings = self.settings_type
+        super().__init__(
+            settings.stage_name(), automatically_declare_parameters_from_overrides=True
+        )
+        self.parameters = NodeParameters(self, settings())
         self.add_on_set_parameters_callback(self._change_parameters)
         self.reporter = Reporter(self)
         self.inputs = Inputs(self, self.reporter)
         self.connections = Connections(self, self.reporter, self.inputs)
-        self.kept_state = KeptState(
-            self.get_fully_qualified_name(), self.parameters.own.resume_within_s
-        )
+        self.kept_state = KeptState(self.get_fully_qualified_name(), self.settings.resume_within_s)
         self._at_clean_up: list[Callable[[], Any]] = []
         self._state = 'unconfigured'
         self._is_paused, self._is_needed = False, True
@@ -65,7 +66,7 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
         self._last_health_s = 0.0
         refuse_impossible_transitions(self)
         self.inputs.steady_timer(CONNECTION_CHECK_S, self._check)
-        if self.parameters.own.autostart:
+        if self.settings.autostart:
             self._configure_and_activate()
 
     # What the nodes fill in.
@@ -102,6 +103,11 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
     # What they use.
 
     @property
+    def settings(self) -> Settings:
+        """The node's parameters as they are now."""
+        return self.parameters.settings
+
+    @property
     def state_in_words(self) -> str:
         """The state of the node: unconfigured, inactive, active, paused, idle or finalized."""
         if self._state == 'active' and self._is_paused:
@@ -124,6 +130,22 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
         """
         made = self.create_service(kind, name, answer, callback_group=ReentrantCallbackGroup())
         self.at_clean_up(lambda: self.destroy_service(made))
+
+    def offer_trigger(self, name: str, work: Callable[[], str | Awaitable[str]]) -> None:
+        """Offer a service that does some work and answers with its message, or with why it failed.
+        work: may return an awaitable; raises SegfloorError or OSError.
+        """
+
+        async def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                message = work()
+                response.message = message if isinstance(message, str) else await message
+                response.success = True
+            except (SegfloorError, OSError) as error:
+                response.message = str(error)
+            return response
+
+        self.offer(Trigger, name, answer)
 
     def at_clean_up(self, step: Callable[[], Any]) -> None:
         """Do something when the node is cleaned up; the last one first."""
@@ -278,4 +300,23 @@ class StageNode(LifecycleNode, Generic[Stage, Own]):
         return result
 
 
-AnyStageNode = StageNode[Any, Any]
+AnyStageNode = StageNode[Any]
+
+
+def refuse_impossible_transitions(node: LifecycleNode) -> None:
+    """Let the service `~/change_state` refuse a transition that the present state does not have;
+    rclpy's own answer to it raises, which would end the node.
+    """
+    name = node.resolve_service_name('~/change_state')
+    (service,) = (found for found in node.services if found.srv_name == name)
+    change_state = service.callback
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return change_state(request, response)
+        except RuntimeError as error:  # rcl's error of a transition that is not registered
+            node.get_logger().warning(str(error).partition(', at ')[0])
+            response.success = False
+            return response
+
+    service.callback = answer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -10,18 +11,21 @@ import numpy as np
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
+from segfloor_ros.camera.bag_messages import IMU_FRAME
 from segfloor_ros.camera.images import Grey
-from segfloor_ros.camera.settings import SENSORS, StereoCameraSettings
+from segfloor_ros.camera.settings import SENSORS
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.headers import stamp_of, to_time
 from segfloor_ros.messages.images import compressed_message, image_message
+from segfloor_ros.messages.poses import transform_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
@@ -29,6 +33,7 @@ from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.nodes.pacing import ChainPace, ClockPace
 from segfloor_ros.nodes.running import run_node
 from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.nodes.transforms import TfLink
 
 LOOK_AGAIN_S = 0.05
 """How often is looked for subscribers, and whether the chain has room: its answers say so too."""
@@ -36,23 +41,23 @@ AFTER_THE_END_S = 1.0
 LOG_WAITING_S = 5.0
 
 
-class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]):
+class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
     """Publishes every pair with its own stamp, once somebody listens."""
 
-    def __init__(self) -> None:
-        super().__init__(StereoCameraSettings, StereoCameraNodeSettings)
+    settings_type = StereoCameraNodeSettings
 
     def set_up(self) -> None:
         """Open the recording and make the topics."""
-        if not self.parameters.stage.input:
+        if not self.settings.input:
             raise InputError('stereo_camera.input is empty; name a recording or a device')
-        own = self.parameters.own
+        own = self.settings
         use_rosbag2_py()
-        self._source: StereoSource = open_source(self.parameters.stage)
+        self._source: StereoSource = open_source(self.settings)
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
+        self._imu_frame = ''
         self._compressed = own.image_transport == 'compressed'
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
-        self._has_depth = any(s.name == DEPTH and s.used for s in self._source.sensors)
+        self._has_depth = self._source.takes_depth
         sides = ('left',) if self._has_depth else ('left', 'right')
         self._images = {side: self.output(f'{side}/{kind}') for side in sides}
         self._infos = {side: self.output(f'{side}/camera_info') for side in sides}
@@ -76,23 +81,25 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
 
     def reset_stage(self) -> None:
         """Begin with the first frame."""
-        own = self.parameters.own
+        own = self.settings
         self._pairs = self._source.raw_pairs()
         self._measurements = MeasurementLog(self._source.sensors)
         self._measurements_sent = dict.fromkeys(self._sensors, 0)
         self._next: RawPair | None = None
+        if not self._imu_frame:
+            self._imu_frame = self._place_imu(self._measurements.imu_place_m)
         self._frames_sent = 0
         self._connected = self._finished = False
         self._logged_waiting_s = time.monotonic()
-        self._clock_pace = ClockPace(own.rate) if own.rate else None
-        self._chain_pace = ChainPace() if own.lossless or not own.rate else None
+        self._clock_pace = ClockPace(own.rate or math.inf)
+        self._chain_pace = ChainPace(is_on=own.lossless or not own.rate)
+        self._paces = (self._clock_pace, self._chain_pace)
 
     def on_inputs_opened(self) -> None:
         """Keep the recording's pace from here on."""
         self._logged_waiting_s = time.monotonic()
-        for pace in (self._clock_pace, self._chain_pace):
-            if pace is not None:
-                pace.restart()
+        for pace in self._paces:
+            pace.restart()
 
     def _stop_reading(self) -> None:
         self._pairs = iter(())
@@ -102,8 +109,7 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
 
         def follow(name: str, note: Callable[[ChainPace, int], None]) -> None:
             def take(message: Any) -> None:
-                if self._chain_pace is not None:
-                    note(self._chain_pace, stamp_of(message))
+                note(self._chain_pace, stamp_of(message))
                 if self.inputs.is_open:
                     self._advance()
 
@@ -135,20 +141,20 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
         """
         if self._finished:
             return False
-        if not self._connected or self._chain_pace is not None:
+        if not self._connected or self._chain_pace.is_on:
             outputs = (*self._images.values(), *self._infos.values())
             silent = [out.topic_name for out in outputs if not out.get_subscription_count()]
             if silent:
                 self._log_waiting_for('subscribers of ' + ', '.join(silent))
-            if silent and self._connected and self._chain_pace is not None:
+            if silent and self._connected:
                 self._chain_pace.drop_frames()
                 self._chain_pace.restart()
             self._connected = not silent
         return self._connected
 
     def _wait_s(self, pair: RawPair) -> float:
-        wait_s = 0.0 if self._clock_pace is None else self._clock_pace.wait_s(pair.stamp_ns)
-        if wait_s > 0 or self._chain_pace is None or self._chain_pace.ready():
+        wait_s = self._clock_pace.wait_s(pair.stamp_ns)
+        if wait_s > 0 or self._chain_pace.ready():
             return wait_s
         given_up = self._chain_pace.give_up()
         if given_up:
@@ -172,9 +178,8 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
     def _send(self, pair: RawPair) -> None:
         calibration = self._source.calibration
         eyes = {'left': (pair.left, calibration.left), 'right': (pair.right, calibration.right)}
-        for pace in (self._clock_pace, self._chain_pace):
-            if pace is not None:
-                pace.sent(pair.stamp_ns)
+        for pace in self._paces:
+            pace.sent(pair.stamp_ns)
         self._logged_waiting_s = time.monotonic()
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
@@ -201,14 +206,27 @@ class StereoCameraNode(StageNode[StereoCameraSettings, StereoCameraNodeSettings]
             self._sensors[name].publish(wheel_message(measurement, 'base_link'))
         else:
             R_left_rectified = self._source.calibration.left.R.T
-            left_frame = self._frame_ids['left']
-            self._sensors[name].publish(imu_message(measurement, left_frame, R_left_rectified))
+            self._sensors[name].publish(imu_message(measurement, self._imu_frame, R_left_rectified))
         self._measurements_sent[name] += 1
+
+    def _place_imu(self, place_m: Array) -> str:
+        """Return the frame of an IMU at a place (3,) in the rectified left optical frame; one that
+        is elsewhere than the camera has a frame of its own on tf.
+        """
+        left_frame = self._frame_ids['left']
+        link = TfLink(self) if place_m.any() else None
+        if link is None or not link.is_there:
+            return left_frame
+        link.stop_listening()
+        R_left_rectified = self._source.calibration.left.R.T
+        T_left_imu = make_transform(np.eye(3), R_left_rectified @ place_m)
+        link.send_fixed(transform_message(0, left_frame, IMU_FRAME, T_left_imu))
+        return IMU_FRAME
 
     def _image_message(self, stamp_ns: int, frame_id: str, image: Grey) -> Any:
         if not self._compressed:
             return image_message(stamp_ns, frame_id, image)
-        own = self.parameters.own
+        own = self.settings
         quality = own.jpeg_quality if own.compression == 'jpeg' else None
         return compressed_message(stamp_ns, frame_id, image, quality)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,22 +16,62 @@ from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.images import EightBitScale
+from segfloor_ros.camera.images import EightBitScale, depth_image, grey_image
 from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.ros_messages import eye_calibration
+from segfloor_ros.errors import InputError
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import eye_calibration, same_calibration
-from segfloor_ros.messages.errors import MessageError
-from segfloor_ros.messages.images import depth_image, grey_image
+from segfloor_ros.messages.camera_info import same_calibration
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.camera_watch import CameraWatch
-from segfloor_ros.nodes.qos_check import offered_best_effort
+from segfloor_ros.nodes.connections import offered_best_effort
 from segfloor_ros.nodes.stage_node import AnyStageNode
 
+MAX_KEPT = 100
+"""Pairs that are kept while calibration or mount are not known."""
+
+CATCH_UP = 0.2
+"""Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
+
 INFOS = ('left/camera_info', 'right/camera_info')
+
 MAX_UNPAIRED = 30
+
 DEPTH = 'depth/image_raw'
+
 DISCOVERY_S = 4.0
 """Publishers of one driver are seen one after the other, the last ones after so long."""
+
+
+Pair = dict[str, Any]
+"""A left and a right message of the same time, by topic."""
+
+StampedPair = tuple[int, Pair]
+
+
+class PairQueue(deque[StampedPair]):
+    """Keeps the newest pairs: a late pose is of no use to a robot. What came before processing
+    could begin is caught up on, not thrown away at once.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._allowed: float = MAX_KEPT
+
+    def skip_overdue(self, is_ready: bool, least: int) -> list[StampedPair]:
+        """Take out the oldest pairs that are too many and return them. is_ready: processing has
+        begun; then no more than `least` wait for long.
+        """
+        if is_ready:
+            self._allowed = max(min(self._allowed - CATCH_UP, len(self)), least)
+        skipped = []
+        while len(self) > self._allowed:
+            skipped.append(self.popleft())
+        return skipped
+
+    def reset(self) -> None:
+        """Keep many pairs again, as at the start."""
+        self._allowed = MAX_KEPT
 
 
 @dataclass(frozen=True)
@@ -58,10 +99,6 @@ def _kinds(use_depth: bool) -> list[Kind]:
     pairs = [Kind(f'left/{name}', f'right/{name}', *of) for name, *of in names]
     depth = [Kind(f'left/{name}', DEPTH, *of) for name, *of in names]
     return depth if use_depth else [*pairs, *depth]
-
-
-Pair = dict[str, Any]
-"""A left and a right message of the same time, by topic."""
 
 
 class StereoInput:
@@ -150,7 +187,7 @@ class StereoInput:
     def images(self, pair: Pair) -> tuple[NDArray[np.uint8], NDArray[Any]]:
         """Return the rectified grey images (H, W) of a pair, or the left one and a disparity.
 
-        Raises MessageError.
+        Raises InputError.
         """
         if self._kind.is_depth:
             return self._depth_images(pair)
@@ -163,7 +200,7 @@ class StereoInput:
         grey, depth = grey_image(pair[self.left], self.left), depth_image(pair[DEPTH], DEPTH)
         if grey.shape != depth.shape:
             (rows, columns), (grey_rows, grey_columns) = depth.shape, grey.shape
-            raise MessageError(
+            raise InputError(
                 f'{DEPTH}: {columns}x{rows}, but {self.left} is {grey_columns}x{grey_rows}; take '
                 'the depth images that are aligned with them'
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.errors import InputError
@@ -13,21 +14,16 @@ from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.messages.topics import FRAME_DONE
 from segfloor_ros.node_settings import StereoSlamNodeSettings
-from segfloor_ros.nodes.initial_pose import InitialPose
-from segfloor_ros.nodes.lost_time import LostTime
-from segfloor_ros.nodes.mask_input import MaskInput
-from segfloor_ros.nodes.pair_queue import PairQueue
 from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.sensor_input import SensorInput
+from segfloor_ros.nodes.sensor_input import InitialPose, MaskInput, SensorInput
 from segfloor_ros.nodes.slam_maps import SlamMaps
-from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamOutputs
+from segfloor_ros.nodes.slam_outputs import CameraFrames, LostTime, SlamOutputs
 from segfloor_ros.nodes.stage_node import StageNode
-from segfloor_ros.nodes.stereo_input import Pair, StereoInput
+from segfloor_ros.nodes.stereo_input import Pair, PairQueue, StereoInput
 from segfloor_ros.nodes.transforms import Transforms
 from segfloor_ros.nodes.when_idle import WhenIdle
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, saved_camera
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 
@@ -35,22 +31,25 @@ LOOK_AGAIN_S = 0.2
 PATIENCE_S = 5.0
 """For how long the place where the node was killed is looked for before a new map begins."""
 REMARK_AGAIN_S = 600.0
+NEXT_S, IDLE_S = 0.005, 0.05
+"""Results that were held back are published one by one: others need time to take each of them."""
+MAPPING_APART = 'lost; maps on its own until it recognises a place of the map'
 
 
-class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
+class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
     """Tracks every stereo pair and publishes what comes of it."""
+
+    settings_type = StereoSlamNodeSettings
 
     works_on_demand = True
 
-    def __init__(self) -> None:
-        super().__init__(StereoSlamSettings, StereoSlamNodeSettings)
-
     def set_up(self) -> None:
         """Make the topics."""
-        own = self.parameters.own
+        own = self.settings
         self._slam: StereoSlam | None = None
         self._ready: tuple[StereoSlam, StereoCamera] | None = None
-        self._waiting: PairQueue[tuple[int, Pair]] = PairQueue()
+        self._waiting = PairQueue()
+        self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
         self._outputs = SlamOutputs(self, own)
         self._frame_done = self.output(FRAME_DONE)
         self._transforms = Transforms(self, own)
@@ -61,6 +60,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._maps = SlamMaps(self, self._known, lambda: self.reset('by ~/load_map'))
         self._initial_pose = InitialPose(self, own)
         self.inputs.every(LOOK_AGAIN_S, self._look_again)
+        self.inputs.repeat(self._send_next)
         self.at_clean_up(self._end_stage)
 
     def reset_stage(self) -> None:
@@ -70,6 +70,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         saved = self._maps.read()
         self._end_stage()
         self._waiting.reset()
+        self._unsent.clear()
         self._outputs.reset(self.get_clock().now().nanoseconds, is_loaded=saved is not None)
         self._transforms.reset()
         self._camera.reset()
@@ -85,7 +86,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._frame_count = 0
         self._unannounced: tuple[MapFile, LoadedMap] | None = None
         if saved is not None:
-            name, own = self.parameters.own.load_map, self.parameters.own
+            name, own = self.settings.load_map, self.settings
             slam, camera = self._ready = self._make_slam(saved_camera(saved, name))
             loaded = load_slam(slam, camera, saved, name, own.localize)
             self._unannounced = saved, loaded
@@ -119,7 +120,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         self._camera.watch.find_problems(missing)
 
     def _take_pair(self, stamp_ns: int, pair: Pair) -> None:
-        self._waiting.add((stamp_ns, pair))
+        self._waiting.append((stamp_ns, pair))
         self._work.request()
 
     def _look_at_waiting(self) -> None:
@@ -139,15 +140,15 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         """
         if not self._waiting:
             return
-        is_ready = self._is_ready(self._waiting.first[1])
-        least = self.parameters.own.max_waiting_frames
+        is_ready = self._is_ready(self._waiting[0][1])
+        least = self.settings.max_waiting_frames
         for stamp_ns, _ in self._waiting.skip_overdue(is_ready, least):
             self._camera.watch.report_skipped(stamp_ns, is_ready)
             self._frame_done.publish(make_header(stamp_ns, self._frames.left))
         lag_ns = self._slam.sensors.lag_ns if self._slam is not None else 0
-        if not is_ready or self._sensors.is_behind(self._waiting.first[0], lag_ns):
+        if not is_ready or self._sensors.is_behind(self._waiting[0][0], lag_ns):
             return
-        stamp_ns, pair = self._waiting.take()
+        stamp_ns, pair = self._waiting.popleft()
         self._work.request()
         if self._is_in_order(stamp_ns):
             self._process(stamp_ns, pair)
@@ -164,7 +165,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         return self._transforms.mount_is_settled(self._camera.frame_ids(pair)[0])
 
     def _mount_is_given(self) -> bool:
-        settings = self.parameters.stage
+        settings = self.settings
         given = (settings.camera_height_m, settings.camera_pitch_rad, settings.camera_roll_rad)
         return not all(math.isnan(value) for value in given)
 
@@ -198,10 +199,11 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             self.reporter.report_fault(stamp_ns, error)
             return
         milliseconds = 1e3 * (time.perf_counter() - start)
-        for result in results:
-            self._publish(result, slam, milliseconds / len(results))
-            if result.stamp_ns == stamp_ns and result.tracked:
-                self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
+        self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
+        if results and results[-1].stamp_ns == stamp_ns and results[-1].tracked:
+            self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
+        if len(self._unsent) == 1:
+            self._send_next()
         for about, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(about, remark, repeat_s=REMARK_AGAIN_S)
         if self._lost.lost_s(stamp_ns) > PATIENCE_S and self._is_resumed and not self._lost.found:
@@ -209,7 +211,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         elif self._mount is not None and not slam.is_adjusting:
             self._maps.keep(slam)
         if not results:
-            self._publish_provisional(stamp_ns, slam.provisional)
+            self._report_held(stamp_ns, slam)
 
     def _start(self, stamp_ns: int, pair: Pair) -> StereoSlam:
         """Build the stage, now that the calibration is known."""
@@ -219,7 +221,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
         if self._ready is not None and self._ready[1] != camera:
             if not self._is_resumed:
                 raise InputError(
-                    f'{self.parameters.own.load_map}: was made with another camera or calibration; '
+                    f'{self.settings.load_map}: was made with another camera or calibration; '
                     'map anew'
                 )
             self._ready = None
@@ -233,7 +235,7 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def _make_slam(
         self, camera: StereoCamera, mount: Mount | None = None
     ) -> tuple[StereoSlam, StereoCamera]:
-        stage, background = self.parameters.stage, self.parameters.own.background
+        stage, background = self.settings, self.settings.background
         return make_slam(camera, stage, mount, background=background), camera
 
     def _end_stage(self) -> None:
@@ -244,6 +246,12 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
     def _known(self) -> tuple[StereoSlam, StereoCamera, int] | None:
         """Return what can be saved."""
         return self._ready and (*self._ready, self._outputs.map_start_ns)
+
+    def _send_next(self) -> float:
+        """Publish the oldest result that is not yet; return in how many seconds the next is due."""
+        if self._unsent:
+            self._publish(*self._unsent.popleft())
+        return NEXT_S if self._unsent else IDLE_S
 
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self._mount is None and result.tracked and slam.mount is not None:
@@ -266,13 +274,19 @@ class StereoSlamNode(StageNode[StereoSlamSettings, StereoSlamNodeSettings]):
             **self._lost.note(result.stamp_ns, result.tracked),
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
             blind=int(result.blind),
+            apart=int(result.apart),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
 
-    def _publish_provisional(self, stamp_ns: int, result: FrameResult | None) -> None:
-        """Publish the newest pose while the mount is being measured: it is corrected once, when
-        keyframes come.
+    def _report_held(self, stamp_ns: int, slam: StereoSlam) -> None:
+        """Tell why no result is ready. While the mount is being measured the newest pose is
+        published: it is corrected once, when keyframes come.
         """
+        if slam.is_apart:
+            lost = self._lost.note(stamp_ns, tracked=False)
+            self.reporter.report(stamp_ns, Level.ERROR, MAPPING_APART, tracked=0, apart=1, **lost)
+            return
+        result = slam.provisional
         if result is not None:
             self._provisional_ns = stamp_ns
             self._transforms.broadcast(result)

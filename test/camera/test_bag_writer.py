@@ -8,12 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from camera_recordings import grey_pairs, opened, write_folders, write_kitti
+from camera_recordings import grey_pairs, opened, sensor_yaml, write_folders, write_kitti
 from rosbags.highlevel import AnyReader
 
 from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, convert
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import ImuSample, MeasurementLog
 
 
@@ -113,8 +114,8 @@ WHEELS = '0.00 2 0 0 0 0 0 1\n0.05 2.1 0 0 0 0 0.6 0.8\n0.2 3 0 0 0 0 0 1\n'
 IMU = ''.join(f'{t},0.1,0.2,0.3,0.4,-9.81,{t / 1e9}\n' for t in range(0, 210_000_000, 5_000_000))
 
 
-@pytest.mark.parametrize('distorted', [False, True])
-def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool) -> None:
+@pytest.mark.parametrize(('distorted', 'beside'), [(False, False), (True, False), (True, True)])
+def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool, beside: bool) -> None:
     """Also of images that are not rectified: the file's axes are those of the rectified ones."""
     pairs = grey_pairs(3)
     if distorted:
@@ -123,6 +124,9 @@ def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool) -> None:
         folder = write_kitti(tmp_path / 'images', pairs)
     (folder / 'wheel_odometry.txt').write_text(WHEELS)
     (folder / 'imu.csv').write_text(IMU)
+    if beside:
+        T_left_imu = make_transform(np.eye(3), np.array([0.1, 0.0, -0.3]))
+        (folder / 'imu.yaml').write_text(sensor_yaml(T_left_imu))
     (folder / 'depth').mkdir()
     height, width = pairs[0][0].shape
     depth_mm = np.arange(height * width, dtype=np.uint16).reshape(height, width)
@@ -147,6 +151,8 @@ def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool) -> None:
     for one, other in zip(measured(by_folder), measured(by_bag), strict=True):
         if isinstance(one, ImuSample):
             np.testing.assert_allclose(other.accel_m_s2, one.accel_m_s2, atol=1e-9)
+            np.testing.assert_allclose(other.place_m, one.place_m, atol=1e-9)
+            assert one.place_m.any() == beside
 
 
 def measured(source: StereoSource) -> list[Any]:

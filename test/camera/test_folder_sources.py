@@ -352,7 +352,7 @@ def test_inputs_of_no_known_kind_are_refused(tmp_path: Path) -> None:
         open_source(StereoCameraSettings())
     with pytest.raises(InputError, match=r'nowhere: no such file or folder; give a KITTI'):
         opened(tmp_path / 'nowhere')
-    with pytest.raises(InputError, match=r'no recording was recognised in it; give a KITTI'):
+    with pytest.raises(InputError, match=r'not a known kind of recording; give a KITTI'):
         opened(tmp_path)
     (tmp_path / 'notes.txt').write_text('hello')
     with pytest.raises(InputError, match=r'notes.txt: not a known kind of recording; give'):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +11,8 @@ import pytest
 from segfloor_ros.camera.images import (
     CorruptImageError,
     EightBitScale,
-    decode_compressed,
-    decode_raw,
+    decode_file,
+    grey_image,
     to_grey,
 )
 from segfloor_ros.errors import InputError
@@ -20,8 +22,9 @@ GREY = round(0.299 * RED + 0.587 * GREEN + 0.114 * BLUE)
 
 
 def raw(data: bytes, width: int, height: int, encoding: str, **fields: object) -> np.ndarray:
-    step = fields.pop('step', len(data) // max(height, 1))
-    return decode_raw(data, width=width, height=height, encoding=encoding, step=step, **fields)  # type: ignore[arg-type]
+    header = {'step': len(data) // max(height, 1), 'is_bigendian': 0, **fields}
+    message = SimpleNamespace(data=data, width=width, height=height, encoding=encoding, **header)
+    return grey_image(message, 'left')
 
 
 @pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
@@ -89,12 +92,12 @@ def test_bayer_mosaic_of_one_colour_is_one_grey(pattern: str, bits: int) -> None
 def test_data_that_contradicts_the_header_is_refused(
     data: int, width: int, height: int, step: int
 ) -> None:
-    with pytest.raises(CorruptImageError, match=f'{data} bytes do not make a {width}x{height}'):
+    with pytest.raises(CorruptImageError, match=f'left: {data} bytes do not make a'):
         raw(bytes(data), width, height, 'mono8', step=step)
 
 
 def test_encodings_that_are_no_pictures_are_refused() -> None:
-    with pytest.raises(InputError, match='encoding 32FC1 is not supported'):
+    with pytest.raises(InputError, match='left: image encoding 32FC1 is not supported'):
         raw(bytes(4), 1, 1, '32FC1')
 
 
@@ -110,34 +113,36 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 def test_png_is_exact_in_8_and_16_bits() -> None:
     image = picture()
     deep = image.astype(np.uint16) * 257
-    np.testing.assert_array_equal(decode_compressed(encoded('.png', image)), image)
-    np.testing.assert_array_equal(decode_compressed(encoded('.png', deep)), deep)
+    np.testing.assert_array_equal(decode_file(encoded('.png', image), 'left'), image)
+    np.testing.assert_array_equal(decode_file(encoded('.png', deep), 'left'), deep)
 
 
 @pytest.mark.parametrize('suffix', ['.png', '.jpg'])
 def test_truncated_images_are_refused(suffix: str) -> None:
     data = encoded(suffix, picture())
     for part in (0.02, 0.5, 0.97):
-        with pytest.raises(CorruptImageError, match='truncated'):
-            decode_compressed(data[: int(part * len(data))])
+        with pytest.raises(CorruptImageError, match=r'left: the \w+ is truncated'):
+            decode_file(data[: int(part * len(data))], 'left')
 
 
 def test_zeros_after_a_jpeg_are_padding() -> None:
     data = encoded('.jpg', picture())
-    np.testing.assert_array_equal(decode_compressed(data + bytes(5000)), decode_compressed(data))
+    np.testing.assert_array_equal(
+        decode_file(data + bytes(5000), 'left'), decode_file(data, 'left')
+    )
 
 
 def test_damaged_png_is_refused() -> None:
     data = bytearray(encoded('.png', picture()))
     data[len(data) // 2] ^= 0xFF
-    with pytest.raises(CorruptImageError, match='the PNG is damaged'):
-        decode_compressed(bytes(data))
+    with pytest.raises(CorruptImageError, match='left: the PNG is damaged'):
+        decode_file(bytes(data), 'left')
 
 
 @pytest.mark.parametrize(('data', 'message'), [(b'', 'empty'), (b'not an image', 'be decoded')])
 def test_data_that_is_no_image_is_refused(data: bytes, message: str) -> None:
     with pytest.raises(CorruptImageError, match=message):
-        decode_compressed(data)
+        decode_file(data, 'left')
 
 
 def test_the_scale_is_that_of_the_first_pair() -> None:

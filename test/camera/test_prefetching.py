@@ -8,7 +8,7 @@ from itertools import islice
 
 import pytest
 
-from segfloor_ros.camera.sources.prefetch import AHEAD, prefetched
+from segfloor_ros.camera.sources.source import AHEAD, prefetched
 
 
 def reader_threads() -> list[str]:

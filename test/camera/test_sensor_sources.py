@@ -101,11 +101,24 @@ def test_the_imu_of_euroc_is_turned_into_the_left_camera(tmp_path: Path) -> None
     T_body_imu = np.eye(4)
     # The IMU's x is the camera's y, its y the camera's -x.
     T_body_imu[:2, :2] = [[0, -1], [1, 0]]
+    T_body_imu[:3, 3] = 0.1, 0.2, -0.3
     (root / 'sensor.yaml').write_text(sensor_yaml(T_body_imu))
     (root / 'data.csv').write_text('#t,w,w,w,a,a,a\n0,1,2,3,-9.81,0,0\n')
     (sample,) = measured(opened(folder))
     np.testing.assert_allclose(sample.gyro_rad_s, [-2, 1, 3], atol=1e-6)
     np.testing.assert_allclose(sample.accel_m_s2, [0, -9.81, 0], atol=1e-5)
+    np.testing.assert_allclose(sample.place_m, [0.1, 0.2, -0.3], atol=1e-6)
+
+
+def test_a_file_beside_the_imu_of_a_folder_tells_where_it_is(tmp_path: Path) -> None:
+    T_left_imu = np.eye(4)
+    T_left_imu[:2, :2] = [[0, -1], [1, 0]]
+    T_left_imu[:3, 3] = 0.0, 0.1, -0.3
+    source = opened(kitti(tmp_path, imu__csv=IMU, imu__yaml=sensor_yaml(T_left_imu)))
+    sample = measured(source)[1]
+    np.testing.assert_allclose(sample.place_m, [0.0, 0.1, -0.3], atol=1e-6)
+    np.testing.assert_allclose(sample.gyro_rad_s, [-0.2, 0.1, 0.3], atol=1e-6)
+    assert sample.accel_m_s2[0] == pytest.approx(9.81)
 
 
 def odometry_message(topic: str, stamp_ns: int, x_m: float, frame: str = 'odom') -> Message:
@@ -203,6 +216,7 @@ def test_the_imu_of_a_bag_is_turned_by_tf(tmp_path: Path) -> None:
     # The pictures are distorted but not turned: x right is -y, y down is -z, z forward is x.
     np.testing.assert_allclose(sample.accel_m_s2, [-2, -9.81, 1], atol=1e-9)
     np.testing.assert_allclose(sample.gyro_rad_s, [-0.2, -0.3, 0.1], atol=1e-9)
+    np.testing.assert_allclose(sample.place_m, [0.0, 0.1, 0.0], atol=1e-9)
 
 
 def test_an_imu_without_transform_is_used_where_gravity_says_it_is_the_camera_s(

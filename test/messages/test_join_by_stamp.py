@@ -26,7 +26,6 @@ def test_at_most_the_capacity_waits() -> None:
     for stamp_ns in range(5):
         joiner.add('a', stamp_ns, stamp_ns)
     assert joiner.take_dropped() == [Dropped(0, ('b',)), Dropped(1, ('b',))]
-    assert joiner.waiting_for() == ('b',)
     assert joiner.add('b', 2, None) == {'a': 2, 'b': None}
 
 
@@ -36,7 +35,6 @@ def test_a_repeated_message_does_not_make_a_second_set() -> None:
     assert joiner.add('b', 1, 'first') is not None
     assert joiner.add('a', 1, 'again') is None
     assert joiner.add('b', 1, 'again') is None
-    assert joiner.waiting_for() == ()
 
 
 def test_stamps_that_jump_back_are_joined_like_any_other() -> None:
@@ -54,15 +52,6 @@ def test_within_the_tolerance_the_nearest_partner_is_taken() -> None:
     assert joiner.take_dropped() == [Dropped(100, ('right',))]
     joiner.add('left', 200, 'l200')
     assert joiner.add('right', 211, 'r211') is None
-
-
-def test_waiting_for_names_what_every_set_lacks() -> None:
-    joiner = StampJoiner(('a', 'b', 'c'))
-    assert joiner.waiting_for() == ()
-    joiner.add('a', 1, None)
-    joiner.add('a', 2, None)
-    joiner.add('b', 2, None)
-    assert joiner.waiting_for() == ('c',)
 
 
 def test_an_optional_part_is_waited_for_while_it_may_come() -> None:

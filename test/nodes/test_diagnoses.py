@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +15,7 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.row_check import rows_apart_px
+from segfloor_ros.camera.rectification import rows_apart_px
 from segfloor_ros.floor.mount_check import MountCheck
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
@@ -45,10 +47,13 @@ def health(graph, node: str):
     return found[-1] if found else None
 
 
-def says(graph, node: str, *words: str):
-    """Wait until a node's health says all the words; returns the status."""
+def says(graph, node: str, *words: str, meanwhile: Callable[[], None] = lambda: None):
+    """Wait until a node's health says all the words, and do something now and then meanwhile;
+    returns the status.
+    """
 
     def found() -> bool:
+        meanwhile()
         status = health(graph, node)
         return status is not None and all(word in status.message for word in words)
 
@@ -133,11 +138,15 @@ def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> N
     driver = Driver(graph)
     graph.add(StereoSlamNode())
     driver.connect()
-    for i in range(12):
-        driver.send('left', i * FRAME_NS, frames[0].left)
-        driver.send('right', i * FRAME_NS + 40_000_000, frames[0].right)
+    stamps = itertools.count(0, FRAME_NS)
+
+    def go_on() -> None:
+        stamp_ns = next(stamps)
+        driver.send('left', stamp_ns, frames[0].left)
+        driver.send('right', stamp_ns + 40_000_000, frames[0].right)
+
     words = ('left/image_raw and right/image_raw', '40.0 ms', 'sync_tolerance_s = 0.005 s')
-    assert says(graph, 'stereo_slam', *words).level is Level.ERROR
+    assert says(graph, 'stereo_slam', *words, meanwhile=go_on).level is Level.ERROR
 
 
 def test_images_without_calibration_are_named(make_graph, frames) -> None:
@@ -245,7 +254,7 @@ def test_rate_delay_and_problems_are_those_of_the_time() -> None:
     level, words, values = found.summary('active')
     assert (level, words, values['processed']) == (Level.OK, 'waiting for the floor', '0')
     found.processed(12.0, 'running')
-    found.skipped()
+    found.count('skipped')
     found.lost('image', 3)
     level, words, values = found.summary('active')
     assert (level, words, values['processed']) == (Level.OK, 'running', '1')

@@ -15,10 +15,10 @@ USE = """
 import sys
 import numpy as np
 import segfloor_ros.nodes.{node}
-from segfloor_ros.messages.poses import path_arrays, path_message, pose_array, pose_message
+from segfloor_ros.messages.poses import PathMessages, path_arrays, pose_array, pose_message
 from segfloor_ros.slam.results import KeyframePath
 pose_array(pose_message(np.eye(4)))
-path_arrays(path_message(1, 'map', KeyframePath(np.array([1]), np.eye(4)[None])))
+path_arrays(PathMessages('map').next(1, KeyframePath(np.array([1]), np.eye(4)[None])))
 packages = {{name.partition('.')[0] for name in sys.modules}}
 print(sorted(packages & {{'scipy', 'matplotlib', 'rosbags'}}))
 """

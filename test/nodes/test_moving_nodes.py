@@ -15,7 +15,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message
 from segfloor_ros.messages.poses import transform_message
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.mask_input import MaskInput
+from segfloor_ros.nodes.sensor_input import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 from segfloor_ros.slam.excluded import is_inside
 

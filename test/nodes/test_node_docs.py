@@ -42,7 +42,8 @@ SERVICES_OF_ROS = re.compile(
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_the_page_of_a_node_is_as_generated(node) -> None:
+def test_the_page_of_a_node_is_as_generated(node, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(DOCS)
     spec = importlib.util.spec_from_file_location('generate', DOCS / 'generate.py')
     assert spec is not None and spec.loader is not None
     generate = importlib.util.module_from_spec(spec)

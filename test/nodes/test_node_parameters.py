@@ -7,10 +7,9 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter
 
-from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.configuration import STAGE_SETTINGS
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.node_settings import NODE_SETTINGS
+from segfloor_ros.node_settings import NODE_SETTINGS, CloudLabellingNodeSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
@@ -26,7 +25,7 @@ PARAMS = Path(__file__).resolve().parents[2] / 'params'
 def test_every_setting_is_a_parameter_with_description_and_range(make_graph, make) -> None:
     node = make_graph().add(make())
     stage = node.get_name()
-    specs = [*STAGE_SETTINGS[stage].specs(), *NODE_SETTINGS[stage].specs()]
+    specs = NODE_SETTINGS[stage].specs()
     for spec in specs:
         value = node.get_parameter(spec.name).value
         assert value == spec.default or (math.isnan(value) and math.isnan(spec.default))
@@ -51,7 +50,7 @@ def test_files_and_arguments_set_parameters_and_the_last_one_wins(make_graph, tm
     )
     graph = make_graph('--params-file', str(file), '-p', 'step_height_m:=0.2')
     node = graph.add(CloudLabellingNode())
-    assert node.parameters.stage == CloudLabellingSettings(robot_height_m=2.0, step_height_m=0.2)
+    assert node.settings == CloudLabellingNodeSettings(robot_height_m=2.0, step_height_m=0.2)
 
 
 @pytest.mark.parametrize('namespace', ['/', '/robot', '/fleet/robot'])
@@ -59,7 +58,7 @@ def test_a_file_of_the_package_holds_in_every_namespace(make_graph, tmp_path, na
     file = tmp_path / 'params.yaml'
     file.write_text('/**/cloud_labelling:\n  ros__parameters:\n    robot_height_m: 0.7\n')
     graph = make_graph('--params-file', str(file), '-r', f'__ns:={namespace}')
-    assert graph.add(CloudLabellingNode()).parameters.stage.robot_height_m == 0.7
+    assert graph.add(CloudLabellingNode()).settings.robot_height_m == 0.7
     for params in PARAMS.glob('*.yaml'):
         sections = yaml.safe_load(params.read_text())
         own = [name for name in sections if name.rsplit('/', 1)[-1] in STAGE_SETTINGS]
@@ -78,7 +77,7 @@ def test_the_command_line_wins_over_every_section_of_a_file(
     arguments = ['-p', 'step_height_m:=1e-2', '--params-file', str(file)]
     monkeypatch.setattr('sys.argv', ['node', '--ros-args', *arguments])
     node = make_graph(*arguments).add(CloudLabellingNode())
-    assert node.parameters.stage == CloudLabellingSettings(robot_height_m=2.0, step_height_m=0.01)
+    assert node.settings == CloudLabellingNodeSettings(robot_height_m=2.0, step_height_m=0.01)
     assert node.get_parameter('step_height_m').value == 0.01
 
 
@@ -93,11 +92,11 @@ def test_parameters_of_a_command_line_are_those_for_ros_and_any_node() -> None:
 def test_each_parameter_changes_while_running_or_says_that_it_does_not(make_graph, make) -> None:
     node = make_graph().add(make())
     stage = node.get_name()
-    settings = {**vars(node.parameters.stage), **vars(node.parameters.own)}
-    for spec in [*STAGE_SETTINGS[stage].specs(), *NODE_SETTINGS[stage].specs()]:
+    settings = vars(node.settings)
+    for spec in NODE_SETTINGS[stage].specs():
         (result,) = node.set_parameters([Parameter(spec.name, value=another(spec))])
         assert result.successful is spec.live, (spec.name, result.reason)
-        now = {**vars(node.parameters.stage), **vars(node.parameters.own)}[spec.name]
+        now = getattr(node.settings, spec.name)
         expected = another(spec) if spec.live else settings[spec.name]
         assert now == expected or math.isnan(expected)
         if not spec.live:
@@ -137,14 +136,14 @@ def test_live_parameters_change_and_bad_values_are_rejected_with_the_reason(make
     node = make_graph().add(CloudLabellingNode())
     (accepted,) = node.set_parameters([Parameter('robot_height_m', value=0.5)])
     assert accepted.successful
-    assert node.parameters.stage.robot_height_m == 0.5
+    assert node.settings.robot_height_m == 0.5
     (rejected,) = node.set_parameters([Parameter('robot_height_m', value=-1.0)])
     assert not rejected.successful
     assert 'robot_height_m' in rejected.reason
     (wrong_type,) = node.set_parameters([Parameter('robot_height_m', value='tall')])
     assert not wrong_type.successful
     assert 'expected a number' in wrong_type.reason
-    assert node.parameters.stage.robot_height_m == 0.5
+    assert node.settings.robot_height_m == 0.5
 
 
 def test_other_parameters_are_read_only(make_graph) -> None:

@@ -16,7 +16,7 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli.main import main
-from segfloor_ros.cli.replay_graph import unconnected
+from segfloor_ros.cli.replay_nodes import unconnected
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE

@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from node_messages import cloud_messages, publish
+from node_messages import cloud_messages, grid_arrays, publish
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.clouds import labelled_arrays
-from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import image_message
-from segfloor_ros.messages.progress import map_start_message
+from segfloor_ros.messages.map_files import map_start_message
 from segfloor_ros.messages.topics import MAP_START, TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode

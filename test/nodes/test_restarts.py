@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from node_chain import CHAIN, NodeChain, seen_again
+from node_messages import grid_arrays
 from ros_graph import fresh_graph
 from stereo_drive import room_drive, write_kitti
 
@@ -20,7 +21,6 @@ from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM

@@ -28,7 +28,6 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.configuration import STAGE_SETTINGS
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import NODES, TOPICS
 from segfloor_ros.node_settings import NODE_SETTINGS
@@ -117,11 +116,7 @@ def set_state(graph, name: str, label: str) -> None:
 @pytest.mark.parametrize('node', NODES)
 def test_ros2_param_lists_describes_gets_and_dumps(run, node) -> None:
     graph, name = run(node)
-    specs = {
-        spec.name: spec
-        for settings in (STAGE_SETTINGS[node], NODE_SETTINGS[node])
-        for spec in settings.specs()
-    }
+    specs = {spec.name: spec for spec in NODE_SETTINGS[node].specs()}
     listed = graph.call(ListParameters, f'{name}/list_parameters', ListParameters.Request())
     names = sorted(listed.result.names)
     assert set(specs) <= set(names)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_messages import grid_arrays
 from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from ros_graph import Graph, fresh_graph
@@ -18,7 +19,6 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
 from segfloor_ros.map_file import read_map_file
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
-from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.messages.poses import pose_array, pose_message

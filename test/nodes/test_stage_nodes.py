@@ -14,6 +14,7 @@ from node_messages import (
     SCAN,
     STAMP_NS,
     cloud_messages,
+    grid_arrays,
     grid_messages,
     pose_message_at,
     publish,
@@ -23,6 +24,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.model import Mount
+from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR
 from segfloor_ros.cloud.settings import CloudLabellingSettings
@@ -33,17 +35,12 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.messages.camera_info import (
-    camera_info_message,
-    eye_calibration,
-    rectified_calibration,
-)
+from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.clouds import (
     labelled_arrays,
     sparse_cloud_arrays,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import compressed_message, grey8_image, image_message
 from segfloor_ros.messages.poses import (
@@ -344,7 +341,7 @@ class TestFreeScan:
         scans = graph.collect('scan')
         mount = transform_message(0, 'base_link', 'left', MOUNT.T_base_left)
         publishers = publish(graph, {'camera_mount': mount})
-        graph.comes(lambda: False, 0.3)
+        graph.until(lambda: node._mount is not None, 'the mount')
         publish(graph, self.frame_messages(frame), publishers)
         graph.until(lambda: scans, 'the scan')
         stage = FloorSegmentation(CAMERA, FloorSegmentationSettings())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -10,36 +11,25 @@ from typing import Any
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration_files import read_eye_calibration
+from segfloor_ros.camera.calibration_files import given_calibration, given_left_calibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.images import (
-    CorruptImageError,
-    Grey,
-    decode_compressed,
-    decode_depth,
-    decode_raw,
-)
+from segfloor_ros.camera.images import Grey, depth_image, grey_image
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.camera.ros_messages import eye_calibration, stamp_ns
 from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import bag_topics
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
-from segfloor_ros.camera.sources.bag_sensors import bag_sensors, stamp_ns
-from segfloor_ros.camera.sources.bag_topics import (
-    StereoTopics,
-    find_depth_topics,
-    find_topics,
-    has_pair,
-)
-from segfloor_ros.camera.sources.found_calibration import given_calibration
-from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
+from segfloor_ros.camera.sources.bag_sensors import bag_sensors
+from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, rate_of
 from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
-from segfloor_ros.camera.sources.stamps import rate_of
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.measurements import RecordedSensor
 
 STAMPS_FOR_RATE = 20
 
 
-def open_bag(path: Path, settings: StereoCameraSettings) -> BagSource:
+def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
     """Open a bag: find its stereo topics and their calibration. Raises InputError or
     CalibrationError.
     """
@@ -47,12 +37,12 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> BagSource:
         types = {name: topic.msgtype for name, topic in bag.topics.items() if topic.num_messages}
         if not types:
             raise InputError(f'{path}: the bag is empty; record the image topics again')
-        depth = find_depth_topics(str(path), types, settings)
-        if depth is not None and (settings.depth or not has_pair(types, settings)):
+        depth = bag_topics.find_depth_topics(str(path), types, settings)
+        if depth is not None and (settings.depth or not bag_topics.has_pair(types, settings)):
             topics = depth
             calibration = depth_calibration(_left_eye(path, bag, topics, settings))
         else:
-            topics = find_topics(
+            topics = bag_topics.find_topics(
                 str(path), types, settings.left_image_topic, settings.right_image_topic
             )
             calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
@@ -65,111 +55,69 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> BagSource:
         if depth is not None:
             messages = bag.topics[depth.right].num_messages
             sensors.append(RecordedSensor(DEPTH, depth.right, messages, topics is depth))
-    return BagSource(path, topics, calibration, count, rate_hz, settings, sensors)
+    read = partial(_entries, path, topics, calibration.camera, settings.pairing_tolerance_s)
+    return StereoSource(
+        str(path),
+        calibration,
+        read,
+        frame_count=count,
+        rate_hz=rate_hz,
+        bit_depth=settings.bit_depth,
+        sensors=sensors,
+    )
 
 
-class BagSource(StereoSource):
-    """The images of two topics, paired by their header stamps while they are read."""
+def _entries(
+    path: Path,
+    topics: bag_topics.StereoTopics,
+    camera: StereoCamera,
+    tolerance_s: float,
+    source: StereoSource,
+) -> Iterator[PairEntry]:
+    """Yield the images of two topics, paired by their header stamps while they are read."""
 
-    def __init__(
-        self,
-        path: Path,
-        topics: StereoTopics,
-        calibration: StereoCalibration,
-        count: int,
-        rate_hz: float,
-        settings: StereoCameraSettings,
-        sensors: Sequence[RecordedSensor] = (),
-    ) -> None:
-        self._path = path
-        self._topics = topics
-        self._tolerance_s = settings.pairing_tolerance_s
-        super().__init__(
-            str(path),
-            calibration,
-            frame_count=count,
-            rate_hz=rate_hz,
-            bit_depth=settings.bit_depth,
-            sensors=sensors,
-        )
-
-    def _entries(self) -> Iterator[PairEntry]:
-        pairing: StampPairing[Any] = StampPairing(
-            self._tolerance_s,
-            (f'{self._path}, {self._topics.left}', f'{self._path}, {self._topics.right}'),
-        )
-        with open_bag_file(self._path) as bag:
-            for index, (left, right) in enumerate(self._pairs(bag, pairing)):
-                yield PairEntry(index, left.stamp_ns, self._loader(left.item, right.item))
-        self.skipped_frames += max(pairing.duplicates)
-        pairing.report()
-
-    def _pairs(
-        self, bag: BagFile, pairing: StampPairing[Any]
-    ) -> Iterator[tuple[Stamped[Any], Stamped[Any]]]:
-        sides = {self._topics.left: 0, self._topics.right: 1}
+    def pairs(bag: BagFile) -> Iterator[tuple[Stamped[Any], Stamped[Any]]]:
+        sides = {topics.left: 0, topics.right: 1}
         for topic, message in bag.messages(list(sides)):
             yield from pairing.add(sides[topic], stamp_ns(message), message)
         yield from pairing.finish()
 
-    def _loader(self, left: Any, right: Any) -> Callable[[], tuple[Grey, NDArray[Any]]]:
-        topics = self._topics
+    def load(left: Any, right: Any) -> tuple[Grey, NDArray[Any]]:
+        image = grey_image(left, topics.left)
         if topics.right_is_depth:
-            return lambda: (
-                _decode(topics.left, left),
-                disparity_of_depth(_decode(topics.right, right, decode_depth), self.camera),
-            )
-        return lambda: (_decode(topics.left, left), _decode(topics.right, right))
+            return image, disparity_of_depth(depth_image(right, topics.right), camera)
+        return image, grey_image(right, topics.right)
+
+    names = (f'{path}, {topics.left}', f'{path}, {topics.right}')
+    pairing: StampPairing[Any] = StampPairing(tolerance_s, names)
+    with open_bag_file(path) as bag:
+        for index, (left, right) in enumerate(pairs(bag)):
+            yield PairEntry(index, left.stamp_ns, partial(load, left.item, right.item))
+    source.skipped_frames += max(pairing.duplicates)
+    pairing.report()
 
 
-def _decode(
-    topic: str, message: Any, decode: Callable[..., NDArray[Any]] = decode_raw
-) -> NDArray[Any]:
-    try:
-        if hasattr(message, 'encoding'):
-            return decode(
-                message.data,
-                width=message.width,
-                height=message.height,
-                encoding=message.encoding,
-                step=message.step,
-                is_bigendian=bool(message.is_bigendian),
-            )
-        return decode_compressed(message.data.tobytes())
-    except CorruptImageError as error:
-        raise CorruptImageError(f'{topic}: {error}') from None
-    except InputError as error:
-        raise InputError(f'{topic}: {error}') from None
-
-
-def _read_calibration(path: Path, bag: BagFile, topics: StereoTopics) -> StereoCalibration:
-    for side, info in (('left', topics.left_info), ('right', topics.right_info)):
-        if not info:
-            raise CalibrationError(
-                f'{path}: no CameraInfo beside {getattr(topics, side)}; record it too, or give '
-                'stereo_camera.left_calibration and right_calibration'
-            )
-    eyes = [_eye(path, bag, topic) for topic in (topics.left_info, topics.right_info)]
-    return StereoCalibration(*eyes)
+def _read_calibration(
+    path: Path, bag: BagFile, topics: bag_topics.StereoTopics
+) -> StereoCalibration:
+    given = 'stereo_camera.left_calibration and right_calibration'
+    left = _eye(path, bag, topics.left, topics.left_info, given)
+    return StereoCalibration(left, _eye(path, bag, topics.right, topics.right_info, given))
 
 
 def _left_eye(
-    path: Path, bag: BagFile, topics: StereoTopics, settings: StereoCameraSettings
+    path: Path, bag: BagFile, topics: bag_topics.StereoTopics, settings: StereoCameraSettings
 ) -> EyeCalibration:
-    if settings.left_calibration:
-        return read_eye_calibration(Path(settings.left_calibration))
-    if not topics.left_info:
+    given = given_left_calibration(settings)
+    if given is not None:
+        return given
+    return _eye(path, bag, topics.left, topics.left_info, 'stereo_camera.left_calibration')
+
+
+def _eye(path: Path, bag: BagFile, image: str, topic: str, setting: str) -> EyeCalibration:
+    if not topic:
         raise CalibrationError(
-            f'{path}: no CameraInfo beside {topics.left}; record it too, or give '
-            'stereo_camera.left_calibration'
+            f'{path}: no CameraInfo beside {image}; record it too, or give {setting}'
         )
-    return _eye(path, bag, topics.left_info)
-
-
-def _eye(path: Path, bag: BagFile, topic: str) -> EyeCalibration:
     _, info = next(bag.messages([topic]))
-    # ROS 1 names the matrices in capitals, ROS 2 does not.
-    D, K, R, P = (getattr(info, n if hasattr(info, n) else n.lower()) for n in 'DKRP')
-    return EyeCalibration(
-        int(info.width), int(info.height), K, D, R, P, info.distortion_model, f'{path}, {topic}'
-    )
+    return eye_calibration(info, f'{path}, {topic}')

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,20 +43,20 @@ def read_rosbag2_with(open_bag: OpenBag) -> None:
     _ros_reader = open_bag
 
 
+@dataclass(frozen=True)
 class BagFile:
     """An open bag. Message types are those of ROS 2 Jazzy or ROS 1 Noetic, so that other types
     in the bag do not matter.
     """
 
-    def __init__(self, path: Path, topics: dict[str, Topic], read: ReadMessages) -> None:
-        self.topics = topics
-        self._path = path
-        self._read = read
+    path: Path
+    topics: dict[str, Topic]
+    read: ReadMessages
 
     def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
         """Yield (topic, message) of some topics in the order of recording."""
-        with _read_errors(self._path):
-            yield from self._read(topics)
+        with _read_errors(self.path):
+            yield from self.read(topics)
 
 
 def is_bag(path: Path) -> bool:

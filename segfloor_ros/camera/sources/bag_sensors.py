@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from segfloor_ros.camera import ros_messages
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
-from segfloor_ros.camera.sources.sensor_files import IMU, WHEEL_ODOMETRY, check_gravity
+from segfloor_ros.camera.sources.sensor_files import IMU, WHEEL_ODOMETRY, check_gravity, is_upright
 from segfloor_ros.errors import InputError
 from segfloor_ros.frames import FrameTree
-from segfloor_ros.geometry import Array, transform_from_quaternion
-from segfloor_ros.measurements import ImuSample, Measurement, RecordedSensor, WheelPose
+from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.measurements import Measurement, RecordedSensor, WheelPose
 
 ODOMETRY_TYPE, IMU_TYPE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu'
 TF_TYPE, STATIC_TF = 'tf2_msgs/msg/TFMessage', '/tf_static'
@@ -24,9 +25,6 @@ NOT_WHEELS = ('truth', 'visual', 'vio', 'slam', 'keyframe', 'lidar', 'laser', 'i
 """Words in the names of odometry that is not the wheels'."""
 
 GRAVITY_SAMPLES = 50
-UPRIGHT = 0.8
-"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
-
 GLOBAL_FRAMES = ('map', 'world', 'earth')
 """Frames that wheels know nothing of."""
 
@@ -52,19 +50,20 @@ def bag_sensors(
         )
     imu = _imu_topic(path, bag, settings.imu_topic)
     if imu:
-        used, rotation, where = IMU not in ignored, None, imu
+        used, T_raw_imu, where = IMU not in ignored, None, imu
         if used:
-            rotation = _R_raw_imu(bag, left_topic, imu)
-            if rotation is None:
+            T_raw_imu = _T_raw_imu(bag, left_topic, imu)
+            if T_raw_imu is None:
                 used, where = False, f'{imu} (no tf from its frame to the camera)'
-        R_left_imu = R_left_raw @ (np.eye(3) if rotation is None else rotation)
+        T_left_raw = make_transform(R_left_raw, np.zeros(3))
+        T_left_imu = T_left_raw @ (np.eye(4) if T_raw_imu is None else T_raw_imu)
         found.append(
             RecordedSensor(
                 IMU,
                 where,
                 bag.topics[imu].num_messages,
                 used,
-                lambda: _imu_samples(path, imu, R_left_imu),
+                lambda: _imu_samples(path, imu, T_left_imu),
             )
         )
     return found
@@ -92,9 +91,7 @@ def _imu_topic(path: Path, bag: BagFile, given: str) -> str:
     complete = []
     for topic in topics:
         _, first = next(bag.messages([topic]))
-        covariances = first.angular_velocity_covariance, first.linear_acceleration_covariance
-        # A first element of -1 means: not measured (sensor_msgs/Imu).
-        if all(covariance[0] != -1 for covariance in covariances):
+        if ros_messages.measures_motion(first):
             complete.append(topic)
     return max(complete, key=lambda t: (bag.topics[t].num_messages, t), default='')
 
@@ -110,23 +107,23 @@ def _topics(path: Path, bag: BagFile, kind: str, given: str, setting: str) -> li
     return sorted(found)
 
 
-def _R_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
-    """Return the rotation (3, 3) from the IMU's frame to that of the left images, by the fixed
-    transforms of the bag. Without any, an IMU for which up is up in the image is taken for one in
-    the frame of the images; None for others.
+def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
+    """Return the IMU's frame in that of the left images (4, 4), by the fixed transforms of the bag.
+    Without any, an IMU for which up is up in the image is taken for one in the frame of the images;
+    None for others.
     """
     frames = []
     for topic in (left_topic, imu_topic):
         _, first = next(bag.messages([topic]))
         frames.append(first.header.frame_id.strip('/'))
     if frames[0] == frames[1]:
-        return np.eye(3)
+        return np.eye(4)
     T_left_imu = _fixed_transforms(bag).lookup(*frames)
     if T_left_imu is not None:
-        return T_left_imu[:3, :3]
+        return T_left_imu
     some = islice(bag.messages([imu_topic]), GRAVITY_SAMPLES)
-    felt = np.mean([_xyz(message.linear_acceleration) for _, message in some], axis=0)
-    return np.eye(3) if -felt[1] > UPRIGHT * np.linalg.norm(felt) else None
+    felt = np.mean([ros_messages.xyz(message.linear_acceleration) for _, message in some], axis=0)
+    return np.eye(4) if is_upright(felt) else None
 
 
 def _fixed_transforms(bag: BagFile) -> FrameTree:
@@ -137,28 +134,20 @@ def _fixed_transforms(bag: BagFile) -> FrameTree:
         for _, message in bag.messages([topic]):
             for transform in message.transforms:
                 parent, child = transform.header.frame_id, transform.child_frame_id
-                pose = _pose(transform.transform.translation, transform.transform.rotation)
+                moved = transform.transform
+                pose = ros_messages.rigid_motion(moved.translation, moved.rotation, topic)
                 tree.add_fixed(parent.strip('/'), child.strip('/'), pose)
     return tree
 
 
 def _wheel_poses(path: Path, topic: str) -> Iterator[WheelPose]:
     with _messages(path, topic) as messages:
-        for message in messages:
-            pose = message.pose.pose
-            yield WheelPose(stamp_ns(message), _pose(pose.position, pose.orientation))
+        yield from (ros_messages.wheel_pose(message, f'{path}, {topic}') for message in messages)
 
 
-def _imu_samples(path: Path, topic: str, R_left_imu: Array) -> Sequence[Measurement]:
+def _imu_samples(path: Path, topic: str, T_left_imu: Array) -> Sequence[Measurement]:
     with _messages(path, topic) as messages:
-        samples = [
-            ImuSample(
-                stamp_ns(message),
-                R_left_imu @ _xyz(message.angular_velocity),
-                R_left_imu @ _xyz(message.linear_acceleration),
-            )
-            for message in messages
-        ]
+        samples = [ros_messages.imu_sample(message, T_left_imu) for message in messages]
     check_gravity(f'{path}, {topic}', np.array([sample.accel_m_s2 for sample in samples]))
     return samples
 
@@ -167,20 +156,3 @@ def _imu_samples(path: Path, topic: str, R_left_imu: Array) -> Sequence[Measurem
 def _messages(path: Path, topic: str) -> Iterator[Iterator[Any]]:
     with open_bag_file(path) as bag:
         yield (message for _, message in bag.messages([topic]))
-
-
-def stamp_ns(message: Any) -> int:
-    """Return the stamp in a message's header in ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _xyz(vector: Any) -> Array:
-    return np.array([vector.x, vector.y, vector.z])
-
-
-def _pose(translation: Any, rotation: Any) -> Array:
-    quat_xyzw = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    if not abs(float(np.linalg.norm(quat_xyzw)) - 1) < 0.01:
-        raise InputError(f'a pose has the quaternion {quat_xyzw}, which is no rotation')
-    return transform_from_quaternion(_xyz(translation), quat_xyzw)

@@ -4,30 +4,24 @@ benchmark.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.calibration_files import read_eye_calibration
+from segfloor_ros.camera.calibration import EyeCalibration
+from segfloor_ros.camera.calibration_files import given_left_calibration, read_eye_calibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.eye_calibration import EyeCalibration
-from segfloor_ros.camera.images import Grey
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources.files import (
-    FilePair,
-    FilePairSource,
-    first_image_size,
-    images_in,
-    read_grey,
-)
-from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
+from segfloor_ros.camera.sources import files
+from segfloor_ros.camera.sources.pairing import Stamped, nanoseconds
 from segfloor_ros.camera.sources.sensor_files import DEPTH, folder_sensors
-from segfloor_ros.camera.sources.stamps import read_times
+from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import RecordedSensor
 
 TUM_UNIT_M = 1 / 5000
@@ -49,40 +43,37 @@ MONO = (
 )
 
 
-class DepthSource(FilePairSource):
-    """Images with depth images in place of the right ones."""
+def _depth_source(
+    name: str,
+    pairs: Sequence[files.FilePair],
+    left: EyeCalibration,
+    settings: StereoCameraSettings,
+    sensors: Sequence[RecordedSensor],
+    metres_per_unit: float | None = None,
+) -> StereoSource:
+    """Return images with depth images in place of the right ones. left: of the raw images."""
+    calibration = depth_calibration(left)
 
-    def __init__(
-        self,
-        name: str,
-        pairs: Sequence[FilePair],
-        calibration: StereoCalibration,
-        settings: StereoCameraSettings,
-        sensors: Sequence[RecordedSensor],
-        metres_per_unit: float | None = None,
-    ) -> None:
-        self._metres_per_unit = metres_per_unit
-        found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
-        others = [sensor for sensor in sensors if sensor.name != DEPTH]
-        super().__init__(name, pairs, calibration, settings.bit_depth, [found, *others])
+    def read_depth(path: Path) -> NDArray[Any]:
+        return disparity_of_depth(files.read_grey(path), calibration.camera, metres_per_unit)
 
-    def _loader(self, pair: FilePair) -> Callable[[], tuple[Grey, NDArray[Any]]]:
-        return lambda: (
-            read_grey(pair.left),
-            disparity_of_depth(read_grey(pair.right), self.camera, self._metres_per_unit),
-        )
+    found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
+    others = [sensor for sensor in sensors if sensor.name != DEPTH]
+    return files.file_pair_source(
+        name, pairs, calibration, settings.bit_depth, [found, *others], read_depth
+    )
 
 
 def with_depth(
     folder: Path,
-    pairs: Sequence[FilePair],
+    pairs: Sequence[files.FilePair],
     left: EyeCalibration,
     settings: StereoCameraSettings,
-) -> DepthSource:
+) -> StereoSource:
     """Return the left images of a folder with the depth images of its `depth/`, by file name or,
     where there are as many, in order. Raises InputError.
     """
-    depth = images_in(folder / DEPTH) if (folder / DEPTH).is_dir() else []
+    depth = files.images_in(folder / DEPTH) if (folder / DEPTH).is_dir() else []
     if not depth:
         raise InputError(
             f'{folder / DEPTH}: there are no depth images (16-bit PNG, mm); leave out --depth'
@@ -98,13 +89,15 @@ def with_depth(
             f'{missing[0]} is missing'
         )
     found = [
-        FilePair(pair.index, pair.stamp_ns, pair.left, path)
+        files.FilePair(pair.index, pair.stamp_ns, pair.left, path)
         for pair, path in zip(pairs, partners, strict=True)
         if path is not None
     ]
     # The images of a depth camera are not turned: `imu.csv` is in the axes of the rectified ones.
-    sensors = folder_sensors(folder, settings.ignored_sensors, left.R.T)
-    return DepthSource(str(folder), found, depth_calibration(left), settings, sensors)
+    sensors = folder_sensors(
+        folder, settings.ignored_sensors, make_transform(left.R.T, np.zeros(3))
+    )
+    return _depth_source(str(folder), found, left, settings, sensors)
 
 
 def is_tum_rgbd(folder: Path) -> bool:
@@ -112,63 +105,47 @@ def is_tum_rgbd(folder: Path) -> bool:
     return all((folder / name).is_file() for name in ('rgb.txt', 'depth.txt'))
 
 
-def open_tum_rgbd(folder: Path, settings: StereoCameraSettings) -> DepthSource:
+def open_tum_rgbd(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     """Open a folder of the TUM RGB-D benchmark. Colour and depth are paired by their stamps.
 
     Raises InputError or CalibrationError.
     """
     names = (str(folder / 'rgb.txt'), str(folder / 'depth.txt'))
-    colour, depth = (_read_list(folder, Path(name)) for name in names)
+    colour, depth = (_read_list(Path(name)) for name in names)
     tolerance_s = max(settings.pairing_tolerance_s, TUM_TOLERANCE_S)
-    pairing: StampPairing[Path] = StampPairing(tolerance_s, names, limit=None)
-    matches = [
-        *(pair for image in colour for pair in pairing.add(0, image.stamp_ns, image.item)),
-        *(pair for image in depth for pair in pairing.add(1, image.stamp_ns, image.item)),
-        *pairing.finish(),
-    ]
-    pairing.report()
-    pairs = [
-        FilePair(i, one.stamp_ns, one.item, other.item) for i, (one, other) in enumerate(matches)
-    ]
-    calibration = depth_calibration(_tum_camera(folder, [pair.left for pair in pairs], settings))
+    pairs = files.pairs_by_stamp(colour, depth, tolerance_s, names)
+    eye = given_left_calibration(settings) or _tum_camera(folder, [pair.left for pair in pairs])
     sensors = folder_sensors(folder, settings.ignored_sensors)
-    return DepthSource(str(folder), pairs, calibration, settings, sensors, TUM_UNIT_M)
+    return _depth_source(str(folder), pairs, eye, settings, sensors, TUM_UNIT_M)
 
 
-def _tum_camera(
-    folder: Path, images: Sequence[Path], settings: StereoCameraSettings
-) -> EyeCalibration:
-    if settings.left_calibration:
-        return read_eye_calibration(Path(settings.left_calibration))
+def _tum_camera(folder: Path, images: Sequence[Path]) -> EyeCalibration:
     for name in CALIBRATIONS:
         if (folder / name).exists():
             return read_eye_calibration(folder / name)
     published = [value for key, value in TUM_CAMERAS.items() if key in folder.resolve().name]
     fx, fy, cx, cy, distortion = (*published, TUM_ANY_CAMERA)[0]
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    width, height = first_image_size(images, str(folder))
+    width, height = files.first_image_size(images, str(folder))
     P = np.hstack([K, np.zeros((3, 1))])
     return EyeCalibration(
         width, height, K, np.array(distortion), np.eye(3), P, origin='the TUM RGB-D benchmark'
     )
 
 
-def _read_list(folder: Path, index: Path) -> list[Stamped[Path]]:
+def _read_list(index: Path) -> list[Stamped[Path]]:
     """Return the images of rgb.txt or depth.txt: lines of a time in seconds and a file name."""
-    lines = index.read_text(errors='replace').splitlines()
-    rows = [(n, line.split()) for n, line in enumerate(lines, 1) if line.strip()]
-    rows = [(number, words) for number, words in rows if not words[0].startswith('#')]
-    entries = []
-    for number, words in rows:
-        if len(words) != 2 or not (folder / words[1]).exists():
-            raise InputError(
-                f'{index}, line {number}: expected a time in seconds and the name of an image '
-                'that is there'
-            )
-    stamps = read_times(index, comments='#')
-    entries = [
-        Stamped(stamp, folder / words[1]) for stamp, (_, words) in zip(stamps, rows, strict=True)
-    ]
+
+    def entry(line: str, where: str) -> Stamped[Path]:
+        with contextlib.suppress(ValueError):
+            seconds, name = line.split()
+            if (index.parent / name).exists():
+                return Stamped(nanoseconds(seconds), index.parent / name)
+        raise InputError(
+            f'{where}: expected a time in seconds and the name of an image that is there'
+        )
+
+    entries = files.read_index(index, entry)
     if not entries:
         raise InputError(f'{index}: names no image')
     return entries

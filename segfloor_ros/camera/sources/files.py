@@ -5,17 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.images import CorruptImageError, Grey, decode_compressed
+from segfloor_ros.camera.images import CorruptImageError, Grey, decode_file
+from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, check_forward, rate_of
 from segfloor_ros.camera.sources.sensor_files import check_shared_clock
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
-from segfloor_ros.camera.sources.stamps import rate_of
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.measurements import RecordedSensor
 
 IMAGE_SUFFIXES = {'.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff', '.webp'}
@@ -31,40 +32,42 @@ class FilePair:
     right: Path
 
 
-class FilePairSource(StereoSource):
-    """A recording of image files."""
+def file_pair_source(
+    name: str,
+    pairs: Sequence[FilePair],
+    calibration: StereoCalibration,
+    bit_depth: int,
+    sensors: Sequence[RecordedSensor] = (),
+    read_right: Callable[[Path], NDArray[Any]] | None = None,
+) -> StereoSource:
+    """Return a recording of image files. read_right: of what stands in place of the right images.
+    Raises InputError.
+    """
 
-    def __init__(
-        self,
-        name: str,
-        pairs: Sequence[FilePair],
-        calibration: StereoCalibration,
-        bit_depth: int,
-        sensors: Sequence[RecordedSensor] = (),
-    ) -> None:
-        self._pairs = pairs
-        stamps = [pair.stamp_ns for pair in pairs]
-        super().__init__(
-            name,
-            calibration,
-            frame_count=len(pairs),
-            rate_hz=rate_of(stamps),
-            bit_depth=bit_depth,
-            sensors=sensors,
-        )
-        check_shared_clock(sensors, stamps)
-
-    def _entries(self) -> Iterator[PairEntry]:
+    def entries(source: StereoSource) -> Iterator[PairEntry]:
         last_ns = None
-        for pair in self._pairs:
+        for pair in pairs:
             if pair.stamp_ns == last_ns:
-                self._skip(pair.index, f'its stamp {last_ns} ns was there before')
+                source.skip(pair.index, f'its stamp {last_ns} ns was there before')
                 continue
             last_ns = pair.stamp_ns
-            yield PairEntry(pair.index, pair.stamp_ns, self._loader(pair))
+            yield PairEntry(pair.index, pair.stamp_ns, partial(load, pair))
 
-    def _loader(self, pair: FilePair) -> Callable[[], tuple[Grey, NDArray[Any]]]:
-        return lambda: (read_grey(pair.left), read_grey(pair.right))
+    def load(pair: FilePair) -> tuple[Grey, NDArray[Any]]:
+        return read_grey(pair.left), (read_right or read_grey)(pair.right)
+
+    stamps = [pair.stamp_ns for pair in pairs]
+    source = StereoSource(
+        name,
+        calibration,
+        entries,
+        frame_count=len(pairs),
+        rate_hz=rate_of(stamps),
+        bit_depth=bit_depth,
+        sensors=sensors,
+    )
+    check_shared_clock(sensors, stamps)
+    return source
 
 
 def read_grey(path: Path) -> Grey:
@@ -73,12 +76,44 @@ def read_grey(path: Path) -> Grey:
     Raises CorruptImageError naming the file when it is truncated or damaged, InputError when it
     cannot be read.
     """
-    try:
-        return decode_compressed(path.read_bytes())
-    except CorruptImageError as error:
-        raise CorruptImageError(f'{path}: {error}') from None
-    except OSError as error:
-        raise InputError(f'{path}: cannot read the image ({error.strerror})') from None
+    with os_errors(f'{path}: cannot read the image'):
+        return decode_file(path.read_bytes(), str(path))
+
+
+def read_index(index: Path, parse: Callable[[str, str], Stamped[Path]]) -> list[Stamped[Path]]:
+    """Return the images that the lines of a file name, those with `#` in front left out. parse:
+    gets the line and what to call it. Raises InputError, also for stamps that go backwards.
+    """
+    entries: list[Stamped[Path]] = []
+    for number, line in enumerate(index.read_text(errors='replace').splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith('#'):
+            continue
+        where = f'{index}, line {number}'
+        entry = parse(line, where)
+        check_forward(where, [e.stamp_ns for e in entries[-1:]], entry.stamp_ns)
+        entries.append(entry)
+    return entries
+
+
+def pairs_by_stamp(
+    left: Sequence[Stamped[Path]],
+    right: Sequence[Stamped[Path]],
+    tolerance_s: float,
+    names: tuple[str, str],
+) -> list[FilePair]:
+    """Return the images of two lists that belong together. names: of both, for messages. Raises
+    InputError where there are none.
+    """
+    pairing: StampPairing[Path] = StampPairing(tolerance_s, names, limit=None)
+    matches = [
+        *(pair for image in left for pair in pairing.add(0, image.stamp_ns, image.item)),
+        *(pair for image in right for pair in pairing.add(1, image.stamp_ns, image.item)),
+        *pairing.finish(),
+    ]
+    pairing.report()
+    return [
+        FilePair(i, one.stamp_ns, one.item, other.item) for i, (one, other) in enumerate(matches)
+    ]
 
 
 def first_image_size(paths: Sequence[Path], name: str) -> tuple[int, int]:

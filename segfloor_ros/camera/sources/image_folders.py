@@ -6,19 +6,18 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from segfloor_ros.camera.calibration_files import read_eye_calibration
-from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
-from segfloor_ros.camera.sources.files import (
-    FilePair,
-    FilePairSource,
-    check_equal_numbers,
-    images_in,
+from segfloor_ros.camera.calibration_files import (
+    find_calibration,
+    given_left_calibration,
+    read_eye_calibration,
 )
-from segfloor_ros.camera.sources.found_calibration import find_calibration
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import files
+from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
+from segfloor_ros.camera.sources.pairing import check_times, read_times, stamps_of_rate
 from segfloor_ros.camera.sources.sensor_files import folder_sensors
 from segfloor_ros.camera.sources.sides import is_side, side_pairs
-from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
+from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
@@ -31,32 +30,31 @@ def has_image_sides(folder: Path) -> bool:
     return _side_images(folder) is not None
 
 
-def open_image_folders(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
+def open_image_folders(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     """Open two image folders with their calibration. Raises InputError or CalibrationError."""
     sides = _side_images(folder)
     if settings.depth or (sides and not sides[1] and (folder / DEPTH).is_dir()):
         return _open_depth(folder, sides[0] if sides else [], settings)
     left, right = find_image_pairs(folder)
     stamps = _stamps(folder, left, settings.rate_hz)
-    pairs = [FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))]
+    pairs = [
+        files.FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))
+    ]
     places = (folder, left[0].parent, left[0].parent.parent)
     calibration = find_calibration(str(folder), places, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
-    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
+    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
-def _open_depth(
-    folder: Path, left: Sequence[Path], settings: StereoCameraSettings
-) -> FilePairSource:
+def _open_depth(folder: Path, left: Sequence[Path], settings: StereoCameraSettings) -> StereoSource:
     if not left:
         raise InputError(f'{folder}: expected an image folder left beside depth')
     stamps = _stamps(folder, left, settings.rate_hz)
     pairs = [
-        FilePair(i, stamp, path, path)
+        files.FilePair(i, stamp, path, path)
         for i, (stamp, path) in enumerate(zip(stamps, left, strict=True))
     ]
-    given = settings.left_calibration
-    eye = read_eye_calibration(Path(given) if given else folder / 'left.yaml')
+    eye = given_left_calibration(settings) or read_eye_calibration(folder / 'left.yaml')
     return with_depth(folder, pairs, eye, settings)
 
 
@@ -74,7 +72,7 @@ def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:
     left, right = sides
     if not (left and right) and (left or right):
         raise InputError(f'{folder}: {len(left)} left and {len(right)} right images; {MONO}')
-    check_equal_numbers(str(folder), left, right)
+    files.check_equal_numbers(str(folder), left, right)
     for one, other in zip(left, right, strict=True):
         if _numbers(one) and _numbers(other) and _numbers(one)[-1:] != _numbers(other)[-1:]:
             raise InputError(
@@ -92,7 +90,7 @@ def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
             return images
     # Both sides in one folder, or a lonely side, whose partner is missed in the next check.
     left_images, right_images = (
-        [path for path in images_in(folder) if is_side(path.stem, side)]
+        [path for path in files.images_in(folder) if is_side(path.stem, side)]
         or [
             path
             for name in folders
@@ -106,7 +104,7 @@ def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
 
 def _nested_images(folder: Path) -> list[Path]:
     data = folder / 'data'
-    return images_in(folder) or (images_in(data) if data.is_dir() else [])
+    return files.images_in(folder) or (files.images_in(data) if data.is_dir() else [])
 
 
 def _numbers(path: Path) -> list[int]:
@@ -118,12 +116,7 @@ def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
     for name in TIME_FILES:
         if (folder / name).exists():
             stamps = read_times(folder / name)
-            if len(stamps) != len(left):
-                raise InputError(
-                    f'{folder / name}: {len(stamps)} times for {len(left)} pairs of images; it '
-                    'needs one line for each, or remove it to read the images at '
-                    'stereo_camera.rate_hz'
-                )
+            check_times(folder / name, stamps, left)
             return stamps
     if all(path.stem.isdigit() and len(path.stem) >= NANOSECOND_DIGITS for path in left):
         return [int(path.stem) for path in left]

@@ -7,24 +7,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from segfloor_ros.camera.calibration import StereoCalibration
 from segfloor_ros.camera.calibration_files import (
-    read_eye_calibration,
+    given_calibration,
+    given_left_calibration,
     read_kitti_calibration,
     read_kitti_eye,
 )
 from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.sources import files
 from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
-from segfloor_ros.camera.sources.files import (
-    FilePair,
-    FilePairSource,
-    check_equal_numbers,
-    first_image_size,
-    images_in,
-)
-from segfloor_ros.camera.sources.found_calibration import given_calibration
+from segfloor_ros.camera.sources.pairing import check_times, read_times, stamps_of_rate
 from segfloor_ros.camera.sources.sensor_files import folder_sensors
-from segfloor_ros.camera.sources.stamps import read_times, stamps_of_rate
+from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
 
 CAMERAS = ((0, 1), (2, 3))
@@ -36,29 +30,23 @@ def is_kitti(folder: Path) -> bool:
     return has_index and any((folder / f'image_{i}').is_dir() for i in range(4))
 
 
-def open_kitti(folder: Path, settings: StereoCameraSettings) -> FilePairSource:
+def open_kitti(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     """Open a KITTI odometry folder. Raises InputError or CalibrationError."""
-    cameras = _cameras(folder)
-    if settings.depth or cameras[1] is None:
-        return _open_depth(folder, cameras[0], settings)
-    left, right = (images_in(folder / f'image_{camera}') for camera in cameras)
-    check_equal_numbers(str(folder), left, right)
+    camera, partner = _cameras(folder)
+    has_right = partner is not None and not settings.depth
+    left = files.images_in(folder / f'image_{camera}')
+    right = files.images_in(folder / f'image_{partner}') if has_right else left
+    files.check_equal_numbers(str(folder), left, right)
     indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
-    pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
-    calibration = _calibration(folder, settings, left, (cameras[0], cameras[1]))
+    pairs = [files.FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
+    calib, size = folder / 'calib.txt', files.first_image_size(left, str(folder))
+    if partner is None or not has_right:
+        eye = given_left_calibration(settings) or read_kitti_eye(calib, *size, camera)
+        return with_depth(folder, pairs, eye, settings)
+    calibration = given_calibration(settings)
+    calibration = calibration or read_kitti_calibration(calib, *size, (camera, partner))
     sensors = folder_sensors(folder, settings.ignored_sensors)
-    return FilePairSource(str(folder), pairs, calibration, settings.bit_depth, sensors)
-
-
-def _open_depth(folder: Path, camera: int, settings: StereoCameraSettings) -> FilePairSource:
-    left = images_in(folder / f'image_{camera}')
-    indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
-    pairs = [FilePair(*fields) for fields in zip(indices, stamps, left, left, strict=True)]
-    if settings.left_calibration:
-        eye = read_eye_calibration(Path(settings.left_calibration))
-    else:
-        eye = read_kitti_eye(folder / 'calib.txt', *first_image_size(left, str(folder)), camera)
-    return with_depth(folder, pairs, eye, settings)
+    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
 def _cameras(folder: Path) -> tuple[int, int | None]:
@@ -91,22 +79,5 @@ def _indices_and_stamps(
     numbers = [int(path.stem) for path in left if path.stem.isdigit()]
     if len(numbers) == len(left) and numbers[-1] < len(stamps):
         return numbers, [stamps[number] for number in numbers]
-    if len(stamps) != len(left):
-        raise InputError(
-            f'{times}: {len(stamps)} times for {len(left)} pairs of images; it needs one line '
-            'for each, or remove it to read the images at stereo_camera.rate_hz'
-        )
+    check_times(times, stamps, left)
     return indices, stamps
-
-
-def _calibration(
-    folder: Path,
-    settings: StereoCameraSettings,
-    left: Sequence[Path],
-    cameras: tuple[int, int],
-) -> StereoCalibration:
-    given = given_calibration(settings)
-    if given is not None:
-        return given
-    width, height = first_image_size(left, str(folder))
-    return read_kitti_calibration(folder / 'calib.txt', width, height, cameras)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag import open_bag
 from segfloor_ros.camera.sources.bag_file import is_bag
-from segfloor_ros.camera.sources.depth_images import DEPTH, is_tum_rgbd, open_tum_rgbd
+from segfloor_ros.camera.sources.depth_images import is_tum_rgbd, open_tum_rgbd
 from segfloor_ros.camera.sources.euroc import is_euroc, open_euroc
 from segfloor_ros.camera.sources.image_folders import has_image_sides, open_image_folders
 from segfloor_ros.camera.sources.kitti import is_kitti, open_kitti
-from segfloor_ros.camera.sources.masks import MaskFolder
-from segfloor_ros.camera.sources.source import StereoSource
+from segfloor_ros.camera.sources.source import MaskFolder, StereoSource
 from segfloor_ros.camera.sources.video import is_device, is_video, open_device, open_video
 from segfloor_ros.errors import InputError
 
@@ -21,6 +21,20 @@ KINDS = (
     'right.yaml, a TUM RGB-D folder, a ROS bag (.mcap, .db3, .bag), or a video or device with a '
     'calibration'
 )
+
+
+Openers = tuple[
+    tuple[Callable[[Path], bool], Callable[[Path, StereoCameraSettings], StereoSource]], ...
+]
+FOLDERS: Openers = (
+    (is_tum_rgbd, open_tum_rgbd),
+    (is_kitti, open_kitti),
+    (is_euroc, open_euroc),
+    (is_bag, open_bag),
+    (has_image_sides, open_image_folders),
+)
+FILES: Openers = ((is_bag, open_bag), (is_video, open_video))
+"""What recognises a kind of recording, and what opens it."""
 
 
 def open_source(settings: StereoCameraSettings) -> StereoSource:
@@ -33,6 +47,10 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
     try:
         source = _open(settings)
+        if settings.depth and not source.takes_depth:
+            raise InputError(
+                f'{source.name}: no depth images can be read from it; leave out --depth'
+            )
         if settings.masks:
             source.masks = MaskFolder(Path(settings.masks).expanduser(), source.camera)
         return source
@@ -43,36 +61,12 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
 
 
 def _open(settings: StereoCameraSettings) -> StereoSource:
-    source = _open_any(settings)
-    if settings.depth and not any(s.name == DEPTH and s.used for s in source.sensors):
-        raise InputError(f'{source.name}: no depth images can be read from it; leave out --depth')
-    return source
-
-
-def _open_any(settings: StereoCameraSettings) -> StereoSource:
     path = Path(settings.input).expanduser()
     if is_device(settings.input) and not path.is_dir():
         return open_device(settings.input, settings)
     if not path.exists():
         raise InputError(f'{path}: no such file or folder; give {KINDS}')
-    if path.is_dir():
-        return _open_folder(path, settings)
-    if is_bag(path):
-        return open_bag(path, settings)
-    if is_video(path):
-        return open_video(path, settings)
+    for recognises, open_path in FOLDERS if path.is_dir() else FILES:
+        if recognises(path):
+            return open_path(path, settings)
     raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
-
-
-def _open_folder(folder: Path, settings: StereoCameraSettings) -> StereoSource:
-    if is_tum_rgbd(folder):
-        return open_tum_rgbd(folder, settings)
-    if is_kitti(folder):
-        return open_kitti(folder, settings)
-    if is_euroc(folder):
-        return open_euroc(folder, settings)
-    if is_bag(folder):
-        return open_bag(folder, settings)
-    if has_image_sides(folder):
-        return open_image_folders(folder, settings)
-    raise InputError(f'{folder}: no recording was recognised in it; give {KINDS}')

@@ -8,29 +8,34 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.calibration_files import read_body_pose
+from segfloor_ros.camera.sources.pairing import nanoseconds
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
-from segfloor_ros.measurements import ImuSample, Measurement, RecordedSensor, WheelPose
+from segfloor_ros.measurements import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 
-WHEEL_ODOMETRY, IMU, DEPTH = 'wheel_odometry', 'imu', 'depth'
+WHEEL_ODOMETRY, IMU = 'wheel_odometry', 'imu'
 WHEEL_FILE, IMU_FILE = 'wheel_odometry.txt', 'imu.csv'
 TUM_COLUMNS = 't x y z qx qy qz qw'
 IMU_COLUMNS = 'stamp in ns, angular velocity x y z in rad/s, acceleration x y z in m/s²'
 ACCEL_RANGE_M_S2 = (7.0, 13.0)
 """Median acceleration felt on earth; outside of it the unit or the columns are wrong."""
 
+UPRIGHT = 0.8
+"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
+
 
 def folder_sensors(
-    folder: Path, ignored: Collection[str], R_left_imu: Array | None = None, imu: Path | None = None
+    folder: Path, ignored: Collection[str], T_left_imu: Array | None = None, imu: Path | None = None
 ) -> list[RecordedSensor]:
     """Return the sensors whose files lie in a folder; depth images count as not used.
 
-    R_left_imu: (3, 3) turns what the file `imu` holds into the rectified left optical frame. Raises
-    InputError when a file that is used is bad.
+    T_left_imu: (4, 4), the frame of what the file `imu` holds in the rectified left optical one.
+    Raises InputError when a file that is used is bad.
     """
     files: list[tuple[str, Path, Callable[[Path], Sequence[Measurement]]]] = [
         (WHEEL_ODOMETRY, folder / WHEEL_FILE, read_wheel_odometry),
-        (IMU, imu or folder / IMU_FILE, lambda path: read_imu(path, R_left_imu)),
+        (IMU, imu or folder / IMU_FILE, lambda path: read_imu(path, T_left_imu)),
     ]
     found = [
         _sensor(name, path, read, name not in ignored)
@@ -56,7 +61,7 @@ def _sensor(
 
 def read_wheel_odometry(path: Path) -> list[WheelPose]:
     """Return the poses of a file in the TUM format. Raises InputError naming file and line."""
-    table, stamps_ns = _read_table(path, ' ', 8, TUM_COLUMNS, stamp_factor=1_000_000_000)
+    table, stamps_ns = _read_table(path, 8, TUM_COLUMNS, nanoseconds)
     norms = np.linalg.norm(table[:, 3:7], axis=1)
     bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
     if len(bad):
@@ -72,16 +77,22 @@ def read_wheel_odometry(path: Path) -> list[WheelPose]:
     return [WheelPose(int(stamp), pose) for stamp, pose in zip(stamps_ns, poses, strict=True)]
 
 
-def read_imu(path: Path, R_left_imu: Array | None = None) -> list[ImuSample]:
-    """Return the samples of a file with the columns of EuRoC's data.csv, turned by R_left_imu.
+def read_imu(path: Path, T_left_imu: Array | None = None) -> list[ImuSample]:
+    """Return the samples of a file with the columns of EuRoC's data.csv. A YAML file of the same
+    name tells by `T_BS` where the IMU is; T_left_imu: (4, 4), and where that frame is in the
+    rectified left optical one.
 
-    Raises InputError naming file and line.
+    Raises InputError naming file and line, or CalibrationError.
     """
-    table, stamps_ns = _read_table(path, ',', 7, IMU_COLUMNS, stamp_factor=1)
+    table, stamps_ns = _read_table(path, 7, IMU_COLUMNS, int)
     check_gravity(str(path), table[:, 3:6])
-    R = np.eye(3) if R_left_imu is None else R_left_imu
-    gyro, accel = table[:, :3] @ R.T, table[:, 3:6] @ R.T
-    return [ImuSample(int(t), w, a) for t, w, a in zip(stamps_ns, gyro, accel, strict=True)]
+    beside = path.with_suffix('.yaml')
+    T = np.eye(4) if T_left_imu is None else T_left_imu
+    T = T @ read_body_pose(beside) if beside.exists() else T
+    return [
+        ImuSample.seen_from(T, int(stamp), row[:3], row[3:6])
+        for stamp, row in zip(stamps_ns, table, strict=True)
+    ]
 
 
 def check_gravity(where: str, accel_m_s2: Array) -> None:
@@ -92,6 +103,13 @@ def check_gravity(where: str, accel_m_s2: Array) -> None:
             f'{where}: the median acceleration is {felt:.3g}, but gravity alone is 9.81 m/s²; '
             'correct the unit or the columns, or leave it out with --ignore imu'
         )
+
+
+def is_upright(accel_m_s2: Array) -> bool:
+    """Whether up is about up in the image for what an IMU at rest feels (3,): its axes may be those
+    of the image.
+    """
+    return bool(-accel_m_s2[1] > UPRIGHT * np.linalg.norm(accel_m_s2))
 
 
 def check_shared_clock(sensors: Sequence[RecordedSensor], stamps_ns: Sequence[int]) -> None:
@@ -108,7 +126,7 @@ def check_shared_clock(sensors: Sequence[RecordedSensor], stamps_ns: Sequence[in
 
 
 def _read_table(
-    path: Path, separator: str, columns: int, expected: str, stamp_factor: int
+    path: Path, columns: int, expected: str, read_stamp: Callable[[str], int]
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return the numbers (N, columns - 1) after the stamps, and the stamps (N,) in ns, ascending;
     of several lines with the same stamp the first counts.
@@ -117,11 +135,11 @@ def _read_table(
     for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
         if not line.strip() or line.lstrip().startswith('#'):
             continue
-        words = line.split(',') if separator == ',' else line.replace(',', ' ').split()
+        words = line.replace(',', ' ').split()
         try:
             values = [float(word) for word in words[1:columns]]
-            stamp_ns = _stamp_ns(words[0].strip(), stamp_factor)
-        except (ValueError, OverflowError):
+            stamp_ns = read_stamp(words[0])
+        except ValueError:
             values = []
         if len(values) != columns - 1 or not np.isfinite(values).all():
             raise InputError(f'{path}, line {number}: expected {expected}')
@@ -130,12 +148,3 @@ def _read_table(
         raise InputError(f'{path}: holds no measurement; expected {expected}')
     stamps = sorted(rows)
     return np.array([rows[stamp] for stamp in stamps]), np.array(stamps, np.int64)
-
-
-def _stamp_ns(word: str, factor: int) -> int:
-    if factor == 1:
-        return int(word)
-    seconds, _, fraction = word.partition('.')
-    if seconds.isdigit() and (not fraction or fraction.isdigit()):
-        return int(seconds) * factor + int((fraction + '0' * 9)[:9])
-    return round(float(word) * factor)

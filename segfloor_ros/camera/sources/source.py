@@ -1,13 +1,16 @@
-"""What every source of stereo pairs has in common."""
+"""What every source of stereo pairs has in common, and the masks that may go with its frames."""
 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,15 +19,48 @@ from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.rectification import StereoRectifier
-from segfloor_ros.camera.sources.masks import MaskFolder
-from segfloor_ros.camera.sources.prefetch import prefetched
 from segfloor_ros.errors import InputError
-from segfloor_ros.measurements import RecordedSensor
+from segfloor_ros.measurements import DEPTH, RecordedSensor
 
 DEFAULT_RATE_HZ = 10.0
 """Frame rate of a recording that has no stamps."""
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar('T')
+
+AHEAD = 3
+"""Items prepared before they are asked for."""
+
+
+class MaskFolder:
+    """Masks `%06d.png` by frame index, of the left image as recorded, 255 = moving. A frame
+    without a file has nothing that moves.
+    """
+
+    def __init__(self, folder: Path, camera: StereoCamera) -> None:
+        if not folder.is_dir():
+            raise InputError(f'{folder}: no such folder; give --masks a folder of %06d.png')
+        if next(folder.glob('[0-9]*.png'), None) is None:
+            raise InputError(f'{folder}: holds no masks; they are named by frame, e.g. 000012.png')
+        self._folder = folder
+        self._shape = (camera.height, camera.width)
+
+    def read(self, index: int) -> NDArray[np.uint8] | None:
+        """Return the mask (H, W) uint8 of a frame, or None where there is none.
+
+        Raises InputError for a file that is no such mask.
+        """
+        path = self._folder / f'{index:06d}.png'
+        if not path.exists():
+            return None
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise InputError(f'{path}: is no image; masks are PNG files, 255 = moving')
+        if mask.shape != self._shape:
+            found, expected = (f'{shape[1]}x{shape[0]}' for shape in (mask.shape, self._shape))
+            raise InputError(f'{path}: is {found}, but the images are {expected}')
+        return np.asarray(mask, np.uint8)
 
 
 @dataclass(frozen=True)
@@ -51,10 +87,11 @@ class PairEntry:
     load: Callable[[], tuple[Grey, NDArray[Any]]]
 
 
-class StereoSource(ABC):
+class StereoSource:
     """A recording or device as a sequence of stereo pairs with one calibration.
 
-    name: of the recording, for messages. calibration: of the raw pairs. camera: the rectified
+    name: of the recording, for messages. calibration: of the raw pairs. read: gets this source and
+    yields its pairs in order, without decoding them. camera: the rectified
     one. frame_count: pairs expected, None when unknown. rate_hz: frames per second.
     skipped_frames: pairs left out so far because an image was damaged or the stamp was there
     before. sensors: what else was found in the recording. masks: of what moves, where given.
@@ -64,6 +101,7 @@ class StereoSource(ABC):
         self,
         name: str,
         calibration: StereoCalibration,
+        read: Callable[[StereoSource], Iterator[PairEntry]],
         *,
         frame_count: int | None,
         rate_hz: float,
@@ -73,6 +111,7 @@ class StereoSource(ABC):
         self.name = name
         self.sensors = sensors
         self.calibration = calibration
+        self._read = read
         self.frame_count = frame_count
         self.rate_hz = rate_hz
         self.masks: MaskFolder | None = None
@@ -86,6 +125,11 @@ class StereoSource(ABC):
         """The rectified stereo camera."""
         return self.calibration.camera
 
+    @property
+    def takes_depth(self) -> bool:
+        """Whether depth images stand in place of the right ones."""
+        return any(sensor.name == DEPTH and sensor.used for sensor in self.sensors)
+
     def frames(self) -> Iterator[StereoFrame]:
         """Yield the rectified pairs in order of their stamps; the next ones are prepared
         meanwhile on one background thread.
@@ -97,10 +141,6 @@ class StereoSource(ABC):
     def raw_pairs(self) -> Iterator[RawPair]:
         """Yield the pairs of `frames()` unrectified; they belong to `calibration`."""
         return prefetched(self._decoded())
-
-    @abstractmethod
-    def _entries(self) -> Iterator[PairEntry]:
-        """Yield the pairs in order, without decoding them."""
 
     def _check_first_pair(self) -> None:
         """Read up to the first good pair: its size must be the calibration's, its pixels tell the
@@ -119,11 +159,11 @@ class StereoSource(ABC):
 
     def _decoded(self) -> Iterator[RawPair]:
         self.skipped_frames = 0
-        for entry in self._entries():
+        for entry in self._read(self):
             try:
                 left, right = entry.load()
             except CorruptImageError as error:
-                self._skip(entry.index, str(error))
+                self.skip(entry.index, str(error))
                 continue
             for image in (left, right):
                 what = f'{self.name}: frame {entry.index}'
@@ -134,8 +174,32 @@ class StereoSource(ABC):
                 left, right = self._eight_bit(left, right)
             yield RawPair(entry.index, entry.stamp_ns, left, right)
 
-    def _skip(self, index: int, reason: str) -> None:
+    def skip(self, index: int, reason: str) -> None:
+        """Count a pair that is left out, with a warning."""
         self.skipped_frames += 1
         if index not in self._warned_of:  # recordings are read more than once
             self._warned_of.add(index)
             logger.warning('%s: frame %d is skipped: %s', self.name, index, reason)
+
+
+def prefetched(items: Generator[T, None, None] | Iterator[T]) -> Iterator[T]:
+    """Yield `items` in order, prepared on one background thread.
+
+    Errors are raised where their item would have come. The thread ends with the last item, with
+    an error, and when the consumer stops early.
+    """
+    end = object()
+    worker = ThreadPoolExecutor(1, 'images')
+    pending: deque[Future[object]] = deque()
+    try:
+        while True:
+            while len(pending) < AHEAD:
+                pending.append(worker.submit(next, items, end))
+            item = pending.popleft().result()
+            if item is end:
+                return
+            yield item  # type: ignore[misc]
+    finally:
+        worker.shutdown(cancel_futures=True)
+        if isinstance(items, Generator):
+            items.close()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -13,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.calibration_files import find_calibration
 from segfloor_ros.camera.images import Grey, to_grey
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources.found_calibration import find_calibration
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
 
@@ -32,71 +33,58 @@ def is_device(name: str) -> bool:
     return name.removeprefix('/dev/video').isdigit()
 
 
-def open_video(path: Path, settings: StereoCameraSettings) -> VideoSource:
+def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
     """Open a side-by-side video with the calibration beside it or in the settings.
 
     Raises InputError or CalibrationError.
     """
     calibration = find_calibration(str(path), (path.parent,), settings)
-    return VideoSource(str(path), calibration, settings, is_live=False)
+    return _video_source(str(path), calibration, settings, is_live=False)
 
 
-def open_device(name: str, settings: StereoCameraSettings) -> VideoSource:
+def open_device(name: str, settings: StereoCameraSettings) -> StereoSource:
     """Open a side-by-side camera device. Raises InputError or CalibrationError."""
     calibration = find_calibration(f'device {name}', (Path.cwd(),), settings)
-    return VideoSource(name, calibration, settings, is_live=True)
+    return _video_source(name, calibration, settings, is_live=True)
 
 
-class VideoSource(StereoSource):
-    """The frames of a video, stamped by their number and the frame rate, or of a device, stamped
-    on arrival.
+def _video_source(
+    name: str, calibration: StereoCalibration, settings: StereoCameraSettings, is_live: bool
+) -> StereoSource:
+    """Return the frames of a video, stamped by their number and the frame rate, or of a device,
+    stamped on arrival.
     """
+    size = (2 * calibration.left.width, calibration.left.height)
 
-    def __init__(
-        self,
-        name: str,
-        calibration: StereoCalibration,
-        settings: StereoCameraSettings,
-        is_live: bool,
-    ) -> None:
-        self._path = name
-        self._is_live = is_live
-        self._size = (2 * calibration.left.width, calibration.left.height)
-        with self._opened() as video:
-            count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-            rate_hz = settings.rate_hz or video.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE_HZ
-        super().__init__(
-            name,
-            calibration,
-            frame_count=None if is_live or count <= 0 else count,
-            rate_hz=rate_hz,
-        )
-
-    def _entries(self) -> Iterator[PairEntry]:
-        with self._opened() as video:
-            index = 0
-            while True:
+    def entries(source: StereoSource) -> Iterator[PairEntry]:
+        with _opened(name, size, is_live) as video:
+            for index in count():
                 ok, image = video.read()
                 if not ok:
                     return
-                stamp_ns = time.time_ns() if self._is_live else round(index * 1e9 / self.rate_hz)
+                stamp_ns = time.time_ns() if is_live else round(index * 1e9 / source.rate_hz)
                 yield PairEntry(index, stamp_ns, partial(_halves, image))
-                index += 1
 
-    @contextmanager
-    def _opened(self) -> Iterator[cv2.VideoCapture]:
-        name = self._path.removeprefix('/dev/video')
-        video = cv2.VideoCapture(int(name) if self._is_live else self._path)
-        try:
-            if not video.isOpened():
-                what = 'the device' if self._is_live else 'the video'
-                raise InputError(f'{self._path}: cannot open {what}; is it there and readable?')
-            if self._is_live:
-                video.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
-                video.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
-            yield video
-        finally:
-            video.release()
+    with _opened(name, size, is_live) as video:
+        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        rate_hz = settings.rate_hz or video.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE_HZ
+    frame_count = None if is_live or frames <= 0 else frames
+    return StereoSource(name, calibration, entries, frame_count=frame_count, rate_hz=rate_hz)
+
+
+@contextmanager
+def _opened(name: str, size: tuple[int, int], is_live: bool) -> Iterator[cv2.VideoCapture]:
+    video = cv2.VideoCapture(int(name.removeprefix('/dev/video')) if is_live else name)
+    try:
+        if not video.isOpened():
+            what = 'the device' if is_live else 'the video'
+            raise InputError(f'{name}: cannot open {what}; is it there and readable?')
+        if is_live:
+            video.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            video.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        yield video
+    finally:
+        video.release()
 
 
 def _halves(image: NDArray[np.uint8]) -> tuple[Grey, Grey]:
