@@ -7,6 +7,7 @@ same one. The robot is one for all stages, whichever of them it was set for.
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -31,15 +32,11 @@ ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_servi
 class Configuration:
     """The settings of the five stages, each under its node's name."""
 
-    stereo_camera: StereoCameraSettings = dataclasses.field(default_factory=StereoCameraSettings)
-    stereo_slam: StereoSlamSettings = dataclasses.field(default_factory=StereoSlamSettings)
-    floor_segmentation: FloorSegmentationSettings = dataclasses.field(
-        default_factory=FloorSegmentationSettings
-    )
-    cloud_labelling: CloudLabellingSettings = dataclasses.field(
-        default_factory=CloudLabellingSettings
-    )
-    occupancy_grid: OccupancyGridSettings = dataclasses.field(default_factory=OccupancyGridSettings)
+    stereo_camera: StereoCameraSettings
+    stereo_slam: StereoSlamSettings
+    floor_segmentation: FloorSegmentationSettings
+    cloud_labelling: CloudLabellingSettings
+    occupancy_grid: OccupancyGridSettings
 
     def stages(self) -> dict[str, StageSettings]:
         """Return the settings by stage name, in the order of the data flow."""
@@ -53,16 +50,7 @@ class Configuration:
         }
 
 
-STAGE_SETTINGS: dict[str, type[StageSettings]] = {
-    cls.stage_name(): cls
-    for cls in (
-        StereoCameraSettings,
-        StereoSlamSettings,
-        FloorSegmentationSettings,
-        CloudLabellingSettings,
-        OccupancyGridSettings,
-    )
-}
+STAGE_SETTINGS: dict[str, type[StageSettings]] = typing.get_type_hints(Configuration)
 
 ROBOT_STAGES = [name for name, cls in STAGE_SETTINGS.items() if issubclass(cls, RobotSettings)]
 ROBOT_PARAMETERS = [spec.name for spec in RobotSettings.specs()]
@@ -129,8 +117,12 @@ def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, di
     stage = node.rsplit('/', 1)[-1]
     if stage in STAGE_SETTINGS:
         # What only the node has (frames, rates) is no concern of the stage.
-        own = {k: v for k, v in parameters.items() if not is_node_parameter(stage, k)}
-        return {stage: own}
+        known = {spec.name for spec in STAGE_SETTINGS[stage].specs()}
+        return {
+            stage: {
+                k: v for k, v in parameters.items() if k in known or not is_node_parameter(stage, k)
+            }
+        }
     if stage != '**':
         return {}
     values: dict[str, dict[str, Any]] = {}

@@ -2,13 +2,18 @@
 stop.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class SegfloorError(Exception):
     """Root of every error whose message is meant for the user: what, where, what to do."""
 
 
 class InputError(SegfloorError):
-    """A recording cannot be read: missing, empty, inconsistent or of an unknown kind."""
+    """A recording or message cannot be read: missing, empty, inconsistent or of an unknown kind."""
 
 
 class CalibrationError(SegfloorError):
@@ -21,3 +26,14 @@ class SettingsError(SegfloorError):
 
 class MapError(SegfloorError):
     """No map could be made, or a map file cannot be read."""
+
+
+@contextmanager
+def os_errors(what: str, advice: str = '') -> Iterator[None]:
+    """Turn an error of the operating system into one line: what is wrong, why, what to do. Raises
+    InputError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f'{what} ({error.strerror}){advice}') from None

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segfloor_ros import results_folder
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
@@ -20,16 +21,9 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.resident_memory import MemoryLog
-from segfloor_ros.results_folder import (
-    OutputFolder,
-    RunResult,
-    RunSummary,
-    lost_intervals,
-    relocalisations,
-)
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
+from segfloor_ros.timing import MemoryLog
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
 
 ProgressListener = Callable[[int, str], None]
@@ -81,6 +75,14 @@ class MapOptions:
 NO_MAPS = MapOptions()
 
 
+def no_floor(name: str, frames: int) -> str:
+    """Return why there is no map where the mount of the camera stayed unknown."""
+    return (
+        f'{name}: no level floor was recognised in {frames} frames, so the height of the camera is '
+        'unknown; give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad'
+    )
+
+
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs.
@@ -90,7 +92,7 @@ class LockstepRun:
         self,
         source: StereoSource,
         configuration: Configuration,
-        folder: OutputFolder,
+        folder: results_folder.OutputFolder,
         save_masks: SaveMasks = SaveMasks.keyframes,
         save_debug: bool = False,
         map_options: MapOptions = NO_MAPS,
@@ -114,7 +116,7 @@ class LockstepRun:
         self._frames = 0
         self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
-    def execute(self, on_progress: ProgressListener | None = None) -> RunResult:
+    def execute(self, on_progress: ProgressListener | None = None) -> results_folder.RunResult:
         """Process every frame and return the result; an interrupt (Ctrl-C) ends the run early
         and keeps the map.
 
@@ -123,6 +125,8 @@ class LockstepRun:
         start = time.perf_counter()
         try:
             self._process_frames(on_progress)
+            for result in self._pipeline.slam.finish():
+                self._note(result)
             grid = self._pipeline.finish()
         finally:
             self._pipeline.close()
@@ -133,7 +137,7 @@ class LockstepRun:
             raise MapError(self._why_no_map())
         self._save_map()
         path = self._path
-        return RunResult(
+        return results_folder.RunResult(
             grid,
             corrected_trajectory(poses, path),
             Trajectory(path.stamp_ns, path.T_map_base),
@@ -203,20 +207,19 @@ class LockstepRun:
         floor = self._other_frames.process(
             frame.left, frame.right, self._pipeline.mount, T_map_base
         )
-        self._folder.add_mask(frame.index, floor.mask)
+        self._folder.add_picture('floor_masks', f'{frame.index:06d}', floor.mask)
 
     def _on_keyframe(self, keyframe: Keyframe, floor: FloorObservation) -> None:
         self._memory.sample()
+        number = f'{keyframe.frame_index:06d}'
         if self._save_masks is not SaveMasks.none:
-            self._folder.add_mask(keyframe.frame_index, floor.mask)
+            self._folder.add_picture('floor_masks', number, floor.mask)
             if keyframe.moving is not None:
-                self._folder.add_moving_mask(keyframe.frame_index, keyframe.moving)
+                self._folder.add_picture('moving_masks', number, keyframe.moving)
         if self._save_debug:
-            pictures = {
-                'overlay': mask_overlay(keyframe.left, floor.mask),
-                'v_disparity': v_disparity_picture(floor),
-            }
-            self._folder.add_debug(keyframe.frame_index, pictures)
+            overlay, histogram = mask_overlay(keyframe.left, floor.mask), v_disparity_picture(floor)
+            self._folder.add_picture('floor_debug', f'{number}_overlay', overlay)
+            self._folder.add_picture('floor_debug', f'{number}_v_disparity', histogram)
 
     def _why_no_map(self) -> str:
         name = self._configuration.stereo_camera.input
@@ -225,11 +228,7 @@ class LockstepRun:
         if self._map_options.load is not None:
             return self._map_options.why_not_found(name, self._frames)
         if self._pipeline.mount is None:
-            return (
-                f'{name}: no level floor was recognised in {self._frames} frames, so the height of '
-                'the camera is unknown; give stereo_slam.camera_height_m, camera_pitch_rad and '
-                'camera_roll_rad'
-            )
+            return no_floor(name, self._frames)
         return f'{name}: none of {self._frames} frames could be tracked, so there is no map'
 
     def _sensors_used(self) -> dict[str, int]:
@@ -241,18 +240,25 @@ class LockstepRun:
             if sensor.used
         }
 
-    def _summary(self, wall_s: float) -> RunSummary:
+    def _summary(self, wall_s: float) -> results_folder.RunSummary:
         tracked = np.array([result.tracked for result in self._results], bool)
         mount = self._pipeline.mount
         assert mount is not None
-        return RunSummary(
+        return results_folder.RunSummary(
             frames=self._frames,
             tracked_frames=int(tracked.sum()),
             skipped_frames=self._source.skipped_frames,
-            lost_intervals=lost_intervals([r.index for r in self._results], tracked),
+            lost_intervals=results_folder.lost_intervals([r.index for r in self._results], tracked),
             keyframes=len(self._pipeline.slam.map.keyframes),
             loops=self._pipeline.slam.loop_count,
-            relocalisations=relocalisations([r.stamp_ns for r in self._results], tracked),
+            relocalisations=results_folder.relocalisations(
+                [r.stamp_ns for r in self._results], tracked
+            ),
+            apart=results_folder.apart_intervals(
+                [r.index for r in self._results],
+                np.array([r.apart for r in self._results], bool),
+                tracked,
+            ),
             map_updates=self._pipeline.keyframe_stages.map_updates,
             wall_s=round(wall_s, 3),
             frames_per_s=round(self._frames / wall_s, 2),

@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
 
 FORMAT = 'segfloor map'
 VERSION = 1
@@ -69,11 +69,8 @@ def read_map_file(path: Path) -> MapFile:
     """Read a map. Raises InputError, in one line, for a file that is missing, truncated, damaged,
     of another kind or of a newer version.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
-    return from_bytes(data, str(path))
+    with os_errors(f'{path}: cannot be read'):
+        return from_bytes(path.read_bytes(), str(path))
 
 
 def to_bytes(saved: MapFile, compress: bool = True) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,20 @@ class WheelPose:
 
 @dataclass(frozen=True)
 class ImuSample:
-    """Angular velocity and specific force (3,) at a time, in the rectified left optical frame."""
+    """Angular velocity and specific force (3,) at a time, and where the IMU is (3,), all in the
+    rectified left optical frame.
+    """
 
     stamp_ns: int
     gyro_rad_s: Array
     accel_m_s2: Array
+    place_m: Array = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def seen_from(T_left_imu: Array, stamp_ns: int, gyro: Array, accel: Array) -> ImuSample:
+        """Return what an IMU at a pose (4, 4) in the rectified left optical frame measured."""
+        R = T_left_imu[:3, :3]
+        return ImuSample(stamp_ns, R @ gyro, R @ accel, T_left_imu[:3, 3])
 
 
 @dataclass(frozen=True)
@@ -37,6 +46,12 @@ class Up:
 
 
 Measurement = WheelPose | ImuSample
+
+DEPTH = 'depth'
+"""Name of the depth images among the sensors of a recording."""
+
+DEPTH = 'depth'
+"""Name of the depth images among the sensors of a recording."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +77,13 @@ class MeasurementLog:
             if sensor.used
         ]
 
+    @property
+    def imu_place_m(self) -> Array:
+        """Where the IMU is (3,) in the rectified left optical frame; there, without one."""
+        firsts = (stream.first for stream in self._streams)
+        places = (first.place_m for first in firsts if isinstance(first, ImuSample))
+        return next(places, np.zeros(3))
+
     def until(self, stamp_ns: int) -> Iterator[Measurement]:
         """Yield what has not been handed out yet, up to the first measurement of each sensor at or
         after a time, so that poses can be interpolated there.
@@ -75,6 +97,10 @@ class _Stream:
         self._measurements = measurements
         self._stamps_ns: NDArray[np.int64] = np.array([m.stamp_ns for m in measurements], np.int64)
         self._next = 0
+
+    @property
+    def first(self) -> Measurement | None:
+        return self._measurements[0] if self._measurements else None
 
     def until(self, stamp_ns: int) -> Sequence[Measurement]:
         end = int(np.searchsorted(self._stamps_ns, stamp_ns)) + 1

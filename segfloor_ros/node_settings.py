@@ -1,18 +1,22 @@
-"""Parameters that only the ROS nodes have: frames, rates and topics' quality of service.
-
-They are declared like the settings of the stages, which know nothing of them.
+"""The parameters of the ROS nodes: the settings of their stages, and what only nodes have: frames,
+rates and topics' quality of service, declared in the same way.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.settings import StageSettings, setting
+from segfloor_ros.slam.settings import StereoSlamSettings
 
 
 @dataclass(frozen=True)
 class NodeSettings(StageSettings):
-    """Base of the settings of one node."""
+    """What every node has."""
 
     autostart: bool = setting(
         True,
@@ -22,9 +26,7 @@ class NodeSettings(StageSettings):
         30.0,
         'A node that was killed resumes with what it knew if it is started again within this time; '
         '0: it starts with an empty map.',
-        unit='s',
-        minimum=0.0,
-        maximum=3600.0,
+        within=(0.0, 3600.0),
     )
 
     @classmethod
@@ -34,14 +36,13 @@ class NodeSettings(StageSettings):
 
 
 @dataclass(frozen=True)
-class StereoCameraNodeSettings(NodeSettings):
+class StereoCameraNodeSettings(StereoCameraSettings, NodeSettings):
     """How a recording is played."""
 
     rate: float = setting(
         1.0,
         'Speed of a recording against real time; 0: as fast as the chain takes it, without loss.',
-        minimum=0.0,
-        maximum=100.0,
+        within=(0.0, 100.0),
     )
     lossless: bool = setting(
         False,
@@ -61,8 +62,7 @@ class StereoCameraNodeSettings(NodeSettings):
     jpeg_quality: int = setting(
         90,
         'Quality of the JPEG images; above 90 they grow much faster than they improve.',
-        minimum=1,
-        maximum=100,
+        within=(1, 100),
     )
     publish_clock: bool = setting(
         False,
@@ -75,7 +75,7 @@ class StereoCameraNodeSettings(NodeSettings):
 
 
 @dataclass(frozen=True)
-class StereoSlamNodeSettings(NodeSettings):
+class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     """Frames, images and tf."""
 
     map_frame: str = setting('map', 'Frame of the map.')
@@ -93,9 +93,7 @@ class StereoSlamNodeSettings(NodeSettings):
         5.0,
         'How long after the start to wait for the mount of the camera on tf before measuring it, '
         'where another node publishes tf.',
-        unit='s',
-        minimum=0.0,
-        maximum=60.0,
+        within=(0.0, 60.0),
     )
     load_map: str = setting(
         '',
@@ -139,55 +137,47 @@ class StereoSlamNodeSettings(NodeSettings):
     sync_tolerance_s: float = setting(
         0.005,
         'Largest difference of stamps of a left and a right image of one pair.',
-        unit='s',
-        minimum=0.0,
-        maximum=0.5,
+        within=(0.0, 0.5),
     )
     mask_timeout_s: float = setting(
         0.2,
         'A mask on dynamic_mask is used for later frames, too, until it is so old or a newer one '
         'comes; 0: only for the frame of its stamp.',
-        unit='s',
-        minimum=0.0,
-        maximum=10.0,
+        within=(0.0, 10.0),
     )
     max_waiting_frames: int = setting(
         3,
         'When more pairs than these wait, the oldest are skipped, so that poses stay fresh where '
         'tracking is slower than the camera. A lossless stereo_camera sends no more at a time.',
-        minimum=3,
-        maximum=100,
+        within=(3, 100),
         live=True,
     )
     bit_depth: int = setting(
         0,
         'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
         unit='bits',
-        minimum=0,
-        maximum=16,
+        within=(0, 16),
     )
 
 
 @dataclass(frozen=True)
-class FloorSegmentationNodeSettings(NodeSettings):
+class FloorSegmentationNodeSettings(FloorSegmentationSettings, NodeSettings):
     """Nothing beyond what every node has."""
 
 
 @dataclass(frozen=True)
-class CloudLabellingNodeSettings(NodeSettings):
+class CloudLabellingNodeSettings(CloudLabellingSettings, NodeSettings):
     """Nothing beyond what every node has."""
 
 
 @dataclass(frozen=True)
-class OccupancyGridNodeSettings(NodeSettings):
+class OccupancyGridNodeSettings(OccupancyGridSettings, NodeSettings):
     """When the map is published and where it is saved."""
 
     publish_period_s: float = setting(
         1.0,
         'The map is published at most this often; a change is never held back for longer.',
-        unit='s',
-        minimum=0.0,
-        maximum=60.0,
+        within=(0.0, 60.0),
         live=True,
     )
     map_file: str = setting(
@@ -212,5 +202,5 @@ NODE_SETTINGS: dict[str, type[NodeSettings]] = {
 
 
 def is_node_parameter(node: str, name: str) -> bool:
-    """Return whether a node has a parameter of this name beside its stage's settings."""
+    """Return whether a node has a parameter of this name."""
     return any(spec.name == name for spec in NODE_SETTINGS[node].specs())

@@ -70,15 +70,9 @@ class KeyframeStages:
             floor = self._floor.process(
                 keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving
             )
+        path, cloud = keyframe.path, keyframe.cloud
         self.update_map(
-            MapInput(
-                keyframe.stamp_ns,
-                keyframe.features,
-                keyframe.path,
-                keyframe.cloud,
-                floor.mask,
-                floor.scan,
-            )
+            MapInput(keyframe.stamp_ns, keyframe.features, path, cloud, floor.mask, floor.scan)
         )
         return floor
 

@@ -13,7 +13,6 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -25,7 +24,7 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.cloud.ply import write_ply
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.trajectory import Trajectory, write_tum
@@ -50,7 +49,9 @@ class RunSummary:
     """The figures of a run, as written to summary.json.
 
     lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
-    the times in seconds at which tracking was lost and found again, lost_s and found_s. sensors:
+    the times in seconds at which tracking was lost and found again, lost_s and found_s. apart: the
+    first_frame and last_frame of every stretch that was mapped without knowing where in the map it
+    is, and whether it was `joined` later; what was not is in no map and no trajectory. sensors:
     messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. moving_frames:
     in which something was found that moves. sensor_remarks: what seems wrong with sensors, in
     words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and
@@ -64,6 +65,7 @@ class RunSummary:
     keyframes: int
     loops: int
     relocalisations: list[dict[str, float]]
+    apart: list[dict[str, int | bool]]
     map_updates: int
     wall_s: float
     frames_per_s: float
@@ -105,6 +107,20 @@ def lost_intervals(
     ]
 
 
+def apart_intervals(
+    frame_indices: Sequence[int], apart: NDArray[np.bool_], tracked: NDArray[np.bool_]
+) -> list[dict[str, int | bool]]:
+    """Return what was mapped apart, as in `RunSummary`; all inputs are (N,)."""
+    return [
+        {
+            'first_frame': int(frame_indices[start]),
+            'last_frame': int(frame_indices[end]),
+            'joined': bool(tracked[start : end + 1].any()),
+        }
+        for start, end in lost_intervals(range(len(apart)), ~apart)
+    ]
+
+
 def relocalisations(stamp_ns: Sequence[int], tracked: NDArray[np.bool_]) -> list[dict[str, float]]:
     """Return when tracking was lost (the first stamp without a pose) and found again, for every
     stretch without a pose that ended; both inputs are (N,).
@@ -126,43 +142,26 @@ class OutputFolder:
         if target.exists() and not target.is_dir():
             raise InputError(f'{target}: exists and is no folder; choose another --out')
         self._target = target
-        self._staging: Path | None = None
 
     def __enter__(self) -> OutputFolder:
+        parent = self._target.absolute().parent
+        with os_errors(f'{parent}: cannot write there', '; choose another --out'):
+            parent.mkdir(parents=True, exist_ok=True)
+            self._staging = Path(tempfile.mkdtemp(prefix='.segfloor-', dir=parent))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._staging is not None:
-            shutil.rmtree(self._staging, ignore_errors=True)
+    def __exit__(self, *error: object) -> None:
+        shutil.rmtree(self._staging, ignore_errors=True)
 
-    def add_mask(self, frame_index: int, mask: NDArray[np.uint8]) -> None:
-        """Keep the floor mask (H, W) of a frame."""
-        self._add_mask('floor_masks', frame_index, mask)
-
-    def add_moving_mask(self, frame_index: int, mask: NDArray[np.uint8]) -> None:
-        """Keep the mask (H, W) of what moves in a frame."""
-        self._add_mask('moving_masks', frame_index, mask)
-
-    def _add_mask(self, name: str, frame_index: int, mask: NDArray[np.uint8]) -> None:
-        folder = self._open() / name
-        folder.mkdir(exist_ok=True)
-        cv2.imwrite(str(folder / f'{frame_index:06d}.png'), mask)
-
-    def add_debug(self, frame_index: int, pictures: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Keep pictures (H, W, 3) BGR of what floor segmentation did with a frame, by name."""
-        folder = self._open() / 'floor_debug'
-        folder.mkdir(exist_ok=True)
-        for name, picture in pictures.items():
-            cv2.imwrite(str(folder / f'{frame_index:06d}_{name}.png'), picture)
+    def add_picture(self, folder: str, name: str, picture: NDArray[np.uint8]) -> None:
+        """Keep a mask (H, W), or a picture (H, W, 3) BGR, in one of the folders of pictures."""
+        target = self._staging / folder
+        target.mkdir(exist_ok=True)
+        cv2.imwrite(str(target / f'{name}.png'), picture)
 
     def write(self, result: RunResult) -> None:
         """Write every file and move them into place, replacing the files of an earlier run."""
-        staging = self._open()
+        staging = self._staging
         save_map(result.grid, staging / 'map.yaml')
         write_tum(staging / 'trajectory.txt', result.trajectory)
         write_tum(staging / 'keyframes.txt', result.keyframes)
@@ -174,18 +173,6 @@ class OutputFolder:
         settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
         (staging / 'settings.yaml').write_text(settings)
         self._move_into_place(staging)
-
-    def _open(self) -> Path:
-        if self._staging is None:
-            parent = self._target.absolute().parent
-            try:
-                parent.mkdir(parents=True, exist_ok=True)
-                self._staging = Path(tempfile.mkdtemp(prefix='.segfloor-', dir=parent))
-            except OSError as error:
-                raise InputError(
-                    f'{parent}: cannot write there ({error.strerror}); choose another --out'
-                ) from None
-        return self._staging
 
     def _move_into_place(self, staging: Path) -> None:
         self._target.mkdir(exist_ok=True)
@@ -207,6 +194,7 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('frames tracked', tracked),
         *([('of them on sensors alone', summary.blind_frames)] if used else []),
         ('frames lost', lost),
+        *(('frames mapped apart', _apart_words(part)) for part in summary.apart),
         *(('remark', remark) for remark in summary.sensor_remarks),
         ('frames skipped (unreadable)', summary.skipped_frames),
         ('frames with something that moves', summary.moving_frames),
@@ -219,3 +207,8 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
     ]
     return [(what, str(value)) for what, value in rows]
+
+
+def _apart_words(part: Mapping[str, int | bool]) -> str:
+    outcome = 'joined later' if part['joined'] else 'no place of the map recognised, left out'
+    return f'{part["first_frame"]}-{part["last_frame"]}, {outcome}'

@@ -14,25 +14,19 @@ class RobotSettings(StageSettings):
     robot_height_m: float = setting(
         1.0,
         'The robot passes under what hangs higher than this above the floor.',
-        unit='m',
-        minimum=0.05,
-        maximum=10.0,
+        within=(0.05, 10.0),
         live=True,
     )
     step_height_m: float = setting(
         0.03,
         'The robot drives over what is lower than this; what stands higher is an obstacle.',
-        unit='m',
-        minimum=0.005,
-        maximum=0.5,
+        within=(0.005, 0.5),
         live=True,
     )
     drop_height_m: float = setting(
         0.04,
         'What lies deeper than this below the floor is not floor.',
-        unit='m',
-        minimum=0.005,
-        maximum=0.5,
+        within=(0.005, 0.5),
         live=True,
     )
 

@@ -21,47 +21,40 @@ Value = bool | int | float | str
 S = TypeVar('S', bound='StageSettings')
 
 
+UNITS = {'_m': 'm', '_s': 's', '_px': 'px', '_hz': 'Hz', '_rad': 'rad', '_mps': 'm/s'}
+"""Of a setting by the end of its name, unless it says otherwise."""
+
+
 def setting(
     default: Value,
     description: str,
-    *,
-    unit: str = '',
-    minimum: float | None = None,
-    maximum: float | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = False,
+    within: tuple[float, float] | None = None,
+    **facts: Any,
 ) -> Any:
-    """Declare one setting of a stage.
-
-    `minimum` and `maximum` are inclusive. `live` settings may change while a node runs; the others
-    are read-only after start.
+    """Declare one setting of a stage. within: the least and the greatest value, both inclusive.
+    facts: of `SettingSpec`, beside name, type and default.
     """
-    metadata = {
-        'description': description,
-        'unit': unit,
-        'minimum': minimum,
-        'maximum': maximum,
-        'choices': choices,
-        'live': live,
-    }
+    limits = {} if within is None else {'minimum': within[0], 'maximum': within[1]}
+    metadata = {'description': description, **limits, **facts}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True)
 class SettingSpec:
-    """What is known of one setting: its name, type, default, description, unit, range and whether
-    it may change.
+    """What is known of one setting. minimum and maximum are inclusive; without them, or choices,
+    anything of the type goes. live: it may change while a node runs; the others are read-only after
+    the start.
     """
 
     name: str
     type: builtins.type
     default: Value
     description: str
-    unit: str
-    minimum: float | None
-    maximum: float | None
-    choices: tuple[str, ...]
-    live: bool
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
 
     def range_text(self) -> str:
         """Return the accepted values in words, e.g. `0.01 to 0.2 m`, or '' where anything of the
@@ -131,7 +124,12 @@ class StageSettings:
         """Return the settings of this stage in order of declaration."""
         types = typing.get_type_hints(cls)
         return [
-            SettingSpec(f.name, types[f.name], typing.cast(Value, f.default), **f.metadata)
+            SettingSpec(
+                f.name,
+                types[f.name],
+                typing.cast(Value, f.default),
+                **{'unit': unit_of(f.name), **f.metadata},
+            )
             for f in dataclasses.fields(cls)
         ]
 
@@ -151,6 +149,11 @@ class StageSettings:
     def replaced(self: S, **changes: Any) -> S:
         """Return a copy with some values changed, checked like the original."""
         return type(self).from_mapping({**dataclasses.asdict(self), **changes})
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that the end of a setting's name tells, '' where it tells none."""
+    return next((unit for end, unit in UNITS.items() if name.endswith(end)), '')
 
 
 def suggestion(name: str, known: list[str]) -> str:

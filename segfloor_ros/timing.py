@@ -1,12 +1,22 @@
-"""How long each step takes."""
+"""How long each step takes, and how much memory a process has."""
 
 from __future__ import annotations
 
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from segfloor_ros.geometry import Array
+
+MAX_SAMPLES = 200
+
+_PROC = Path('/proc')
 
 
 class StageTimes:
@@ -44,15 +54,16 @@ class StageTimes:
         """Return count, mean, median, 95th percentile and maximum in milliseconds by name."""
         table = {}
         for name, durations in self._durations_s.items():
-            ms = 1e3 * np.array(durations)
-            table[name] = {
-                'count': len(ms),
-                'mean_ms': round(float(ms.mean()), 3),
-                'p50_ms': round(float(np.percentile(ms, 50)), 3),
-                'p95_ms': round(float(np.percentile(ms, 95)), 3),
-                'max_ms': round(float(ms.max()), 3),
-            }
+            spread = spread_of(1e3 * np.array(durations), 3)
+            table[name] = {'count': len(durations)} | {f'{k}_ms': v for k, v in spread.items()}
         return table
+
+
+def spread_of(values: Array, digits: int) -> dict[str, float]:
+    """Return mean, median, 95th percentile and maximum of values (N,), rounded."""
+    middle, high = np.percentile(values, (50, 95))
+    found = {'mean': values.mean(), 'p50': middle, 'p95': high, 'max': values.max()}
+    return {name: round(float(value), digits) for name, value in found.items()}
 
 
 class NoTimes(StageTimes):
@@ -60,3 +71,45 @@ class NoTimes(StageTimes):
 
     def add(self, name: str, duration_s: float) -> None:
         """Forget it."""
+
+
+def rss_mb(process_id: int | None = None) -> float:
+    """Return the resident memory of this process, or of another one, in MB (10^6 bytes).
+
+    Where there is no /proc, it is the peak of this process so far, and 0 for others.
+    """
+    statm = _PROC / str(process_id or 'self') / 'statm'
+    if statm.exists():
+        return int(statm.read_text().split()[1]) * resource.getpagesize() / 1e6
+    if process_id is not None:
+        return 0.0
+    unit = 1 if sys.platform == 'darwin' else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+class MemoryLog:
+    """Memory at the start and at every map update: of this process, or what `measure` returns."""
+
+    def __init__(self, measure: Callable[[], float] = rss_mb) -> None:
+        self._measure = measure
+        self.start_mb = measure()
+        self._samples_mb: list[float] = []
+
+    def sample(self) -> None:
+        """Note the memory at a map update."""
+        self._samples_mb.append(self._measure())
+
+    def summary(self) -> dict[str, Any]:
+        """Return start, peak and growth per map update (slope of a line over the second half,
+        when caches are warm), and at most 200 samples evenly over the updates.
+        """
+        every = max(1, -(-len(self._samples_mb) // MAX_SAMPLES))
+        half = self._samples_mb[len(self._samples_mb) // 2 :]
+        slope = float(np.polyfit(np.arange(len(half)), half, 1)[0]) if len(half) > 2 else 0.0
+        return {
+            'start': round(self.start_mb, 2),
+            'peak': round(max([self.start_mb, *self._samples_mb]), 2),
+            'slope_per_update': round(slope, 4),
+            'samples': [round(sample, 1) for sample in self._samples_mb[::every]],
+            'updates_per_sample': every,
+        }

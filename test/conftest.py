@@ -9,15 +9,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
+
+from segfloor_ros.threads import limit_blas_threads
 
 # Message fields of a wrong type must fail instead of being sent as garbage; read on import.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-# Threads of parallel test processes only wait for each other; NumPy reads it on import.
+limit_blas_threads()
 if 'PYTEST_XDIST_WORKER' in os.environ:
-    os.environ.setdefault('OMP_NUM_THREADS', '1')
+    import cv2  # not before the line above: it imports NumPy
+
+    # Threads of parallel test processes only wait for each other.
     cv2.setNumThreads(1)
 
 REPOSITORY = Path(__file__).resolve().parents[1]

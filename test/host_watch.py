@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import rclpy
 from std_srvs.srv import SetBool, Trigger
 
+from segfloor_ros.cli.replay_nodes import NodeGraph
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
-from segfloor_ros.cli.replay_session import ReplayGraph
 
 
 def main() -> None:
@@ -19,7 +20,7 @@ def main() -> None:
     context = rclpy.Context()
     rclpy.init(context=context)
     recorder = ReplayRecorder(context, lambda: 0.0, None)
-    graph = ReplayGraph(recorder, SimpleNamespace(check=lambda: None))
+    graph = NodeGraph(recorder, SimpleNamespace(check=lambda: None), Path())
     waited_s = graph.connect()
     start_s = time.monotonic()
     graph.call(SetBool, 'stereo_camera/pause', SetBool.Request(data=False))

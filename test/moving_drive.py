@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ class MovingDrive:
     def pose(self, index: int) -> np.ndarray:
         return planar_pose(0.03 * index, 0.0, 0.0)
 
+    @cache  # noqa: B019  a drive lives as long as its tests
     def frame(self, index: int) -> StereoFrame:
         frame = self._room.frame(index, self.pose(index))
         if self._place(index) is None:

@@ -8,10 +8,11 @@ import numpy as np
 
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.messages.clouds import features_message, labelled_message, sparse_cloud_message
 from segfloor_ros.messages.floor import scan_message
 from segfloor_ros.messages.images import image_message
-from segfloor_ros.messages.poses import odometry_message, path_message
+from segfloor_ros.messages.poses import PathMessages, odometry_message
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 STAMP_NS = 12_345_678_901
@@ -50,7 +51,7 @@ def grid_messages(stamp_ns: int) -> dict[str, Any]:
     return {
         'labelled_points': labelled_message(stamp_ns, 'map', LABELLED),
         'keyframe/features': features_message(stamp_ns, 'map', FEATURES),
-        'keyframe/path': path_message(stamp_ns, 'map', path),
+        'keyframe/path': PathMessages('map').next(stamp_ns, path),
         'keyframe/odometry': pose_message_at(stamp_ns),
         'keyframe/floor_scan': scan_message(stamp_ns, 'base_link', SCAN),
     }
@@ -70,3 +71,16 @@ def publish(graph, messages: dict[str, Any], publishers: dict[str, Any] | None =
     for name, message in messages.items():
         publishers[name].publish(message)
     return publishers
+
+
+def grid_arrays(message, topic: str) -> OccupancyGrid:
+    """Return the map of a message; its size must be that of its data."""
+    rows, columns = message.info.height, message.info.width
+    cells = np.frombuffer(message.data, np.int8)
+    assert len(cells) == rows * columns, topic
+    position = message.info.origin.position
+    # The wire carries the resolution as float32; the nearest short decimal is what was meant.
+    resolution_m = float(f'{message.info.resolution:.6g}')
+    return OccupancyGrid(
+        cells.reshape(rows, columns).copy(), resolution_m, (position.x, position.y)
+    )

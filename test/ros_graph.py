@@ -13,7 +13,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from segfloor_ros.cli.replay_graph import free_domain
+from segfloor_ros.cli.replay_nodes import free_domain
 from segfloor_ros.messages.diagnostics import Status, statuses
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 

@@ -148,7 +148,7 @@ def test_what_pip_installs_is_what_rosdep_installs() -> None:
     words = [re.split(r'[\[<>=; ]', word)[0].lower() for word in [*found[''], *found['cli']]]
     by_pip = {module.get(word, word) for word in words}
     assert by_rosdep == by_pip - OF_EXTRAS
-    assert {'rviz2', 'ros2launch', 'rosbag2_storage_mcap', 'launch_ros', 'tf2_ros'} <= keys
+    assert {'rviz2', 'ros2launch', 'rosbag2_storage_mcap', 'launch_ros'} <= keys
 
 
 def test_without_its_libraries_the_command_ends_with_one_line(tmp_path) -> None:

@@ -6,7 +6,7 @@ import pytest
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.results_folder import OutputFolder, lost_intervals
+from segfloor_ros.results_folder import OutputFolder, apart_intervals, lost_intervals
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
@@ -20,6 +20,15 @@ def test_lost_intervals_are_closed_and_cover_the_ends():
     tracked = np.array([False, True, True, False, False, True, False])
     assert lost_intervals(range(10, 17), tracked) == [(10, 10), (13, 14), (16, 16)]
     assert lost_intervals(range(3), np.ones(3, bool)) == []
+
+
+def test_stretches_that_were_mapped_apart_tell_whether_they_were_joined():
+    apart = np.array([False, True, True, False, True, True])
+    tracked = np.array([True, False, True, True, False, False])
+    assert apart_intervals(range(10, 16), apart, tracked) == [
+        {'first_frame': 11, 'last_frame': 12, 'joined': True},
+        {'first_frame': 14, 'last_frame': 15, 'joined': False},
+    ]
 
 
 def test_frames_move_along_with_their_corrected_keyframe():
@@ -70,7 +79,7 @@ def test_trajectory_of_the_camera_starts_at_identity():
 def test_output_folder_appears_only_when_written(tmp_path):
     target = tmp_path / 'out'
     with pytest.raises(RuntimeError), OutputFolder(target) as folder:
-        folder.add_mask(3, np.zeros((4, 4), np.uint8))
+        folder.add_picture('floor_masks', '000003', np.zeros((4, 4), np.uint8))
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
 

@@ -4,20 +4,27 @@ figures were measured, and so no stage waits for another one.
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
-from segfloor_ros.benchmark.figures import UpdateTimes, Workload
+import numpy as np
+
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.pipeline import KeyframeStages, MapInput
-from segfloor_ros.resident_memory import MemoryLog
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.stages import make_slam
+from segfloor_ros.timing import MemoryLog, StageTimes, spread_of
 
 MAP = 'map'
 """The stage of drawing the whole map, which the pipeline does once, at the end."""
+
+EVERY_FRAME = ('tracking', 'moving')
+
+BEFORE_UPDATE = 'mapping'
 
 
 class MeasuredStages:
@@ -93,3 +100,56 @@ class MeasuredStages:
         self.points = points
         self.times.end_update()
         self._memory.sample()
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What one workload cost. items: frames, or keyframes where there were no images. points:
+    in the map at the end. cells: of the map at the end. stages: by name count, mean_ms, p50_ms,
+    p95_ms, max_ms and p50_ratio (of the reference's median). update_s: per map update, everything
+    that is done once per keyframe. items_per_s: throughput. memory_mb: start, peak,
+    slope_per_update. reference_ms: median of the reference, timed before and after.
+    """
+
+    name: str
+    items: int
+    tracked: int
+    map_updates: int
+    points: int
+    cells: int
+    stages: dict[str, dict[str, float]]
+    update_s: dict[str, float]
+    items_per_s: float
+    memory_mb: dict[str, Any]
+    reference_ms: float
+
+
+class UpdateTimes(StageTimes):
+    """Times by stage, and the time of each map update: all that is done once per keyframe."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.total_s = 0.0
+        self.update_s: list[float] = []
+        self._pending_s = 0.0
+        self._mapping_s: deque[float] = deque()
+
+    def add(self, name: str, duration_s: float) -> None:
+        """Add one duration in seconds."""
+        super().add(name, duration_s)
+        self.total_s += duration_s
+        if name == BEFORE_UPDATE:
+            # SLAM may hold keyframes back: each takes its own mapping time along.
+            self._mapping_s.append(duration_s)
+        elif name not in EVERY_FRAME:
+            self._pending_s += duration_s
+
+    def end_update(self) -> None:
+        """Close the map update that the durations since the last one belong to."""
+        mapping_s = self._mapping_s.popleft() if self._mapping_s else 0.0
+        self.update_s.append(self._pending_s + mapping_s)
+        self._pending_s = 0.0
+
+    def per_update(self) -> dict[str, float]:
+        """Return mean, median, 95th percentile and maximum of the map updates in seconds."""
+        return spread_of(np.array(self.update_s), 6) if self.update_s else {}

@@ -1,26 +1,31 @@
-"""What the stages cost: time, memory and throughput on generated data of growing size."""
+"""What the stages cost: time, memory and throughput on generated data of growing size.
+
+Each workload is a process of its own, so that its memory is not filled from what others left.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import platform
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import cv2
 import numpy as np
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark.chain import MeasuredStages
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor
-from segfloor_ros.benchmark.corridor_images import CorridorImages
-from segfloor_ros.benchmark.figures import Workload
-from segfloor_ros.benchmark.processes import Progress, run_apart
+from segfloor_ros.benchmark.chain import MeasuredStages, Workload
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, CorridorImages
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import SettingsError
+from segfloor_ros.errors import SegfloorError, SettingsError
 
 IMAGES = 'images'
 JSON_VERSION = 1
+
+Progress = Callable[[int], None]
+"""Told how many steps are done."""
 
 Announce = Callable[[str, int], Progress]
 """Told the name of a workload and its number of steps; returns whom to tell how many are done."""
@@ -108,3 +113,40 @@ def machine() -> dict[str, str]:
         'numpy': np.__version__,
         'opencv': cv2.__version__,
     }
+
+
+def run_apart(work: Callable[..., Any], *arguments: Any, on_progress: Progress) -> Any:
+    """Return `work(*arguments, on_progress)`, done by a new process.
+
+    work: a function of a module; its arguments and result are pickled. Its known errors are raised
+    here. Raises SegfloorError when the process ends early.
+    """
+    context = multiprocessing.get_context('spawn')
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(sender, work, arguments), daemon=True)
+    process.start()
+    sender.close()
+    try:
+        while True:
+            kind, value = receiver.recv()
+            if kind == 'result':
+                return value
+            if kind == 'error':
+                raise value
+            on_progress(value)
+    except EOFError:
+        process.join()
+        raise SegfloorError(
+            f'a process of the benchmark ended early (status {process.exitcode}); '
+            'if memory is short, choose smaller --sizes'
+        ) from None
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _serve(sender: Connection, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    try:
+        sender.send(('result', work(*arguments, lambda done: sender.send(('progress', done)))))
+    except SegfloorError as error:
+        sender.send(('error', error))

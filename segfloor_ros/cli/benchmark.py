@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
+from segfloor_ros.benchmark.chain import Workload
 from segfloor_ros.benchmark.stages import BenchmarkPlan, as_document, parse_sizes, run_benchmark
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.benchmark_tables import stage_table, workload_table
-from segfloor_ros.cli.options import ParamsOption, SetOption
-from segfloor_ros.cli.output import announcing, console
+from segfloor_ros.cli import options
+from segfloor_ros.cli.output import announcing, console, figure_table, progress_bar
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.errors import SettingsError, os_errors
 
 DEFAULT = BenchmarkPlan()
 
@@ -31,7 +32,7 @@ def benchmark(
         int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
     ] = DEFAULT.threads,
     nodes: Annotated[
-        Optional[str],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        str | None,
         typer.Option(
             metavar='RECORDING',
             help='Play this recording through the five node processes instead: latency from image '
@@ -42,15 +43,15 @@ def benchmark(
         float, typer.Option(min=0.01, help='Speed of --nodes against real time.')
     ] = 1.0,
     json_file: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option('--json', help='Write all figures of the stages to this file.'),
     ] = None,
-    params: ParamsOption = None,
-    assignments: SetOption = None,
+    params: options.Params = None,
+    assignments: options.Set = None,
 ) -> None:
     """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload."""
     if nodes is not None:
-        print_node_figures(resolve(params, assignments or (), stereo_camera={'input': nodes}), rate)
+        print_node_figures(options.configuration(params, assignments, nodes), rate)
         return
     configuration = resolve(params, assignments or ())
     _make_folder_of(json_file)
@@ -71,9 +72,8 @@ def print_node_figures(configuration: Configuration, rate: float, lossless: bool
     except ImportError as error:
         raise SettingsError(f'to measure the nodes needs ROS 2 ({error})') from None
     frames = open_source(configuration.stereo_camera).frame_count
-    with announcing() as announce:
-        progress = announce('playing', frames or 0)
-        figures = measure_nodes(configuration, rate, lossless, lambda done, state: progress(done))
+    with progress_bar('playing', frames) as progress:
+        figures = measure_nodes(configuration, rate, lossless, progress)
     console.print(figures_table(figures))
 
 
@@ -81,13 +81,9 @@ def _make_folder_of(path: Path | None) -> None:
     """Find out before minutes of work whether the figures can be written."""
     if path is None:
         return
-    try:
+    with os_errors(f'{path}: cannot be written', '; choose another --json'):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open('a'):
-            pass
-    except OSError as error:
-        reason = error.strerror
-        raise InputError(f'{path}: cannot be written ({reason}); choose another --json') from None
+        path.open('a').close()
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
@@ -96,3 +92,39 @@ def write_json(path: Path | None, document: dict[str, Any]) -> None:
         return
     path.write_text(json.dumps(document, indent=2) + '\n')
     console.print(f'figures: {path}', highlight=False, soft_wrap=True)
+
+
+def stage_table(workloads: list[Workload]) -> Table:
+    """Return the time of every stage as a table."""
+    table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
+    for workload in workloads:
+        table.add_row(f'[bold]{workload.name}')
+        for name, stage in workload.stages.items():
+            times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
+            ratio = f'{stage["p50_ratio"]:.3f}'
+            table.add_row(f'  {name}', str(stage['count']), *times, ratio)
+        table.add_row('  reference', '', f'{workload.reference_ms:.2f}', '', '', '1.000')
+        table.add_section()
+    table.caption = 'reference: ORB and semi-global matching of a fixed 640x480 pair, timed beside'
+    return table
+
+
+def workload_table(workloads: list[Workload]) -> Table:
+    """Return throughput, map updates and memory of every workload as a table."""
+    table = figure_table(
+        'workload', 'items/s', 's/update', 'p95 s', 'max s', 'peak MB', 'MB/update'
+    )
+    for workload in workloads:
+        updates = (f'{workload.update_s.get(key, 0.0):.4f}' for key in ('mean', 'p95', 'max'))
+        table.add_row(
+            workload.name,
+            f'{workload.items_per_s:.1f}',
+            *updates,
+            f'{workload.memory_mb["peak"]:.0f}',
+            f'{workload.memory_mb["slope_per_update"]:.3f}',
+        )
+    table.caption = (
+        'items: frames, or keyframes where there are no images; update: all that is done once per '
+        'keyframe, the map included; one thread; memory grows by the slope of the second half'
+    )
+    return table

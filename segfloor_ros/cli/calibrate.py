@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
-from rich.progress import TaskID
-from rich.table import Table
 
 from segfloor_ros.camera.calibrate import CalibrationResult, calibrate_folder
-from segfloor_ros.cli.output import console, progress_bar
+from segfloor_ros.cli.output import console, progress_bar, value_table
 from segfloor_ros.errors import SettingsError
 
 
@@ -23,7 +21,7 @@ def calibrate(
         str, typer.Option(help='Inner corners along the long and the short side.')
     ] = '9x6',
     out: Annotated[
-        Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        Path | None,
         typer.Option('--out', help="Folder for left.yaml and right.yaml; else the pictures'."),
     ] = None,
 ) -> None:
@@ -32,23 +30,18 @@ def calibrate(
     if not (long.isdigit() and short.isdigit()):
         raise SettingsError(f'--board {board}: expected e.g. 9x6')
     with progress_bar('searching boards', None) as progress:
-        result = calibrate_folder(
-            folder,
-            square_m,
-            (int(long), int(short)),
-            out,
-            lambda done: progress.update(TaskID(0), completed=done),
-        )
+        result = calibrate_folder(folder, square_m, (int(long), int(short)), out, progress)
     _print_result(result, out or folder)
 
 
 def _print_result(result: CalibrationResult, folder: Path) -> None:
     camera = result.calibration.camera
-    table = Table('calibration', 'value', title=str(folder), title_justify='left')
-    table.add_row('pairs used', f'{result.pairs_used} of {result.pairs_total}')
-    table.add_row('reprojection error', f'{result.rms_px:.3f} px RMS')
-    table.add_row('row difference after rectification', f'{result.epipolar_rms_px:.3f} px RMS')
-    table.add_row('focal length, rectified', f'{camera.fx:.1f} px')
-    table.add_row('baseline', f'{camera.baseline_m:.4f} m')
-    console.print(table)
+    rows = [
+        ('pairs used', f'{result.pairs_used} of {result.pairs_total}'),
+        ('reprojection error', f'{result.rms_px:.3f} px RMS'),
+        ('row difference after rectification', f'{result.epipolar_rms_px:.3f} px RMS'),
+        ('focal length, rectified', f'{camera.fx:.1f} px'),
+        ('baseline', f'{camera.baseline_m:.4f} m'),
+    ]
+    console.print(value_table('calibration', rows, str(folder)))
     console.print(f'{folder / "left.yaml"}\n{folder / "right.yaml"}', highlight=False)

@@ -6,26 +6,18 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
 from segfloor_ros.cli.output import console, figure_table, print_error
-from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.suite.bounds import number
+from segfloor_ros.errors import SettingsError, os_errors
+from segfloor_ros.suite import verdicts
 from segfloor_ros.suite.description import Suite, read_suite
-from segfloor_ros.suite.job import Job, Outcome, package_digest
+from segfloor_ros.suite.job import Job, Outcome, outcomes, package_digest
+from segfloor_ros.suite.measures import number
 from segfloor_ros.suite.result_files import MEASURED, pack, unpack
-from segfloor_ros.suite.verdicts import (
-    Baseline,
-    Checked,
-    SuiteResult,
-    check,
-    read_baseline,
-    write_baseline,
-)
-from segfloor_ros.suite.workers import outcomes
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
 HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
@@ -44,15 +36,15 @@ def check_suite(
         bool, typer.Option('--resume', help='Keep what an interrupted check has left in --out.')
     ] = False,
     baseline: Annotated[
-        Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        Path | None,
         typer.Option(help='Nothing may be worse than in this file by more than no_worse_by.'),
     ] = None,
     baseline_to_write: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option('--write-baseline', help='Write the measures for a later --baseline.'),
     ] = None,
     cache: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             help='Folder for results, renderings and copies to use again. '
             '[default: ~/.cache/segfloor]'
@@ -64,19 +56,22 @@ def check_suite(
 ) -> None:
     """Map recordings and hold the results against bounds. Status 1: a bound failed."""
     described = read_suite(suite)
-    known = read_baseline(baseline) if baseline is not None else None
-    _check_folder(out)
+    known = verdicts.read_baseline(baseline) if baseline is not None else None
+    with os_errors(f'{out}: cannot be a folder for the results', '; choose another --out'):
+        out.mkdir(parents=True, exist_ok=True)
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
-    found: dict[str, Checked] = {}
+    found: dict[str, verdicts.Checked] = {}
     for job, outcome in _all_outcomes(todo, out, resume, jobs, scheduler):
-        checked = check(job.entry, outcome, known)
+        checked = verdicts.check(job.entry, outcome, known)
         found[checked.name] = checked
         _print_progress(checked, len(found), len(todo))
-    result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
+    result = verdicts.SuiteResult(
+        described.name, [found[entry.name] for entry in described.entries]
+    )
     _finish(result, out, described, known)
     if baseline_to_write is not None:
-        write_baseline(result, baseline_to_write)
+        verdicts.write_baseline(result, baseline_to_write)
         console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)
     if not result.holds:
         raise typer.Exit(1)
@@ -139,11 +134,12 @@ def _read_outcome(job: Job, out: Path) -> Outcome | None:
         return None
 
 
-def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:
+def _finish(
+    result: verdicts.SuiteResult, out: Path, described: Suite, baseline: verdicts.Baseline | None
+) -> None:
     """Print the table and what fails, and write the files of the suite."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.suite.junit import write_junit
-    from segfloor_ros.suite.page import write_page
+    from segfloor_ros.suite.page import write_junit, write_page
 
     console.print(_table(result))
     for checked in result.recordings:
@@ -157,29 +153,19 @@ def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline
     console.print(f'page: {write_page(result, out)}', highlight=False, soft_wrap=True)
 
 
-def _print_progress(checked: Checked, done: int, total: int) -> None:
-    state = 'ok' if checked.holds else 'no map' if checked.problem else 'fails'
+def _print_progress(checked: verdicts.Checked, done: int, total: int) -> None:
     origin = 'kept' if checked.reused else f'{checked.seconds:.0f} s'
-    console.print(f'{done}/{total} {checked.name}: {state} ({origin})', highlight=False)
+    console.print(f'{done}/{total} {checked.name}: {checked.state} ({origin})', highlight=False)
 
 
-def _table(result: SuiteResult) -> Table:
+def _table(result: verdicts.SuiteResult) -> Table:
     table = figure_table('recording', 'result', *HEADINGS)
     for checked in result.recordings:
-        state = '[green]ok' if checked.holds else '[red]no map' if checked.problem else '[red]fails'
+        state = f'[{"green" if checked.holds else "red"}]{checked.state}'
         values = (checked.measured.get(name) for name in COLUMNS)
         cells = ('' if value is None else number(value) for value in values)
         table.add_row(checked.name, state, *cells)
     return table
-
-
-def _check_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f'{out}: cannot be a folder for the results ({error.strerror}); choose another --out'
-        ) from None
 
 
 def _default_cache() -> Path:

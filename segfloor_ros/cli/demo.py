@@ -12,8 +12,7 @@ from segfloor_ros.cli.evaluate import map_table
 from segfloor_ros.cli.output import console
 from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
-from segfloor_ros.evaluation.map_score import compare, score_map
-from segfloor_ros.evaluation.overlay import save_overlay
+from segfloor_ros.evaluation.map_score import compare, save_overlay, score_map
 from segfloor_ros.evaluation.truth import load_truth, read_map
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))

@@ -9,14 +9,19 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
+from segfloor_ros.cli.output import console, figure_table, value_table
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.alignment import find_alignment
 from segfloor_ros.evaluation.floor import score_floor_folders
-from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, MapScore, compare, score_map
-from segfloor_ros.evaluation.overlay import save_overlay
+from segfloor_ros.evaluation.map_score import (
+    DEFAULT_RANGE_M,
+    MapScore,
+    compare,
+    save_overlay,
+    score_map,
+)
 from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
 from segfloor_ros.evaluation.raster import from_frame
 from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
@@ -73,9 +78,9 @@ def evaluate_map(
     if overlay is not None:
         save_overlay(compare(grid, known, pose, sight), overlay)
     if as_json:
-        _print_json(score.as_dict())
+        _print_json(dataclasses.asdict(score))
         return
-    Console().print(map_table(score))
+    console.print(map_table(score))
     if overlay is not None:
         typer.echo(f'overlay: {overlay}')
 
@@ -97,27 +102,28 @@ def evaluate_trajectory(
 ) -> None:
     """ATE and RPE after rigid alignment, with the share of frames that were tracked."""
     # Imported here: evo and matplotlib take a second that no other command should wait for.
-    from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-    from segfloor_ros.evaluation.trajectory_plot import save_trajectory_plot
+    from segfloor_ros.evaluation.trajectory import (
+        match_files,
+        save_trajectory_plot,
+        score_trajectory,
+    )
 
     matched = match_files(estimate, truth, frames)
     score = score_trajectory(matched)
     if plot is not None:
         save_trajectory_plot(matched, plot)
     if as_json:
-        _print_json(score.as_dict())
+        _print_json(dataclasses.asdict(score))
         return
-    table = Table('measure', 'value', 'unit')
-    table.columns[1].justify = 'right'
-    table.add_row('frames tracked', f'{100 * score.tracked:.1f}', '%')
-    table.add_row('  of', str(score.frames), 'frames')
-    table.add_row('path length', f'{score.path_length_m:.2f}', 'm')
-    table.add_row('ATE (RMSE, aligned)', f'{score.ate_rmse_m:.4f}', 'm')
-    table.add_row('ATE (largest)', f'{score.ate_max_m:.4f}', 'm')
-    table.add_row('RPE over 1 m', f'{score.rpe_translation_m:.4f}', 'm')
-    table.add_row('RPE over 1 m', f'{score.rpe_rotation_rad:.5f}', 'rad')
-    table.add_row('error at the end', f'{score.end_error_m:.4f}', 'm')
-    Console().print(table)
+    rows = [
+        ('frames tracked', f'{100 * score.tracked:.1f} % of {score.frames}'),
+        ('path length', f'{score.path_length_m:.2f} m'),
+        ('ATE (RMSE, aligned)', f'{score.ate_rmse_m:.4f} m'),
+        ('ATE (largest)', f'{score.ate_max_m:.4f} m'),
+        ('RPE over 1 m', f'{score.rpe_translation_m:.4f} m, {score.rpe_rotation_rad:.5f} rad'),
+        ('error at the end', f'{score.end_error_m:.4f} m'),
+    ]
+    console.print(value_table('measure', rows))
     if plot is not None:
         typer.echo(f'plot: {plot}')
 
@@ -137,13 +143,11 @@ def evaluate_floor(
     if as_json:
         _print_json(score.as_dict())
         return
-    table = Table('measure', 'value', 'unit')
-    table.columns[1].justify = 'right'
-    for name in ('precision', 'recall', 'iou', 'coverage'):
-        table.add_row(name, f'{100 * getattr(score, name):.2f}', '%')
-    table.add_row('masks scored', str(score.masks), '')
-    table.add_row('true masks without an estimate', str(score.missing), '')
-    Console().print(table)
+    shares = ('precision', 'recall', 'iou', 'coverage')
+    rows = [(name, f'{100 * getattr(score, name):.2f} %') for name in shares]
+    rows.append(('masks scored', str(score.masks)))
+    rows.append(('true masks without an estimate', str(score.missing)))
+    console.print(value_table('measure', rows))
 
 
 @app.command('report')
@@ -177,9 +181,8 @@ def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> P
 def map_table(score: MapScore) -> Table:
     """Return the score of a map as a table for the terminal."""
     title = 'map, floor the drive could see' if score.observable_only else 'map, whole floor'
-    table = Table('measure', 'precision %', 'recall %', title=f'{title}: {score.area_m2:.1f} m²')
-    for column in table.columns[1:]:
-        column.justify = 'right'
+    table = figure_table('measure', 'precision %', 'recall %')
+    table.title = f'{title}: {score.area_m2:.1f} m²'
     for name, road_map in (('raw', score.raw), ('after opening', score.opened)):
         table.add_row(
             f'road map, {name} (±: over repetitions)',

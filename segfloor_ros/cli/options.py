@@ -3,58 +3,66 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated
 
 import typer
 
-InputArgument = Annotated[
+from segfloor_ros.configuration import Configuration, resolve
+
+Input = Annotated[
     str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')
 ]
-OutOption = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
-ParamsOption = Annotated[
-    Optional[Path],  # noqa: UP045  typer evaluates it, also on Python 3.10
+Out = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
+Params = Annotated[
+    Path | None,
     typer.Option('--params', help='ROS parameter file (YAML) for all stages.'),
 ]
-SetOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
+Set = Annotated[
+    list[str] | None,
     typer.Option('--set', help='One parameter, e.g. occupancy_grid.resolution_m=0.02; repeatable.'),
 ]
-MasksOption = Annotated[
-    Optional[Path],  # noqa: UP045
+Masks = Annotated[
+    Path | None,
     typer.Option(
         '--masks',
         help='Folder of masks of what moves: %06d.png by frame index, of the left image as '
         'recorded, 255 = moving.',
     ),
 ]
-IgnoreOption = Annotated[
-    Optional[str],  # noqa: UP045
+Ignore = Annotated[
+    str | None,
     typer.Option('--ignore', help='Sensors to leave out, with commas: wheel_odometry, imu.'),
 ]
-DepthOption = Annotated[
+Depth = Annotated[
     bool, typer.Option('--depth', help='Take depth images in place of the right ones.')
 ]
-SaveMapOption = Annotated[
-    Optional[Path],  # noqa: UP045
+SaveMap = Annotated[
+    Path | None,
     typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
 ]
-LoadMapOption = Annotated[
-    Optional[Path],  # noqa: UP045
+LoadMap = Annotated[
+    Path | None,
     typer.Option('--load-map', help='Saved map to go on mapping in.'),
 ]
-LocalizeOption = Annotated[
+Localize = Annotated[
     bool,
     typer.Option('--localize', help='Poses in the map of --load-map only; nothing is added to it.'),
 ]
-ReportOption = Annotated[
+Report = Annotated[
     bool,
     typer.Option('--report', help='Write report.html: everything about the run on one page.'),
 ]
 
 
-def recording_settings(
-    input: str, masks: Path | None = None, ignore: str | None = None, depth: bool = False
-) -> dict[str, Any]:
-    """Return the settings of `stereo_camera` that options of a command stand for."""
+def configuration(
+    params: Path | None,
+    assignments: list[str] | None,
+    input: str,
+    masks: Path | None = None,
+    ignore: str | None = None,
+    depth: bool = False,
+) -> Configuration:
+    """Return the configuration that the options of a command stand for."""
     given = {'masks': masks and str(masks), 'ignore': ignore, 'depth': depth or None}
-    return {'input': input} | {name: value for name, value in given.items() if value is not None}
+    camera = {name: value for name, value in given.items() if value is not None}
+    return resolve(params, assignments or (), stereo_camera={'input': input, **camera})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TaskProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from segfloor_ros.measurements import RecordedSensor
@@ -24,13 +24,16 @@ from segfloor_ros.results_folder import RunSummary, summary_rows
 console = Console()
 error_console = Console(stderr=True, soft_wrap=True)
 
-Announce = Callable[[str, int], Callable[[int], None]]
+Progress = Callable[..., None]
+"""Told how many steps are done and, as `note`, the state in words."""
+
+Announce = Callable[[str, int], Progress]
 """Told the name of a task and its number of steps; returns whom to tell how many are done."""
 
 
 @contextmanager
-def progress_bar(description: str, total: int | None) -> Iterator[Progress]:
-    """Show a progress bar with one task (id 0) on the terminal."""
+def announcing() -> Iterator[Announce]:
+    """Show a progress bar whose task is replaced by the next announced one."""
     columns = (
         TextColumn('{task.description}'),
         BarColumn(),
@@ -39,22 +42,21 @@ def progress_bar(description: str, total: int | None) -> Iterator[Progress]:
         TimeRemainingColumn(),
         TextColumn('{task.fields[note]}'),
     )
-    with Progress(*columns, console=error_console, transient=not sys.stderr.isatty()) as progress:
-        progress.add_task(description, total=total, note='')
-        yield progress
+    with ProgressBar(*columns, console=error_console, transient=not sys.stderr.isatty()) as bar:
+        task = bar.add_task('starting', total=None, note='')
+
+        def announce(description: str, total: int) -> Progress:
+            bar.reset(task, description=description, total=total or None, note='')
+            return lambda done, note='': bar.update(task, completed=done, note=note)
+
+        yield announce
 
 
 @contextmanager
-def announcing() -> Iterator[Announce]:
-    """Show a progress bar whose task is replaced by the next announced one."""
-    with progress_bar('starting', None) as bar:
-        yield lambda description, total: _next_task(bar, description, total)
-
-
-def _next_task(bar: Progress, description: str, total: int) -> Callable[[int], None]:
-    task = bar.task_ids[-1]
-    bar.reset(task, description=description, total=total or None, note='')
-    return lambda done: bar.update(task, completed=done)
+def progress_bar(description: str, total: int | None) -> Iterator[Progress]:
+    """Show a progress bar with one task."""
+    with announcing() as announce:
+        yield announce(description, total or 0)
 
 
 def figure_table(names: str, *numbers: str) -> Table:
@@ -64,6 +66,14 @@ def figure_table(names: str, *numbers: str) -> Table:
         column.no_wrap = True
     for column in table.columns[1:]:
         column.justify = 'right'
+    return table
+
+
+def value_table(name: str, rows: Iterable[tuple[str, str]], title: str | None = None) -> Table:
+    """Return a table of names and their values with units."""
+    table = Table(name, 'value', title=title, title_justify='left')
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -80,13 +90,8 @@ def print_sensors(sensors: Sequence[RecordedSensor]) -> None:
 
 def print_summary(title: str, summary: RunSummary) -> None:
     """Print the figures of a run and the time of each stage as tables with units."""
-    table = Table('result', 'value', title=title, title_justify='left')
-    for row in summary_rows(summary):
-        table.add_row(*row)
-    console.print(table)
-    stages = Table('stage', 'calls', 'median ms', 'p95 ms', 'max ms')
-    for column in stages.columns[1:]:
-        column.justify = 'right'
+    console.print(value_table('result', summary_rows(summary), title))
+    stages = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms')
     for name, stage in summary.stages.items():
         values = (stage['p50_ms'], stage['p95_ms'], stage['max_ms'])
         stages.add_row(name, str(stage['count']), *(f'{value:.1f}' for value in values))

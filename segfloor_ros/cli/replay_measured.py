@@ -4,34 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import OccupancyGrid, Odometry
 from numpy.typing import NDArray
 from rclpy.context import Context
-from rclpy.signals import SignalHandlerOptions
 from rich.table import Table
 from std_srvs.srv import SetBool
 
-from segfloor_ros.cli.replay_graph import isolated_environment
+from segfloor_ros.cli.output import value_table
+from segfloor_ros.cli.replay_nodes import NodeGraph, ProgressListener, running_nodes
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
-from segfloor_ros.cli.replay_session import ProgressListener, ReplayGraph
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, TOPICS
-from segfloor_ros.resident_memory import rss_mb
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
+from segfloor_ros.timing import rss_mb
 
 MEMORY_PERIOD_S = 2.0
 TICKS_PER_S = os.sysconf('SC_CLK_TCK')
@@ -40,9 +35,10 @@ TICKS_PER_S = os.sysconf('SC_CLK_TCK')
 @dataclass(frozen=True)
 class NodeFigures:
     """latency_s: (K,) from a keyframe's images to the map that holds it, in the order of the
-    keyframes. steps_s: (K,) the part of it until a node had done its work, since the node before
-    had, by node. cpu_share: seconds of CPU per second, by node. memory_mb: (T, 1 + nodes), the
-    number of frames so far and the resident memory of every node, over time.
+    keyframes; odometry_s: (N,) from a frame's images to its odometry. steps_s: (K,) the part of the
+    former until a node had done its work, since the node before had, by node. cpu_share: seconds of
+    CPU per second, by node. memory_mb: (T, 1 + nodes), the number of frames so far and the resident
+    memory of every node, over time.
     """
 
     frames_sent: int
@@ -52,6 +48,7 @@ class NodeFigures:
     mapped: int
     wall_s: float
     latency_s: NDArray[np.float64]
+    odometry_s: NDArray[np.float64]
     steps_s: dict[str, NDArray[np.float64]]
     cpu_share: dict[str, float]
     memory_mb: NDArray[np.float64]
@@ -67,16 +64,22 @@ class FigureRecorder(ReplayRecorder):
         self._health: dict[str, Status] = {}
         self._done_s: dict[str, dict[int, float]] = {node: {} for node in NODES}
         self._arrived_s: dict[int, float] = {}
+        self._located_s: dict[int, float] = {}
         self.memory_rows: list[list[float]] = []
-        topic = TOPICS['map']
-        self.create_subscription(topic.type, topic.name, self._take_map, topic.profile)
         self.create_timer(MEMORY_PERIOD_S, self._note_memory)
 
     def latency_s(self) -> NDArray[np.float64]:
         """Return the latency of every keyframe whose map came, in order."""
+        return self._since_sent_s(self._arrived_s)
+
+    def odometry_s(self) -> NDArray[np.float64]:
+        """Return the latency of the odometry of every frame that has one, in order."""
+        return self._since_sent_s(self._located_s)
+
+    def _since_sent_s(self, arrived_s: dict[int, float]) -> NDArray[np.float64]:
         sent_s = self._done_s[CAMERA]
-        both = sorted(sent_s.keys() & self._arrived_s.keys())
-        return np.array([self._arrived_s[stamp] - sent_s[stamp] for stamp in both])
+        both = sorted(sent_s.keys() & arrived_s.keys())
+        return np.array([arrived_s[stamp] - sent_s[stamp] for stamp in both])
 
     def steps_s(self) -> dict[str, NDArray[np.float64]]:
         """Return how long each node took since the one before had done, for every keyframe whose
@@ -101,6 +104,10 @@ class FigureRecorder(ReplayRecorder):
             self._done_s[status.node].setdefault(status.stamp_ns, time.monotonic())
         super()._take_status(status)
 
+    def _take_odometry(self, message: Odometry) -> None:
+        self._located_s.setdefault(to_ns(message.header.stamp), time.monotonic())
+        super()._take_odometry(message)
+
     def _take_map(self, message: OccupancyGrid) -> None:
         self._arrived_s.setdefault(to_ns(message.header.stamp), time.monotonic())
 
@@ -109,12 +116,15 @@ class FigureRecorder(ReplayRecorder):
         self.memory_rows.append([len(self.answers), *memory])
 
 
+FigureGraph = NodeGraph[FigureRecorder]
+
+
 def measure_nodes(
     configuration: Configuration, rate: float, lossless: bool, on_progress: ProgressListener
 ) -> NodeFigures:
     """Play the recording of the configuration through the nodes. Raises ReplayError."""
     with connected_nodes(configuration, rate, lossless) as graph:
-        return _follow(graph, graph.recorder, on_progress)
+        return _follow(graph, on_progress)
 
 
 @contextlib.contextmanager
@@ -124,44 +134,18 @@ def connected_nodes(
     """The five nodes in a graph of their own, connected, with the camera paused. Raises
     ReplayError.
     """
-    environment = isolated_environment()
-    os.environ.update(environment)
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with tempfile.TemporaryDirectory(prefix='segfloor-figures-') as folder:
-            arguments = _node_arguments(configuration, rate, lossless, Path(folder))
-            with NodeProcesses(NODES, arguments, environment, Path(folder)) as processes:
-                graph = FigureGraph(FigureRecorder(context, processes), processes)
-                # A camera that keeps to the clock does not listen to the nodes.
-                graph.connect(is_paced=lossless)
-                yield graph
-    finally:
-        rclpy.try_shutdown(context=context)
-
-
-class FigureGraph(ReplayGraph):
-    """The running nodes and the one that measures them."""
-
-    recorder: FigureRecorder
-
-
-def _node_arguments(
-    configuration: Configuration, rate: float, lossless: bool, folder: Path
-) -> list[str]:
-    parameters: dict[str, Any] = configuration.as_ros_parameters()
-    own = {'rate': float(rate), 'lossless': lossless, 'start_paused': True}
-    parameters[CAMERA]['ros__parameters'].update(own)
+    parameters = configuration.as_ros_parameters()
+    parameters[CAMERA]['ros__parameters'].update(rate=rate, lossless=lossless, start_paused=True)
     # Else it is this period that is measured.
     parameters[GRID]['ros__parameters'].update(publish_period_s=0.0)
-    file = folder / 'parameters.yaml'
-    file.write_text(yaml.safe_dump(parameters))
-    return ['--ros-args', '--disable-external-lib-logs', '--params-file', str(file)]
+    with running_nodes(lambda _folder: parameters, FigureRecorder) as graph:
+        # A camera that keeps to the clock does not listen to the nodes.
+        graph.connect(is_paced=lossless)
+        yield graph
 
 
-def _follow(
-    graph: FigureGraph, recorder: FigureRecorder, on_progress: ProgressListener
-) -> NodeFigures:
+def _follow(graph: FigureGraph, on_progress: ProgressListener) -> NodeFigures:
+    recorder = graph.recorder
     start_s, before_s = time.monotonic(), cpu_s(graph.processes)
     graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
     try:
@@ -183,6 +167,7 @@ def _follow(
         mapped=recorder.count(GRID, 'processed'),
         wall_s=wall_s,
         latency_s=recorder.latency_s(),
+        odometry_s=recorder.odometry_s(),
         steps_s=recorder.steps_s(),
         cpu_share={node: seconds / wall_s for node, seconds in spent_s.items()},
         memory_mb=np.array(recorder.memory_rows),
@@ -201,15 +186,11 @@ def cpu_s(processes: NodeProcesses) -> dict[str, float]:
 
 def figures_table(figures: NodeFigures) -> Table:
     """Return the figures as a table; of a course, its second and its last quarter."""
-    table = Table('figure', 'value')
-    for name, value in figure_rows(figures):
-        table.add_row(name, value)
-    return table
+    return value_table('figure', figure_rows(figures))
 
 
 def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
     """Return names and values of the figures, with units."""
-    latency_ms = 1e3 * figures.latency_s
     rows = [
         ('frames sent, processed', f'{figures.frames_sent}, {figures.frames_processed}'),
         ('frames skipped to stay up to date', f'{figures.frames_skipped}'),
@@ -217,15 +198,17 @@ def figure_rows(figures: NodeFigures) -> list[tuple[str, str]]:
         ('frames per second', f'{figures.frames_processed / figures.wall_s:.1f}'),
         ('interrupt to all ended', f'{figures.shutdown_s:.2f} s'),
     ]
-    if len(latency_ms):
-        middle, high = np.percentile(latency_ms, (50, 95))
-        rows.append(('image to map, median and p95', f'{middle:.0f} ms, {high:.0f} ms'))
-        early, late = (np.median(part) for part in _second_and_last_quarter(latency_ms))
-        rows.append(('image to map, 2nd and last quarter', f'{early:.0f} ms, {late:.0f} ms'))
-    for node, duration_s in figures.steps_s.items():
+    spreads = {'image to odometry': figures.odometry_s, 'image to map': figures.latency_s}
+    spreads |= {f'until {node} had done': steps_s for node, steps_s in figures.steps_s.items()}
+    for name, duration_s in spreads.items():
         if len(duration_s):
             middle, high = 1e3 * np.percentile(duration_s, (50, 95))
-            rows.append((f'until {node} had done, median and p95', f'{middle:.0f}, {high:.0f} ms'))
+            rows.append((f'{name}, median and p95', f'{middle:.0f} ms, {high:.0f} ms'))
+    if len(figures.latency_s):
+        early, late = (
+            1e3 * np.median(part) for part in _second_and_last_quarter(figures.latency_s)
+        )
+        rows.append(('image to map, 2nd and last quarter', f'{early:.0f} ms, {late:.0f} ms'))
     for column, (node, share) in enumerate(figures.cpu_share.items(), 1):
         rows.append((f'{node}: CPU', f'{100 * share:.0f} % of a core'))
         if len(figures.memory_mb):

@@ -16,28 +16,20 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cli.replay_graph import RECORDED
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.geometry import Array
+from segfloor_ros.messages import diagnostics
 from segfloor_ros.messages.clouds import labelled_arrays
-from segfloor_ros.messages.diagnostics import (
-    CONNECTIONS,
-    RECORDING,
-    REMARKS_APART,
-    Level,
-    Status,
-    statuses,
-)
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.messages.topics import CAMERA, CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM, TOPICS
-from segfloor_ros.resident_memory import MemoryLog
 from segfloor_ros.slam.results import KeyframePath
-from segfloor_ros.timing import StageTimes
+from segfloor_ros.timing import MemoryLog, StageTimes
 from segfloor_ros.trajectory import TrackedPose
 
-MaskListener = Callable[[int, NDArray[np.uint8]], None]
+MaskListener = Callable[[str, NDArray[np.uint8]], None]
+"""Gets the number of a frame, as in the names of masks, and its floor mask."""
 
 
 class ReplayRecorder(Node):
@@ -51,10 +43,10 @@ class ReplayRecorder(Node):
         self.memory = MemoryLog(measure_mb)
         self.connections: dict[str, dict[str, int]] = {}
         self.frame_index: dict[int, int] = {}
-        self.answers: dict[int, Status] = {}
-        self.finished: Status | None = None
+        self.answers: dict[int, diagnostics.Status] = {}
+        self.finished: diagnostics.Status | None = None
         self.updated: set[int] = set()
-        self.failed: dict[int, Status] = {}
+        self.failed: dict[int, diagnostics.Status] = {}
         self.path: KeyframePath | None = None
         self.labelled: LabelledPoints | None = None
         self.mount: Mount | None = None
@@ -76,8 +68,13 @@ class ReplayRecorder(Node):
                 int(self.answers[stamp_ns].values['reference_keyframe_ns']),
                 self._T_map_base.get(stamp_ns),
             )
-            for stamp_ns in sorted(self._T_odom_base.keys() & self.answers.keys())
+            for stamp_ns in sorted(self._T_odom_base.keys() & self._told)
         ]
+
+    @property
+    def _told(self) -> set[int]:
+        """Stamps of the frames that SLAM says it has tracked."""
+        return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get('tracked') == '1'}
 
     @property
     def keyframes(self) -> set[int]:
@@ -95,7 +92,7 @@ class ReplayRecorder(Node):
         """What seems wrong with sensors, in words."""
         last = self.answers.get(max(self.answers, default=0))
         text = last.values.get('remarks', '') if last is not None else ''
-        return text.split(REMARKS_APART) if text else []
+        return text.split(diagnostics.REMARKS_APART) if text else []
 
     def unanswered(self) -> set[int]:
         """Return the stamps of frames that SLAM has not answered."""
@@ -115,23 +112,22 @@ class ReplayRecorder(Node):
         """Whether all that was sent so far has come to its end."""
         if self.unanswered() or self.unmapped() or self._masks:
             return False
-        tracked = {t for t, s in self.answers.items() if s.values.get('tracked') == '1'}
         newest = max(self.keyframes, default=0)
         path_ns = int(self.path.stamp_ns[-1]) if self.path is not None else 0
-        has_poses = tracked <= self._T_odom_base.keys() & self._T_map_base.keys()
+        has_poses = self._told <= self._T_odom_base.keys() & self._T_map_base.keys()
         return has_poses and path_ns >= newest
 
     def _subscribe(self) -> None:
-        callbacks: dict[str, Callable[[Any], None]] = {
+        self.recorded: dict[str, Callable[[Any], None]] = {
             'odometry': self._take_odometry,
             'pose': self._take_pose,
             'camera_mount': self._take_mount,
             'keyframe/path': self._take_path,
             'keyframe/floor_mask': self._take_mask,
             'labelled_points': self._take_labelled,
+            'map': self._take_map,
         }
-        assert set(callbacks) == set(RECORDED)
-        for name, callback in callbacks.items():
+        for name, callback in self.recorded.items():
             self.create_subscription(TOPICS[name].type, name, callback, TOPICS[name].profile)
         self.create_subscription(
             DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_statuses, DIAGNOSTICS.profile
@@ -143,13 +139,8 @@ class ReplayRecorder(Node):
     def _take_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._T_map_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
 
-    def listen_to_map(self) -> None:
-        """Note when there is a map; before the nodes are connected."""
-
-        def take(_message: OccupancyGrid) -> None:
-            self.has_map = True
-
-        self.create_subscription(TOPICS['map'].type, 'map', take, TOPICS['map'].profile)
+    def _take_map(self, message: OccupancyGrid) -> None:
+        self.has_map = True
 
     def _take_mount(self, message: TransformStamped) -> None:
         self.mount = Mount.from_transform(transform_array(message))
@@ -170,19 +161,19 @@ class ReplayRecorder(Node):
         """Masks are filed by frame number, which the camera's status tells."""
         for stamp_ns in sorted(self._masks.keys() & self.frame_index.keys()):
             assert self._on_mask is not None
-            self._on_mask(self.frame_index[stamp_ns], self._masks.pop(stamp_ns))
+            self._on_mask(f'{self.frame_index[stamp_ns]:06d}', self._masks.pop(stamp_ns))
 
     def _take_statuses(self, message: DiagnosticArray) -> None:
-        for status in statuses(message):
-            if status.kind == CONNECTIONS:
+        for status in diagnostics.statuses(message):
+            if status.kind == diagnostics.CONNECTIONS:
                 counts = {topic: int(count) for topic, count in status.values.items()}
                 self.connections[status.node] = counts
-            elif status.kind == RECORDING:
+            elif status.kind == diagnostics.RECORDING:
                 self.finished = status
             elif not status.kind:
                 self._take_status(status)
 
-    def _take_status(self, status: Status) -> None:
+    def _take_status(self, status: diagnostics.Status) -> None:
         self.last_sign_s = time.monotonic()
         if 'processing_ms' in status.values:
             self.times.add(status.node, 1e-3 * float(status.values['processing_ms']))
@@ -191,8 +182,8 @@ class ReplayRecorder(Node):
             self._hand_on_masks()
         elif status.node == SLAM:
             self.answers[status.stamp_ns] = status
-        elif status.node == GRID and status.level is Level.OK:
+        elif status.node == GRID and status.level is diagnostics.Level.OK:
             self.updated.add(status.stamp_ns)
             self.memory.sample()
-        elif status.node in (FLOOR, CLOUD, GRID) and status.level is Level.ERROR:
+        elif status.node in (FLOOR, CLOUD, GRID) and status.level is diagnostics.Level.ERROR:
             self.failed[status.stamp_ns] = status

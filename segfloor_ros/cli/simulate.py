@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
-from rich.progress import TaskID
 
-from segfloor_ros.cli.options import OutOption
+from segfloor_ros.cli import options
 from segfloor_ros.cli.output import console, progress_bar
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.drive_files import RecordingOptions, record
-from segfloor_ros.simulation.simulation import Simulation
 
 
 def simulate(
@@ -21,9 +17,9 @@ def simulate(
             help='Name of a shipped scene, a scene file, or a map_server map (YAML) to drive in.'
         ),
     ],
-    out: OutOption,
+    out: options.Out,
     set_values: Annotated[
-        Optional[list[str]],  # noqa: UP045  typer evaluates it, also on Python 3.10
+        list[str] | None,
         typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
     ] = None,
     floor_every: Annotated[
@@ -37,18 +33,18 @@ def simulate(
     ] = 1,
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
+    # Imported here: the simulator takes time that other commands should not wait for.
+    from segfloor_ros.simulation.drive_files import RecordingOptions, record
+    from segfloor_ros.simulation.scene_file import open_scene
+    from segfloor_ros.simulation.simulation import Simulation
+
     described = open_scene(scene, set_values or ())
     options = RecordingOptions(floor_every, disparity)
     with (
         Simulation(described, supersampling) as simulation,
         progress_bar('rendering', simulation.frame_count) as progress,
     ):
-        record(
-            simulation,
-            out,
-            options,
-            lambda done: progress.update(TaskID(0), completed=done),
-        )
+        record(simulation, out, options, progress)
         seconds = simulation.drive.times_s[-1]
         facts = (
             f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'

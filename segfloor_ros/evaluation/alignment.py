@@ -7,6 +7,7 @@ coarse raster (Fourier domain) and then refined by a shrinking pattern search.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -14,13 +15,7 @@ import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.raster import (
-    FREE,
-    OCCUPIED,
-    cell_centres,
-    from_frame,
-    states,
-)
+from segfloor_ros.evaluation import raster
 from segfloor_ros.evaluation.truth import Pose2d
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.occupancy import OccupancyGrid
@@ -45,17 +40,40 @@ def find_alignment(
     free, occupied = _known_points(estimate)
     if not len(free) + len(occupied):
         raise InputError('the estimated map has no known cell to align by; use --align none')
-    gain = _gain_images(truth)
-    start = near or _search_everywhere(free, occupied, truth, gain)
-    return _refine(free, occupied, truth, gain, start)
+    fit = _Fit(free, occupied, truth, *_gain_images(truth))
+    return _refine(fit, near or _search_everywhere(fit))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Free and occupied points (N, 2) of an estimate, the truth, and what each earns there."""
+
+    free: Array
+    occupied: Array
+    truth: OccupancyGrid
+    free_gain: Array
+    occupied_gain: Array
+
+    def score(self, pose: Pose2d) -> float:
+        """Return what all points earn where the estimate's frame lies at a pose."""
+        free = self._earned(self.free, self.free_gain, pose, -1.0)
+        return free + self._earned(self.occupied, self.occupied_gain, pose, 0.0)
+
+    def _earned(self, points: Array, gain: Array, pose: Pose2d, outside: float) -> float:
+        moved = raster.from_frame(points, pose) - np.array(self.truth.origin_xy_m)
+        cells = np.floor(moved / self.truth.resolution_m).astype(np.int64)
+        height, width = gain.shape
+        inside = ((cells >= 0) & (cells < (width, height))).all(axis=1)
+        hit = cells[inside]
+        return float(gain[hit[:, 1], hit[:, 0]].sum() + outside * (~inside).sum())
 
 
 def _known_points(grid: OccupancyGrid) -> tuple[Array, Array]:
     """Return centres of free and of occupied cells, thinned evenly where there are many."""
-    state = states(grid).ravel()
-    centres = cell_centres(grid)
+    state = raster.states(grid).ravel()
+    centres = raster.cell_centres(grid)
     thinned = []
-    for wanted in (FREE, OCCUPIED):
+    for wanted in (raster.FREE, raster.OCCUPIED):
         points = centres[state == wanted]
         thinned.append(points[:: max(1, len(points) // MAX_SCORED_CELLS)])
     return thinned[0], thinned[1]
@@ -63,40 +81,18 @@ def _known_points(grid: OccupancyGrid) -> tuple[Array, Array]:
 
 def _gain_images(truth: OccupancyGrid) -> tuple[Array, Array]:
     """Return what a free and what an occupied estimated cell earn at each cell of the truth."""
-    state = states(truth)
-    free_gain = np.where(state == FREE, 1.0, -1.0)
+    state = raster.states(truth)
+    free_gain = np.where(state == raster.FREE, 1.0, -1.0)
     reach = 2 * max(1, round(NEAR_OBSTACLE_M / truth.resolution_m)) + 1
-    near = cv2.dilate((state == OCCUPIED).astype(np.uint8), np.ones((reach, reach), np.uint8))
+    near = cv2.dilate(
+        (state == raster.OCCUPIED).astype(np.uint8), np.ones((reach, reach), np.uint8)
+    )
     return free_gain, near.astype(np.float64)
 
 
-def _score(
-    free: Array, occupied: Array, truth: OccupancyGrid, gain: tuple[Array, Array], pose: Pose2d
-) -> float:
-    return _earned(free, truth, gain[0], pose, -1.0) + _earned(occupied, truth, gain[1], pose, 0.0)
-
-
-def _earned(
-    points: Array, truth: OccupancyGrid, gain: Array, pose: Pose2d, outside: float
-) -> float:
-    cells = np.floor(
-        (from_frame(points, pose) - np.array(truth.origin_xy_m)) / truth.resolution_m
-    ).astype(np.int64)
-    height, width = gain.shape
-    inside = ((cells >= 0) & (cells < (width, height))).all(axis=1)
-    hit = cells[inside]
-    return float(gain[hit[:, 1], hit[:, 0]].sum() + outside * (~inside).sum())
-
-
-def _refine(
-    free: Array,
-    occupied: Array,
-    truth: OccupancyGrid,
-    gain: tuple[Array, Array],
-    start: Pose2d,
-) -> Pose2d:
+def _refine(fit: _Fit, start: Pose2d) -> Pose2d:
     """Move to the best of the neighbouring poses until none is better, with shrinking steps."""
-    best, best_score = start, _score(free, occupied, truth, gain, start)
+    best, best_score = start, fit.score(start)
     moves = [move for move in product((-1, 0, 1), repeat=3) if any(move)]
     for step in REFINEMENT_STEPS_M:
         improved = True
@@ -108,34 +104,32 @@ def _refine(
                     centre[1] + dy * step,
                     centre[2] + turn * step * TURN_PER_METRE,
                 )
-                score = _score(free, occupied, truth, gain, pose)
+                score = fit.score(pose)
                 if score > best_score:
                     best, best_score, improved = pose, score, True
     return best
 
 
-def _search_everywhere(
-    free: Array, occupied: Array, truth: OccupancyGrid, gain: tuple[Array, Array]
-) -> Pose2d:
+def _search_everywhere(fit: _Fit) -> Pose2d:
     """Return the best pose over all headings and coarse translations by correlation."""
-    scale = truth.resolution_m / COARSE_CELL_M
-    size = [max(1, round(side * scale)) for side in gain[0].shape[::-1]]
+    scale = fit.truth.resolution_m / COARSE_CELL_M
+    size = [max(1, round(side * scale)) for side in fit.free_gain.shape[::-1]]
     # Outside the truth nothing is free: shift the gains so that zero padding means a loss.
-    free_gain = cv2.resize(gain[0], size, interpolation=cv2.INTER_AREA) + 1.0
-    occupied_gain = cv2.resize(gain[1], size, interpolation=cv2.INTER_AREA)
+    free_gain = cv2.resize(fit.free_gain, size, interpolation=cv2.INTER_AREA) + 1.0
+    occupied_gain = cv2.resize(fit.occupied_gain, size, interpolation=cv2.INTER_AREA)
     best, best_score = (0.0, 0.0, 0.0), -np.inf
     headings = np.linspace(-np.pi, np.pi, COARSE_HEADINGS, endpoint=False)
     # From the smallest turn on, so that a symmetric place is not turned over for nothing.
     for yaw in sorted(headings, key=abs):
-        turned = from_frame(np.vstack([free, occupied]), (0.0, 0.0, float(yaw)))
+        turned = raster.from_frame(np.vstack([fit.free, fit.occupied]), (0.0, 0.0, float(yaw)))
         low = np.floor(turned.min(axis=0) / COARSE_CELL_M) * COARSE_CELL_M
-        counts = [_histogram(part, low, turned) for part in np.split(turned, [len(free)])]
+        counts = [_histogram(part, low, turned) for part in np.split(turned, [len(fit.free)])]
         score = _correlate([free_gain, occupied_gain], counts)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         if score[row, column] > best_score:
             best_score = float(score[row, column])
             offset = np.array([column, row]) - np.array(counts[0].shape[::-1]) + 1
-            shift = np.array(truth.origin_xy_m) + offset * COARSE_CELL_M - low
+            shift = np.array(fit.truth.origin_xy_m) + offset * COARSE_CELL_M - low
             best = (float(shift[0]), float(shift[1]), float(yaw))
     return best
 

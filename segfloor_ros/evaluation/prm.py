@@ -67,30 +67,21 @@ def score_road_maps(
     """
     rng = np.random.default_rng(plan.seed)
     count = plan.nodes_for(float(wanted_free.sum()) * resolution_m**2)
+
+    def replay(built_on: Mask, replayed_on: Mask) -> list[float]:
+        """Return the share of one road map's edges that is free in `replayed_on`, if it has any."""
+        nodes = sample_nodes(built_on, count, plan.min_distance_m / resolution_m, rng)
+        starts, ends = candidate_edges(nodes, plan.max_edge_m / resolution_m)
+        built = edges_are_free(built_on, starts, ends)
+        replayed = edges_are_free(replayed_on, starts[built], ends[built])
+        return [float(replayed.mean())] if built.any() else []
+
     precisions: list[float] = []
     recalls: list[float] = []
     for _ in range(plan.repetitions):
-        _replay(precisions, estimate_free, truth_free, count, resolution_m, plan, rng)
-        _replay(recalls, wanted_free, estimate_free, count, resolution_m, plan, rng)
+        precisions += replay(estimate_free, truth_free)
+        recalls += replay(wanted_free, estimate_free)
     return RoadMapScore(Spread.of(precisions), Spread.of(recalls))
-
-
-def _replay(
-    shares: list[float],
-    built_on: Mask,
-    replayed_on: Mask,
-    count: int,
-    resolution_m: float,
-    plan: RoadMapPlan,
-    rng: np.random.Generator,
-) -> None:
-    """Append the share of one road map's edges that is free in `replayed_on`, if it has edges."""
-    nodes = sample_nodes(built_on, count, plan.min_distance_m / resolution_m, rng)
-    starts, ends = candidate_edges(nodes, plan.max_edge_m / resolution_m)
-    built = edges_are_free(built_on, starts, ends)
-    if built.any():
-        replayed = edges_are_free(replayed_on, starts[built], ends[built])
-        shares.append(float(replayed.mean()))
 
 
 def sample_nodes(

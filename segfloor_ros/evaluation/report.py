@@ -9,9 +9,8 @@ from typing import Any
 
 import cv2
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.map_score import MapScore, compare, score_map
-from segfloor_ros.evaluation.overlay import draw_overlay
+from segfloor_ros.errors import os_errors
+from segfloor_ros.evaluation.map_score import MapScore, compare, draw_overlay, score_map
 from segfloor_ros.evaluation.report_data import ReportData, read_run
 from segfloor_ros.evaluation.report_pictures import (
     cloud_picture,
@@ -25,29 +24,7 @@ from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 
 REPORT_NAME = 'report.html'
 
-STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 1180px; padding: 24px;
-       color: #1d2430; background: #fafbfc; }
-h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 34px 0 10px; }
-p.sub { color: #5a6675; margin: 0 0 18px; }
-.facts { display: flex; flex-wrap: wrap; gap: 12px; }
-.fact { background: #fff; border: 1px solid #e1e6ec; border-radius: 8px; padding: 10px 16px; }
-.fact b { display: block; font-size: 21px; } .fact span { color: #5a6675; font-size: 13px; }
-.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 16px; }
-.strip { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 10px; }
-figure { margin: 0; background: #fff; border: 1px solid #e1e6ec; border-radius: 8px;
-         padding: 10px; }
-figure img { width: 100%; display: block; } figcaption { color: #5a6675; font-size: 13px;
-         padding-top: 6px; }
-table { border-collapse: collapse; background: #fff; width: 100%; }
-td, th { border-bottom: 1px solid #e1e6ec; padding: 5px 10px; text-align: right; }
-td:first-child, th:first-child { text-align: left; }
-td.bar { width: 42%; text-align: left; } td.bar div { background: #4a84d4; height: 12px;
-         border-radius: 3px; min-width: 1px; }
-pre { background: #fff; border: 1px solid #e1e6ec; border-radius: 8px; padding: 12px;
-      overflow-x: auto; font-size: 12.5px; }
-"""
+STYLE = Path(__file__).with_name('report.css')
 
 
 def write_report(run: Path, truth: Path | None = None) -> Path:
@@ -59,10 +36,8 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     data = read_run(run, truth)
     page = _page(data)
     path = run / REPORT_NAME
-    try:
+    with os_errors(f'{path}: cannot be written'):
         path.write_text(page, encoding='utf-8')
-    except OSError as error:
-        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
     return path
 
 
@@ -77,13 +52,18 @@ def _page(data: ReportData) -> str:
         '<h2>Settings</h2><details><summary>as resolved</summary>'
         f'<pre>{html.escape(data.settings_text)}</pre></details>',
     ]
-    title = html.escape(f'Segfloor: {data.name}')
+    about = 'An occupancy map from a stereo camera'
+    return html_page(f'Segfloor: {data.name}', about, ''.join(sections))
+
+
+def html_page(title: str, about: str, content: str, style: str = '') -> str:
+    """Return a page with its content in HTML. style: CSS beside that of all pages."""
+    title = html.escape(title)
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{title}</title><style>{STYLE}</style></head><body>'
-        f'<h1>{title}</h1><p class="sub">An occupancy map from a stereo camera</p>'
-        f'{"".join(sections)}</body></html>\n'
+        f'<title>{title}</title><style>{STYLE.read_text()}{style}</style></head><body>'
+        f'<h1>{title}</h1><p class="sub">{html.escape(about)}</p>{content}</body></html>\n'
     )
 
 
@@ -98,7 +78,7 @@ def _facts(data: ReportData) -> str:
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
         (f'{100 * summary["camera_height_m"]:.1f} cm', 'camera above the floor'),
     ]
-    return f'<div class="facts">{"".join(_fact(*fact) for fact in facts)}</div>' + _scores(data)
+    return _fact_row(facts) + _scores(data)
 
 
 def _scores(data: ReportData) -> str:
@@ -112,10 +92,7 @@ def _scores(data: ReportData) -> str:
         facts.append(
             (f'{100 * path.ate_rmse_m:.1f} cm', f'path error over {path.path_length_m:.1f} m')
         )
-    return (
-        '<h2>Against the truth</h2>'
-        f'<div class="facts">{"".join(_fact(*fact) for fact in facts)}</div>'
-    )
+    return '<h2>Against the truth</h2>' + _fact_row(facts)
 
 
 def _map_facts(score: MapScore) -> list[tuple[str, str]]:
@@ -177,20 +154,25 @@ def _memory(summary: dict[str, Any]) -> str:
         ('peak', 'MB at most'),
         ('slope_per_update', 'MB more per map update'),
     )
-    facts = [_fact(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
+    facts = [(f'{memory[key]:.2f}', text) for key, text in words if key in memory]
     if not facts:
         return ''
     picture = memory_picture(memory)
     drawn = _figure(picture, 'Memory over the map updates') if picture else ''
-    return f'<div class="facts">{"".join(facts)}</div>{drawn}'
+    return _fact_row(facts) + drawn
 
 
 def _section(title: str, content: str) -> str:
     return f'<h2>{title}</h2>{content}' if content else ''
 
 
-def _fact(value: str, what: str) -> str:
-    return f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
+def _fact_row(facts: list[tuple[str, str]]) -> str:
+    """Return values, each with what it is, side by side."""
+    cells = (
+        f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
+        for value, what in facts
+    )
+    return f'<div class="facts">{"".join(cells)}</div>'
 
 
 def _figure(picture: bytes, caption: str, kind: str = 'png') -> str:

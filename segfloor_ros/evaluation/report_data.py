@@ -18,7 +18,7 @@ from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.cloud.ply import read_ply
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import MapTruth, load_truth, read_map
 from segfloor_ros.floor.settings import FloorSegmentationSettings
@@ -120,7 +120,5 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 
 def _read_text(path: Path) -> str:
-    try:
+    with os_errors(f'{path}: cannot be read', '; is this a run?'):
         return path.read_text()
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read ({error.strerror}); is this a run?') from None

@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -80,7 +79,6 @@ def v_disparity_picture(data: ReportData) -> bytes | None:
     floor = stage.process(frame.left, frame.right, data.mount)
     matched = floor.disparity_px > 0
     figure = Figure(figsize=(10, 4.4), layout='constrained')
-    FigureCanvasAgg(figure)
     kept = matched & ~_upright(data, floor.disparity_px)
     for axes, pixels, title in zip(
         figure.subplots(1, 2, sharex=True, sharey=True),
@@ -100,7 +98,6 @@ def memory_picture(memory: dict[str, Any]) -> bytes | None:
     if len(samples) < 2:
         return None
     figure = Figure(figsize=(10, 2.4), layout='constrained')
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     updates = np.arange(len(samples)) * memory.get('updates_per_sample', 1)
     axes.plot(updates, samples)
@@ -162,7 +159,6 @@ def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
         low, high = known.min(axis=0) - MARGIN_CELLS, known.max(axis=0) + 1 + MARGIN_CELLS
     rows, columns = high - low
     figure = Figure(figsize=(8, float(np.clip(8 * rows / columns, 2.5, 10)) + 0.8))
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     x, y = grid.origin_xy_m
     axes.set(

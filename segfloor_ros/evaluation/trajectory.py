@@ -1,11 +1,10 @@
-"""The error of an estimated trajectory against the true one, computed by evo."""
+"""The error of an estimated trajectory against the true one, computed by evo, and its picture."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from evo.core import metrics, sync
@@ -20,6 +19,8 @@ from segfloor_ros.geometry import Array, invert, make_transform
 MAX_STAMP_DIFFERENCE_S = 0.02
 RPE_STEP_M = 1.0
 MIN_MATCHES = 3
+
+FIRST_STRETCH_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,6 @@ class TrajectoryScore:
     rpe_translation_m: float
     rpe_rotation_rad: float
     end_error_m: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the score as plain numbers."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -207,3 +204,48 @@ def _frames_of_run(folder: Path) -> int:
 
 def _file_in(path: Path, name: str) -> Path:
     return path / name if path.is_dir() else path
+
+
+def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
+    """Write a plot of both paths from above and of the error over time.
+
+    Paths are drawn on the plane in which the true path extends most, its first stretch to the
+    right.
+    """
+    # Imported here: Matplotlib takes a second that scores should not wait for.
+    from matplotlib.figure import Figure
+
+    truth, aligned = matched.truth[:, :3, 3], matched.aligned[:, :3, 3]
+    axes = plane_axes(truth)
+    true_xy, xy = (truth - truth[0]) @ axes.T, (aligned - truth[0]) @ axes.T
+    figure = Figure(figsize=(11, 5), layout='constrained')
+    above, error = figure.subplots(1, 2)
+    above.plot(*true_xy.T, 'k--', label='truth')
+    above.plot(*xy.T, color='tab:blue', label='estimate, aligned')
+    above.plot(0, 0, 'ko', label='start')
+    above.set(xlabel='ahead of the start [m]', ylabel='to its left [m]')
+    above.set_aspect('equal', adjustable='datalim')
+    above.legend()
+    above.grid(alpha=0.3)
+    distances_cm = 100 * np.linalg.norm(aligned - truth, axis=1)
+    error.plot(matched.times_s - matched.times_s[0], distances_cm, color='tab:red')
+    error.set(xlabel='time [s]', ylabel='position error [cm]', ylim=(0, None))
+    error.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def plane_axes(path: Array) -> Array:
+    """Return the axes ahead and to the left (2, 3) of the start of a path (N, 3), in the plane in
+    which it extends most. Up is +z or, in optical frames, -y.
+    """
+    up = np.linalg.svd(path - path.mean(axis=0), full_matrices=True)[2][2]
+    largest = int(np.argmax(np.abs(up)))
+    up = up * np.sign(up[largest]) * (-1 if largest == 1 else 1)
+    moved = np.linalg.norm(path - path[0], axis=1)
+    ahead = path[int(np.argmax(moved >= min(FIRST_STRETCH_M, moved.max() / 2)))] - path[0]
+    ahead = ahead - (ahead @ up) * up
+    length = float(np.linalg.norm(ahead))
+    if length == 0:
+        return np.eye(3)[:2]
+    return np.array([ahead / length, np.cross(up, ahead / length)])

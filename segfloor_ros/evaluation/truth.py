@@ -51,10 +51,10 @@ def load_truth(path: Path) -> MapTruth:
     scene_file = path / 'scene.yaml'
     if not scene_file.is_file():
         return MapTruth(grid)
-    scene = _read_scene(scene_file)
+    start_pose, fov_rad = _read_scene(scene_file)
     poses_file = path / 'base_poses.txt'
     poses = read_base_poses(poses_file) if poses_file.is_file() else None
-    return MapTruth(grid, scene['start_pose_world'], poses, scene['fov_rad'])
+    return MapTruth(grid, start_pose, poses, fov_rad)
 
 
 def read_base_poses(path: Path) -> Array:
@@ -67,11 +67,11 @@ def read_base_poses(path: Path) -> Array:
     return np.column_stack([poses[:, 0, 3], poses[:, 1, 3], yaw])
 
 
-def _read_scene(path: Path) -> dict:
+def _read_scene(path: Path) -> tuple[Pose2d, float]:
     scene = yaml.safe_load(path.read_text())
     try:
         x, y, yaw = (float(value) for value in scene['start_pose_world'])
         fov_rad = float(np.radians(scene['fov_x_deg']))
     except (KeyError, TypeError, ValueError):
         raise InputError(f'{path}: expected start_pose_world (x, y, yaw) and fov_x_deg') from None
-    return {'start_pose_world': (x, y, yaw), 'fov_rad': fov_rad}
+    return (x, y, yaw), fov_rad

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -12,10 +13,12 @@ import cv2
 import numpy as np
 import yaml
 
+from segfloor_ros import __version__
+from segfloor_ros.camera.calibration_files import write_ros_calibration
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.simulation.rig import RawCamera
+from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.simulation import SimulatedFrame, Simulation
 
 DISPARITY_SCALE = 256
@@ -27,6 +30,10 @@ IMU_COLUMNS = (
 )
 
 PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
+
+Progress = Callable[[int], None]
+
+STAMP = 'rendered_from.txt'
 
 
 @dataclass(frozen=True)
@@ -119,36 +126,14 @@ def _write_calibration(folder: Path, simulation: Simulation) -> None:
                 for i, side in enumerate((left, right))]  # fmt: skip
         (folder / 'calib.txt').write_text('\n'.join(rows) + '\n')
         return
-    size = (simulation.camera.width, simulation.camera.height)
     for name, side in (('left', left), ('right', right)):
-        document = ros_calibration(name, side, *size)
-        (folder / f'{name}.yaml').write_text(yaml.safe_dump(document, sort_keys=False))
-
-
-def ros_calibration(name: str, side: RawCamera, width: int, height: int) -> dict:
-    """Return a calibration in the form of ROS's camera_calibration_parsers."""
-    return {
-        'image_width': width,
-        'image_height': height,
-        'camera_name': name,
-        'camera_matrix': _matrix(side.K),
-        'distortion_model': 'plumb_bob',
-        'distortion_coefficients': _matrix(side.D[None]),
-        'rectification_matrix': _matrix(side.R),
-        'projection_matrix': _matrix(side.P),
-    }
-
-
-def _matrix(values: Array) -> dict:
-    return {
-        'rows': values.shape[0],
-        'cols': values.shape[1],
-        'data': [float(value) for value in values.ravel()],
-    }
+        write_ros_calibration(folder / f'{name}.yaml', side, name)
 
 
 def _write_sensors(folder: Path, simulation: Simulation) -> None:
-    """Write wheel_odometry.txt (TUM) and imu.csv (the columns of EuRoC's data.csv)."""
+    """Write wheel_odometry.txt (TUM), imu.csv (the columns of EuRoC's data.csv) and, of an IMU that
+    is not where the camera is, imu.yaml.
+    """
     wheels, imu = simulation.wheels(), simulation.imu()
     if wheels is not None:
         turns = np.stack([quaternion_xyzw(T[:3, :3]) for T in wheels.T_odom_base])
@@ -160,6 +145,10 @@ def _write_sensors(folder: Path, simulation: Simulation) -> None:
             for t, gyro, accel in zip(imu.times_s, imu.gyro_rad_s, imu.accel_m_s2, strict=True)
         )
         (folder / 'imu.csv').write_text('\n'.join([IMU_COLUMNS, *rows]) + '\n')
+        if imu.T_left_imu[:3, 3].any():
+            values = imu.T_left_imu.ravel().tolist()
+            matrix = {'T_BS': {'rows': 4, 'cols': 4, 'data': values}}
+            (folder / 'imu.yaml').write_text(yaml.safe_dump(matrix))
 
 
 def _write_images(folder: Path, frame: SimulatedFrame, rectified: bool) -> None:
@@ -190,3 +179,25 @@ def _write_png(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(exist_ok=True)
     if not cv2.imwrite(str(path), image, PNG_SPEED):
         raise InputError(f'{path}: cannot be written; is the disk full?')
+
+
+def render_once(
+    scene: Scene,
+    recording: Path,
+    options: RecordingOptions = RecordingOptions(floor_every=0),
+    on_start: Callable[[int], Progress] = lambda total: lambda done: None,
+) -> None:
+    """Render a drive into the folder `recording`, unless it holds this drive already.
+
+    on_start: told the number of frames; returns whom to tell how many are done. Raises
+    RenderingError where nothing can be rendered.
+    """
+    stamp = recording / STAMP
+    wanted = hashlib.sha256(repr((__version__, scene, options)).encode()).hexdigest() + '\n'
+    if stamp.is_file() and stamp.read_text() == wanted:
+        return
+    with Simulation(scene) as simulation:
+        if recording.is_dir():
+            shutil.rmtree(recording)
+        record(simulation, recording, options, on_start(simulation.frame_count))
+    stamp.write_text(wanted)

@@ -26,19 +26,19 @@ class WorldRenderer:
     """A world in MuJoCo in which the stereo rig and what moves can be placed."""
 
     def __init__(self, scene: Scene, world: World):
-        self._mujoco = _import_mujoco()
+        self.mujoco = _import_mujoco()
         self._scene = scene
-        self._model = self._mujoco.MjModel.from_xml_string(world.xml, world.files)
-        self._data = self._mujoco.MjData(self._model)
+        self.model = self.mujoco.MjModel.from_xml_string(world.xml, world.files)
+        self.data = self.mujoco.MjData(self.model)
         self._movers = mover_bodies(scene)
         self._mocap = {
-            name: int(self._model.body(name).mocapid[0]) for name in [RIG, *chain(*self._movers)]
+            name: int(self.model.body(name).mocapid[0]) for name in [RIG, *chain(*self._movers)]
         }
-        self._floor_ids = [self._model.geom(name).id for name in world.floor_geoms]
+        self.floor_ids = [self.model.geom(name).id for name in world.floor_geoms]
 
     def view(self, width: int, height: int, focal_px: float) -> View:
         """Return a view through cameras of this size and focal length. Close it when done."""
-        return View(self._mujoco, self._model, self._data, self._floor_ids, width, height, focal_px)
+        return View(self, width, height, focal_px)
 
     def move(self, T_world_left: Array, time_s: float) -> None:
         """Put the rig at a pose of the left optical frame, and what moves where it is at a time."""
@@ -46,7 +46,7 @@ class WorldRenderer:
         for mover, names in zip(self._scene.movers, self._movers, strict=True):
             for name, T_world_part in zip(names, part_poses(mover, time_s), strict=True):
                 self._place(name, T_world_part[:3, 3], quaternion_xyzw(T_world_part[:3, :3]))
-        self._mujoco.mj_forward(self._model, self._data)
+        self.mujoco.mj_forward(self.model, self.data)
 
     def moving_geoms(self, time_s: float) -> list[int]:
         """Return the geoms of all that moves at a time."""
@@ -56,13 +56,13 @@ class WorldRenderer:
             for name in names
             if is_moving(mover, time_s)
         ]
-        bodies = [self._model.body(name).id for name in moving]
-        return [int(g) for g in np.flatnonzero(np.isin(self._model.geom_bodyid, bodies))]
+        bodies = [self.model.body(name).id for name in moving]
+        return [int(g) for g in np.flatnonzero(np.isin(self.model.geom_bodyid, bodies))]
 
     def _place(self, name: str, position: Array, quat_xyzw: Array) -> None:
         index = self._mocap[name]
-        self._data.mocap_pos[index] = position
-        self._data.mocap_quat[index] = np.roll(quat_xyzw, 1)
+        self.data.mocap_pos[index] = position
+        self.data.mocap_quat[index] = np.roll(quat_xyzw, 1)
 
 
 class View:
@@ -70,20 +70,12 @@ class View:
     of the picture, (width - 1) / 2 and (height - 1) / 2 in pixels.
     """
 
-    def __init__(
-        self,
-        mujoco: Any,
-        model: Any,
-        data: Any,
-        floor_ids: list[int],
-        width: int,
-        height: int,
-        focal_px: float,
-    ):
-        self._geom_type = int(mujoco.mjtObj.mjOBJ_GEOM)
-        self._model, self._data, self._floor_ids = model, data, floor_ids
+    def __init__(self, renderer: WorldRenderer, width: int, height: int, focal_px: float):
+        self._model, self._data = renderer.model, renderer.data
+        self._floor_ids = renderer.floor_ids
+        self._geom_type = int(renderer.mujoco.mjtObj.mjOBJ_GEOM)
         self._fov_y_deg = float(np.degrees(2 * np.arctan(height / 2 / focal_px)))
-        self._renderer = _open_renderer(mujoco, model, width, height)
+        self._renderer = _open_renderer(renderer.mujoco, self._model, width, height)
 
     def close(self) -> None:
         """Free the graphics memory."""

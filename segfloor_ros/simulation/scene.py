@@ -193,8 +193,9 @@ class Wheels:
 
 @dataclass(frozen=True)
 class Imu:
-    """A gyroscope and accelerometer on the left camera; without a rate there is none. Noise is the
-    standard deviation of a sample, a bias the length of a constant error in a random direction.
+    """A gyroscope and accelerometer; without a rate there is none. place_m: where it is in the left
+    optical frame, whose axes it has. Noise is the standard deviation of a sample, a bias the length
+    of a constant error in a random direction.
     """
 
     rate_hz: float = 0.0
@@ -202,6 +203,7 @@ class Imu:
     gyro_bias_deg_s: float = 0.5
     accel_noise_m_s2: float = 0.03
     accel_bias_m_s2: float = 0.05
+    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""Scene files: YAML whose keys are the fields of `scene.Scene`."""
+"""A scene by name, by file (YAML with the fields of `scene.Scene`), or from a floor plan."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import typing
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import yaml
 from segfloor_ros.errors import InputError
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
+from segfloor_ros.simulation.floor_plan import is_map_file, scene_of_map
 from segfloor_ros.simulation.scene import Scene
 
 
@@ -20,11 +23,6 @@ def shipped_scenes() -> dict[str, Path]:
     """Return the scene files that come with the package, by name."""
     folder = Path(str(resources.files('segfloor_ros.simulation') / 'scenes'))
     return {file.stem: file for file in sorted(folder.glob('*.yaml'))}
-
-
-def load_scene(path: Path) -> Scene:
-    """Read a scene file. Raises InputError naming the file, the entry and what is wrong with it."""
-    return scene_from_mapping(read_scene_values(path), str(path))
 
 
 def read_scene_values(path: Path) -> dict[str, Any]:
@@ -108,3 +106,39 @@ def _build_tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, .
 
 def _is_required(entry: dataclasses.Field) -> bool:
     return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+
+
+def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
+    """Return the scene of that name or file, some values replaced (`camera.height_m=0.4`).
+
+    A map_server map becomes a scene with extruded walls and a planned path. Raises InputError.
+    """
+    path = Path(name)
+    shipped = shipped_scenes()
+    if not path.exists() and name not in shipped:
+        raise InputError(f'{name}: no such scene or file{suggestion(name, list(shipped))}')
+    file = path if path.exists() else shipped[name]
+    if file.is_dir():
+        raise InputError(f'{name}: is a folder; name a scene file or a map YAML')
+    if is_map_file(read_yaml(file)):
+        values = scene_of_map(file, assigned({}, assignments))
+    else:
+        values = read_scene_values(file)
+    return scene_from_mapping(assigned(values, assignments), name)
+
+
+def assigned(values: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    """Return a copy of nested values with `a.b=value` assignments applied."""
+    result = copy.deepcopy(values)
+    for assignment in assignments:
+        key, separator, text = assignment.partition('=')
+        *groups, name = key.strip().split('.')
+        if not separator or not name:
+            raise InputError(f'--set {assignment}: expected group.name=value')
+        inner = result
+        for group in groups:
+            inner = inner.setdefault(group, {})
+            if not isinstance(inner, dict):
+                raise InputError(f'--set {assignment}: {group} has no named values')
+        inner[name] = yaml.safe_load(text)
+    return result

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.simulation.drive import Drive
 from segfloor_ros.simulation.rig import RigMotion
 from segfloor_ros.simulation.scene import DepthSensor, Scene, Wheels
@@ -37,11 +37,14 @@ class WheelReadings:
 
 @dataclass(frozen=True)
 class ImuReadings:
-    """Times (N,) in seconds; gyro_rad_s, accel_m_s2 (N, 3) in the rectified left optical frame."""
+    """Times (N,) in seconds; gyro_rad_s, accel_m_s2 (N, 3) in the axes of the rectified left
+    optical frame, at T_left_imu (4, 4).
+    """
 
     times_s: Array
     gyro_rad_s: Array
     accel_m_s2: Array
+    T_left_imu: Array
 
 
 def smooth_motion(motion: RigMotion) -> RigMotion:
@@ -98,7 +101,8 @@ def imu_readings(scene: Scene, motion: RigMotion) -> ImuReadings:
     imu = scene.sensors.imu
     count = int(motion.drive.times_s[-1] * imu.rate_hz) - 1
     times_s = np.arange(count + 2) / imu.rate_hz
-    poses = np.stack([motion.T_world_left(t) for t in times_s])
+    T_left_imu = make_transform(np.eye(3), np.array(imu.place_m))
+    poses = np.stack([motion.T_world_left(t) @ T_left_imu for t in times_s])
     R, p = poses[:, :3, :3], poses[:, :3, 3]
     turn = Rotation.from_matrix(np.swapaxes(R[:-2], 1, 2) @ R[2:]).as_rotvec()
     lifted = (p[2:] - 2 * p[1:-1] + p[:-2]) * imu.rate_hz**2 + (0.0, 0.0, GRAVITY_M_S2)
@@ -108,7 +112,7 @@ def imu_readings(scene: Scene, motion: RigMotion) -> ImuReadings:
         _errors(rng, imu.gyro_bias_deg_s, imu.gyro_noise_deg_s, count)
     )
     accel += _errors(rng, imu.accel_bias_m_s2, imu.accel_noise_m_s2, count)
-    return ImuReadings(times_s[1:-1], gyro, accel)
+    return ImuReadings(times_s[1:-1], gyro, accel, T_left_imu)
 
 
 def _errors(rng: np.random.Generator, bias: float, noise: float, count: int) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +11,18 @@ from numpy.typing import NDArray
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.occupancy import OCCUPIED, OccupancyGrid
+from segfloor_ros.simulation import sensors
 from segfloor_ros.simulation.drive import Drive, plan_drive
-from segfloor_ros.simulation.imaging import Picture, develop, ideal_image, plan_imaging
 from segfloor_ros.simulation.renderer import WorldRenderer
-from segfloor_ros.simulation.rig import RigMotion, rectified_camera
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.sensors import (
-    ImuReadings,
-    WheelReadings,
-    depth_reading_mm,
-    imu_readings,
-    smooth_motion,
-    wheel_readings,
+from segfloor_ros.simulation.rig import (
+    Picture,
+    RigMotion,
+    develop,
+    ideal_image,
+    plan_imaging,
+    rectified_camera,
 )
+from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.solids import floors, obstacles
 from segfloor_ros.simulation.truth_map import true_map
 from segfloor_ros.simulation.world import CAMERAS, build_world
@@ -83,12 +81,7 @@ class Simulation:
     def __enter__(self) -> Simulation:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._pictures.close()
         self._truth.close()
 
@@ -120,24 +113,24 @@ class Simulation:
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
         return FrameTruth(self._truth.floor_mask(CAMERAS[0]), depth_m, disparity_px)
 
-    def wheels(self) -> WheelReadings | None:
+    def wheels(self) -> sensors.WheelReadings | None:
         """Return what the wheels tell of the whole drive, where the scene has such."""
         if not self.scene.sensors.wheel_odometry.rate_hz:
             return None
-        return wheel_readings(self.scene, smooth_motion(self.motion))
+        return sensors.wheel_readings(self.scene, sensors.smooth_motion(self.motion))
 
-    def imu(self) -> ImuReadings | None:
+    def imu(self) -> sensors.ImuReadings | None:
         """Return what the IMU tells of the whole drive, where the scene has one."""
         if not self.scene.sensors.imu.rate_hz:
             return None
-        return imu_readings(self.scene, smooth_motion(self.motion))
+        return sensors.imu_readings(self.scene, sensors.smooth_motion(self.motion))
 
     def _depth_mm(self, index: int) -> NDArray[np.uint16] | None:
         if not self.scene.sensors.depth.max_m:
             return None
         true_m = self.truth(index).depth_m
         time_s = float(self.drive.times_s[index])
-        return depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
+        return sensors.depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
 
     def moving_mask(self, index: int) -> NDArray[np.uint8]:
         """Render what moves in one frame's left image: (H, W) uint8, 255 moving."""

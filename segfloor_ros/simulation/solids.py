@@ -5,23 +5,18 @@ follow.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.settings import suggestion
-from segfloor_ros.simulation.scene import (
-    Box,
-    Cylinder,
-    FloorPatch,
-    Furniture,
-    Point,
-    Scene,
-    Slope,
-    Wall,
-)
+from segfloor_ros.simulation.scene import FloorPatch, Furniture, Point, Scene, Slope, Wall
 
 CYLINDER_SIDES = 32
 PATCH_THICKNESS_M = 0.001
@@ -74,8 +69,10 @@ def cylinder(
 def obstacles(scene: Scene) -> list[Prism]:
     """Return the solids of a scene that stand still and are not floor, sheets on walls included."""
     solids = [prism for wall in scene.walls for prism in _wall(wall)]
-    solids += [_box(box) for box in scene.boxes]
-    solids += [_cylinder(thing) for thing in scene.cylinders]
+    solids += [block(b.at, b.size, b.texture, b.yaw_deg, b.bottom_m) for b in scene.boxes]
+    solids += [
+        cylinder(c.at, c.radius_m, c.height_m, c.texture, c.bottom_m) for c in scene.cylinders
+    ]
     solids += [prism for thing in scene.furniture for prism in _furniture(thing)]
     return solids + _posters(scene)
 
@@ -127,14 +124,6 @@ def _posters(scene: Scene) -> list[Prism]:
     return solids
 
 
-def _box(box: Box) -> Prism:
-    return block(box.at, box.size, box.texture, box.yaw_deg, box.bottom_m)
-
-
-def _cylinder(thing: Cylinder) -> Prism:
-    return cylinder(thing.at, thing.radius_m, thing.height_m, thing.texture, thing.bottom_m)
-
-
 def _slope(slope: Slope) -> Prism:
     start, end = np.array(slope.start), np.array(slope.end)
     along = end[:2] - start[:2]
@@ -151,64 +140,17 @@ def _patch(patch: FloorPatch) -> Prism:
     return Prism(flat.footprint, flat.bottom_m, flat.top_m, flat.texture, is_floor=True)
 
 
-# (forward, left, length, width, height, bottom) of the blocks of each kind, in metres.
-FURNITURE: dict[str, tuple[str, tuple[tuple[float, ...], ...]]] = {
-    'chair': (
-        'wood',
-        (
-            (0.18, 0.18, 0.03, 0.03, 0.44, 0.0),
-            (0.18, -0.18, 0.03, 0.03, 0.44, 0.0),
-            (-0.18, 0.18, 0.03, 0.03, 0.92, 0.0),
-            (-0.18, -0.18, 0.03, 0.03, 0.92, 0.0),
-            (0.0, 0.0, 0.42, 0.42, 0.04, 0.44),
-            (-0.19, 0.0, 0.025, 0.36, 0.22, 0.66),
-        ),
-    ),
-    'table': (
-        'wood',
-        (
-            (0.62, 0.32, 0.05, 0.05, 0.71, 0.0),
-            (0.62, -0.32, 0.05, 0.05, 0.71, 0.0),
-            (-0.62, 0.32, 0.05, 0.05, 0.71, 0.0),
-            (-0.62, -0.32, 0.05, 0.05, 0.71, 0.0),
-            (0.0, 0.0, 1.4, 0.8, 0.04, 0.71),
-        ),
-    ),
-    'stool': (
-        'metal',
-        (
-            (0.13, 0.13, 0.025, 0.025, 0.45, 0.0),
-            (0.13, -0.13, 0.025, 0.025, 0.45, 0.0),
-            (-0.13, 0.13, 0.025, 0.025, 0.45, 0.0),
-            (-0.13, -0.13, 0.025, 0.025, 0.45, 0.0),
-            (0.0, 0.0, 0.32, 0.32, 0.03, 0.45),
-        ),
-    ),
-    'guitar': (
-        'wood',
-        (
-            (0.0, 0.0, 0.12, 0.4, 0.28, 0.02),
-            (0.0, 0.0, 0.12, 0.3, 0.22, 0.3),
-            (-0.02, 0.0, 0.04, 0.06, 0.5, 0.52),
-            (-0.02, 0.0, 0.03, 0.1, 0.15, 1.02),
-            (-0.12, 0.0, 0.2, 0.03, 0.04, 0.0),
-        ),
-    ),
-    'plant': (
-        'granite',
-        (
-            (0.0, 0.0, 0.3, 0.3, 0.32, 0.0),
-            (0.0, 0.0, 0.05, 0.05, 0.4, 0.32),
-            (0.0, 0.0, 0.45, 0.45, 0.5, 0.7),
-        ),
-    ),
-}
+@cache
+def _kinds() -> dict[str, Any]:
+    """Return texture and blocks of each kind of furniture."""
+    return yaml.safe_load(Path(__file__).with_name('furniture.yaml').read_text())
 
 
 def _furniture(thing: Furniture) -> list[Prism]:
-    if thing.kind not in FURNITURE:
-        raise InputError(f'unknown furniture {thing.kind}{suggestion(thing.kind, list(FURNITURE))}')
-    texture, parts = FURNITURE[thing.kind]
+    kinds = _kinds()
+    if thing.kind not in kinds:
+        raise InputError(f'unknown furniture {thing.kind}{suggestion(thing.kind, list(kinds))}')
+    texture, parts = kinds[thing.kind]['texture'], kinds[thing.kind]['blocks']
     solids = []
     for forward, left, length, width, height, bottom in parts:
         x, y = _turn(thing.yaw_deg) @ (forward, left) + np.array(thing.at)

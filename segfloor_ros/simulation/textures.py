@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -37,19 +37,9 @@ def fractal_noise(size: int, roughness: float, rng: np.random.Generator, cells: 
     return (noise / noise.std()).astype(np.float32)
 
 
-def plain(size: int, rng: np.random.Generator) -> Image:
+def plain(grey: int, size: int, rng: np.random.Generator) -> Image:
     """Paint without any structure."""
-    return np.full((size, size), 175, np.float32)
-
-
-def plain_dark(size: int, rng: np.random.Generator) -> Image:
-    """Dark paint without any structure."""
-    return np.full((size, size), 85, np.float32)
-
-
-def plain_light(size: int, rng: np.random.Generator) -> Image:
-    """Light paint without any structure."""
-    return np.full((size, size), 235, np.float32)
+    return np.full((size, size), grey, np.float32)
 
 
 def plaster(size: int, rng: np.random.Generator) -> Image:
@@ -201,9 +191,9 @@ def metal(size: int, rng: np.random.Generator) -> Image:
 
 
 GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, float]] = {
-    'plain': (plain, 64, 1.0),
-    'plain_dark': (plain_dark, 64, 1.0),
-    'plain_light': (plain_light, 64, 1.0),
+    'plain': (partial(plain, 175), 64, 1.0),
+    'plain_dark': (partial(plain, 85), 64, 1.0),
+    'plain_light': (partial(plain, 235), 64, 1.0),
     'plaster': (plaster, 1024, 3.0),
     'rough_plaster': (rough_plaster, 1024, 2.5),
     'concrete': (concrete, 1024, 3.0),

@@ -46,7 +46,8 @@ def true_map(
     grid = _empty_grid(scene, standing, start)
     blocked = np.zeros(grid.cells.shape, bool)
     for prism in standing:
-        _mark(blocked, grid, scene, prism, floors)
+        rows, columns, hit = _hit_cells(grid, scene, prism, floors)
+        blocked[rows, columns] |= hit
     column, row = ((start - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(int)
     if blocked[row, column]:
         raise InputError(f'the path starts on an obstacle, at x {start[0]:g}, y {start[1]:g} m')
@@ -70,14 +71,12 @@ def _empty_grid(scene: Scene, obstacles: list[Prism], start: Array) -> Occupancy
     return OccupancyGrid(cells, size, (float(low[0]), float(low[1])))
 
 
-def _mark(
-    blocked: NDArray[np.bool_],
-    grid: OccupancyGrid,
-    scene: Scene,
-    prism: Prism,
-    floors: list[Prism],
-) -> None:
-    """Mark the cells where a sample point lies in a prism at the robot's height."""
+def _hit_cells(
+    grid: OccupancyGrid, scene: Scene, prism: Prism, floors: list[Prism]
+) -> tuple[slice, slice, NDArray[np.bool_]]:
+    """Return rows, columns, and in which of their cells a sample point lies in a prism at the
+    robot's height.
+    """
     origin, size = np.array(grid.origin_xy_m), grid.resolution_m
     first = np.floor((prism.footprint.min(axis=0) - origin) / size).astype(int)
     last = np.floor((prism.footprint.max(axis=0) - origin) / size).astype(int) + 1
@@ -87,17 +86,12 @@ def _mark(
     y = (first[1] + np.arange(rows)[:, None] + steps).ravel() * size + origin[1]
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     hit = inside_footprint(prism, points)
-    hit[hit] = _in_the_way(scene, prism, points[hit], floors)
+    ground_m, top_m = floor_height_m(floors, points[hit]), _top_at(prism, points[hit])
+    below = float(prism.bottom_m.min()) < ground_m + scene.robot_height_m
+    hit[hit] = below & (top_m > ground_m + scene.step_height_m)
     shape = (rows, SAMPLES_PER_CELL, columns, SAMPLES_PER_CELL)
-    blocked[first[1] : last[1], first[0] : last[0]] |= hit.reshape(shape).any(axis=(1, 3))
-
-
-def _in_the_way(
-    scene: Scene, prism: Prism, points: Array, floors: list[Prism]
-) -> NDArray[np.bool_]:
-    ground_m = floor_height_m(floors, points)
-    bottom_m, top_m = float(prism.bottom_m.min()), _top_at(prism, points)
-    return (top_m > ground_m + scene.step_height_m) & (bottom_m < ground_m + scene.robot_height_m)
+    cells = np.asarray(hit.reshape(shape).any(axis=(1, 3)))
+    return slice(first[1], last[1]), slice(first[0], last[0]), cells
 
 
 def _top_at(prism: Prism, points: Array) -> Array:

@@ -1,39 +1,127 @@
-"""A scene as a MuJoCo model: textured meshes, floor, lights, the stereo rig, movers."""
+"""A scene as a MuJoCo model: textured meshes of prisms, floor, lights, the stereo rig, movers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.mesh import Mesh, caps, merge, sides
 from segfloor_ros.simulation.movers import part_solids
 from segfloor_ros.simulation.scene import Lighting, Scene
 from segfloor_ros.simulation.solids import Prism, floors, obstacles
 from segfloor_ros.simulation.textures import Texture, make_texture
 
 NEAR_M, FAR_M = 0.02, 120.0
+
 GROUND_HALF_M = 60.0
+
 SHADOW_HALF_M, SHADOW_PX = 12, 4096
 """Within so far of the origin the sun casts shadows, of so many pixels across."""
+
 RIG = 'rig'
+
 CAMERAS = ('left', 'right')
 
 
 @dataclass(frozen=True)
-class World:
-    """A MuJoCo model as text with its binary files, and the names of the floor's geoms."""
+class Mesh:
+    """Triangles: vertices and normals (V, 3), texture coordinates (V, 2) with v downward in the
+    picture, faces (F, 3) counter-clockwise seen from outside.
+    """
 
-    xml: str
-    files: dict[str, bytes]
-    floor_geoms: tuple[str, ...]
+    vertices: Array
+    normals: Array
+    uv: Array
+    faces: NDArray[np.int64]
+
+
+def merge(meshes: list[Mesh]) -> Mesh:
+    """Return one mesh with the triangles of all."""
+    counts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return Mesh(
+        np.vstack([mesh.vertices for mesh in meshes]),
+        np.vstack([mesh.normals for mesh in meshes]),
+        np.vstack([mesh.uv for mesh in meshes]),
+        np.vstack([mesh.faces + first for mesh, first in zip(meshes, counts, strict=True)]),
+    )
+
+
+def sides(prism: Prism, side_m: float) -> Mesh:
+    """Return the upright sides of a prism. side_m: what the texture covers."""
+    corners = prism.footprint
+    following = np.roll(corners, -1, axis=0)
+    along = following - corners
+    lengths = np.hypot(*along.T)
+    count = len(corners)
+    index = np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1)
+    low, high = prism.bottom_m[index], prism.top_m[index]
+    xy = np.stack([corners, following], axis=1)
+    vertices = np.concatenate(
+        [np.dstack([xy, low]), np.dstack([xy[:, ::-1], high[:, ::-1]])], axis=1
+    ).reshape(-1, 3)
+    normals = np.repeat(_side_normals(prism, along / lengths[:, None]), 2, axis=1)
+    normals = normals[:, [0, 2, 3, 1]].reshape(-1, 3)
+    uv = _side_uv(prism, along / lengths[:, None], lengths, vertices, side_m)
+    first = np.arange(count)[:, None] * 4
+    faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+    return Mesh(vertices, normals, uv, faces)
+
+
+def caps(prism: Prism, side_m: float, top: bool = True, bottom: bool = True) -> Mesh:
+    """Return the top and the bottom of a prism."""
+    parts = []
+    if top:
+        parts.append(_cap(prism, prism.top_m, 1.0, side_m))
+    if bottom:
+        parts.append(_cap(prism, prism.bottom_m, -1.0, side_m))
+    return merge(parts)
+
+
+def _side_normals(prism: Prism, direction: Array) -> Array:
+    """Return the normals (K, 2, 3) at the start and the end of each side."""
+    flat = np.stack([direction[:, 1], -direction[:, 0], np.zeros(len(direction))], axis=1)
+    if not prism.smooth:
+        return np.stack([flat, flat], axis=1)
+    corner = flat + np.roll(flat, 1, axis=0)
+    corner /= np.linalg.norm(corner, axis=1, keepdims=True)
+    return np.stack([corner, np.roll(corner, -1, axis=0)], axis=1)
+
+
+def _side_uv(
+    prism: Prism, direction: Array, lengths: Array, vertices: Array, side_m: float
+) -> Array:
+    """Return texture coordinates of the sides' vertices. Flat sides take the position along them,
+    so that a pattern runs on over adjoining solids; round ones the way around.
+    """
+    if prism.is_sheet:
+        return np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (len(lengths), 1))
+    start = np.cumsum(lengths) - lengths
+    if not prism.smooth:
+        start = (prism.footprint * direction).sum(axis=1)
+    end = start + lengths
+    u = np.stack([start, end, end, start], axis=1).ravel() / side_m
+    return np.stack([u, -vertices[:, 2] / side_m], axis=1)
+
+
+def _cap(prism: Prism, heights_m: Array, up: float, side_m: float) -> Mesh:
+    vertices = np.column_stack([prism.footprint, heights_m])
+    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])
+    normal *= np.sign(normal[2]) * up / np.linalg.norm(normal)
+    second = np.arange(1, len(vertices) - 1)
+    fan = np.stack([np.zeros_like(second), second, second + 1], axis=1)
+    uv = vertices[:, :2] * (1.0, -1.0) / side_m
+    return Mesh(vertices, np.tile(normal, (len(vertices), 1)), uv, fan if up > 0 else fan[:, ::-1])
 
 
 @dataclass
-class WorldBuilder:
-    """Collects the parts of the model."""
+class World:
+    """A MuJoCo model: xml with its binary files, names of the floor's geoms, and the parts that it
+    is put together from.
+    """
 
     scene: Scene
     textures: dict[str, Texture] = field(default_factory=dict)
@@ -41,6 +129,7 @@ class WorldBuilder:
     bodies: list[str] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
     floor_geoms: list[str] = field(default_factory=list)
+    xml: str = ''
 
     def texture(self, name: str) -> Texture:
         """Return a texture, made and given a material on first use. `name:3` is a variant."""
@@ -92,13 +181,14 @@ def build_world(scene: Scene, width: int, height: int) -> World:
 
     Raises InputError for an unknown texture or furniture.
     """
-    builder = WorldBuilder(scene)
-    _add_ground(builder)
-    builder.bodies += builder.solids(obstacles(scene), 'solid')
+    world = World(scene)
+    _add_ground(world)
+    world.bodies += world.solids(obstacles(scene), 'solid')
     if scene.slopes or scene.floor_patches:
-        builder.bodies += builder.solids(floors(scene), 'slope')
-    _add_movers(builder)
-    return World(_document(builder, width, height), builder.files, tuple(builder.floor_geoms))
+        world.bodies += world.solids(floors(scene), 'slope')
+    _add_movers(world)
+    world.xml = _document(world, width, height)
+    return world
 
 
 def mover_bodies(scene: Scene) -> list[list[str]]:
@@ -109,72 +199,61 @@ def mover_bodies(scene: Scene) -> list[list[str]]:
     ]
 
 
-def _add_ground(builder: WorldBuilder) -> None:
-    floor, ceiling = builder.scene.floor, builder.scene.ceiling
-    builder.floor_geoms.append('ground')
-    _add_plane(builder, 'ground', 0.0, floor.texture, floor.reflectance)
+def _add_ground(world: World) -> None:
+    floor, ceiling = world.scene.floor, world.scene.ceiling
+    world.floor_geoms.append('ground')
+    _add_plane(world, 'ground', 0.0, floor.texture, floor.reflectance)
     if ceiling.height_m > 0:
-        _add_plane(builder, 'ceiling', ceiling.height_m, ceiling.texture, 0.0)
+        _add_plane(world, 'ceiling', ceiling.height_m, ceiling.texture, 0.0)
 
 
-def _add_plane(
-    builder: WorldBuilder, name: str, height_m: float, texture: str, reflectance: float
-) -> None:
+def _add_plane(world: World, name: str, height_m: float, texture: str, reflectance: float) -> None:
     """Add a wide plane at a height; one above the ground looks down."""
-    per_metre = 1 / builder.texture(texture).side_m
-    builder.assets.append(
+    per_metre = 1 / world.texture(texture).side_m
+    world.assets.append(
         f'<material name="{name}" texture="{texture}" texuniform="true" specular="0" '
         f'texrepeat="{per_metre} {per_metre}" shininess="0" reflectance="{reflectance}"/>'
     )
     facing = '0 1 0 0' if height_m > 0 else '1 0 0 0'
-    builder.bodies.append(
+    world.bodies.append(
         f'<geom name="{name}" type="plane" pos="0 0 {height_m}" quat="{facing}" '
         f'size="{GROUND_HALF_M} {GROUND_HALF_M} 1" material="{name}" '
         'contype="0" conaffinity="0"/>'
     )
 
 
-def _add_movers(builder: WorldBuilder) -> None:
-    for mover, names in zip(builder.scene.movers, mover_bodies(builder.scene), strict=True):
+def _add_movers(world: World) -> None:
+    for mover, names in zip(world.scene.movers, mover_bodies(world.scene), strict=True):
         for name, prisms in zip(names, part_solids(mover), strict=True):
-            geoms = ''.join(builder.solids(prisms, name))
-            builder.bodies.append(f'<body name="{name}" mocap="true">{geoms}</body>')
+            geoms = ''.join(world.solids(prisms, name))
+            world.bodies.append(f'<body name="{name}" mocap="true">{geoms}</body>')
 
 
-def _document(builder: WorldBuilder, width: int, height: int) -> str:
-    scene, camera = builder.scene, builder.scene.camera
+def _document(world: World, width: int, height: int) -> str:
+    scene, camera = world.scene, world.scene.camera
     diffuse = 1.1 - scene.lighting.ambient
     # MuJoCo's cameras look along -z with y up: half a turn about x from the optical frame.
     cameras = ''.join(
         f'<camera name="{name}" pos="{x} 0 0" quat="0 1 0 0"/>'
         for name, x in zip(CAMERAS, (0.0, camera.baseline_m), strict=True)
     )
-    return f"""
-<mujoco>
-  <statistic extent="1" center="0 0 1"/>
-  <visual>
-    <global offwidth="{width}" offheight="{height}"/>
-    <map znear="{NEAR_M}" zfar="{FAR_M}" shadowclip="{SHADOW_HALF_M}"/>
-    <quality offsamples="4" shadowsize="{SHADOW_PX if scene.lighting.sun > 0 else 0}"/>
-    <headlight active="0"/>
-  </visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="gradient" rgb1=".75 .75 .75" rgb2=".6 .6 .6"
-             width="64" height="64"/>
-    {''.join(builder.assets)}
-  </asset>
-  <worldbody>
-    <light directional="true" castshadow="false" pos="0 0 2" dir="0.45 0.6 -0.75"
-           ambient="{_grey(scene.lighting.ambient)}" diffuse="{_grey(diffuse)}" specular="0 0 0"/>
-    <light directional="true" castshadow="false" pos="0 0 2" dir="-0.7 -0.35 -0.5"
-           ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
-    <light directional="true" castshadow="false" pos="0 0 1" dir="0 0 1"
-           ambient="0 0 0" diffuse="{_grey(0.8 * diffuse)}" specular="0 0 0"/>
-    {_sun(scene.lighting)}
-    {''.join(builder.bodies)}
-    <body name="{RIG}" mocap="true">{cameras}</body>
-  </worldbody>
-</mujoco>"""
+    template = Path(__file__).with_name('world.xml').read_text()
+    return template.format(
+        width=width,
+        height=height,
+        near_m=NEAR_M,
+        far_m=FAR_M,
+        shadow_half_m=SHADOW_HALF_M,
+        shadow_px=SHADOW_PX if scene.lighting.sun > 0 else 0,
+        assets=''.join(world.assets),
+        ambient=_grey(scene.lighting.ambient),
+        diffuse=_grey(diffuse),
+        fill=_grey(0.8 * diffuse),
+        sun=_sun(scene.lighting),
+        bodies=''.join(world.bodies),
+        rig=RIG,
+        cameras=cameras,
+    )
 
 
 def _sun(lighting: Lighting) -> str:

@@ -11,11 +11,9 @@ from typing import Any
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.settings import suggestion
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.suite.bounds import Bound, Slack
 from segfloor_ros.suite.marked_yaml import Key, MarkedYaml, read_marked_yaml
-from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES
-from segfloor_ros.suite.recordings import find_recordings, is_url
+from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
+from segfloor_ros.suite.result_files import find_recordings, is_url
 
 RUN, REPLAY = 'run', 'replay'
 RECORDING, SCENE, RESULTS = SOURCES = ('input', 'simulate', 'results')
@@ -154,6 +152,8 @@ class _Reader:
         ]
 
     def _simulated(self, shared: dict[str, Any]) -> Entry:
+        from segfloor_ros.simulation.scene_file import open_scene  # see job.py
+
         scene = str(self._own['simulate'])
         if '/' in scene or scene.endswith('.yaml'):
             scene = self._resolved(scene)

@@ -1,18 +1,26 @@
-"""A suite's results on one page, with links to the report of each recording."""
+"""A suite's results on one page, with links to the report of each recording, and as JUnit XML.
+
+The latter keeps to both schemas in use: that of Ant's JUnit task and the looser one of Jenkins's
+xUnit plugin.
+"""
 
 from __future__ import annotations
 
 import base64
+import datetime
 import html
+import socket
 from pathlib import Path
 
 import cv2
 import numpy as np
+from junitparser import Attr, Error, Failure, IntAttr, JUnitXml, Skipped, TestCase, TestSuite
+from junitparser.junitparser import SystemErr, SystemOut
 
-from segfloor_ros.evaluation.report import REPORT_NAME, STYLE
+from segfloor_ros import __version__
+from segfloor_ros.evaluation.report import REPORT_NAME, html_page
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
-from segfloor_ros.suite.bounds import number
-from segfloor_ros.suite.measures import MEASURES
+from segfloor_ros.suite.measures import MEASURES, Bound, number
 from segfloor_ros.suite.verdicts import Checked, SuiteResult
 
 PAGE = 'suite.html'
@@ -29,7 +37,6 @@ img { image-rendering: pixelated; border: 1px solid #e1e6ec; }
 def write_page(result: SuiteResult, folder: Path) -> Path:
     """Write suite.html into the suite's folder, which holds a folder for each recording."""
     kept = sum(checked.holds for checked in result.recordings)
-    title = html.escape(result.name)
     names = ('recording', 'map', '', *COLUMNS)
     head = ''.join(f'<th>{_heading(name)}</th>' for name in names)
     rows = ''.join(_row(checked, folder) for checked in result.recordings)
@@ -40,15 +47,9 @@ def write_page(result: SuiteResult, folder: Path) -> Path:
     )
     complaints = f'<h2>What fails</h2><ul>{failed}</ul>' if failed else ''
     path = folder / PAGE
-    path.write_text(
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{title}</title><style>{STYLE}{MARKS}</style></head><body>'
-        f'<h1>{title}</h1><p class="sub">{kept} of {len(result.recordings)} recordings are as '
-        f'they should be</p>{complaints}<h2>Recordings</h2>'
-        f'<table><tr>{head}</tr>{rows}</table></body></html>\n',
-        encoding='utf-8',
-    )
+    about = f'{kept} of {len(result.recordings)} recordings are as they should be'
+    table = f'<h2>Recordings</h2><table><tr>{head}</tr>{rows}</table>'
+    path.write_text(html_page(result.name, about, complaints + table, MARKS), encoding='utf-8')
     return path
 
 
@@ -58,18 +59,13 @@ def _row(checked: Checked, folder: Path) -> str:
     if (folder / link).is_file():
         name = f'<a href="{html.escape(link)}">{name}</a>'
     failing = {v.bound.measure for v in checked.verdicts if not v.holds}
-    cells = [name, _thumbnail(folder / checked.name / 'map.pgm'), _state(checked)]
+    state = f'<span class="{"ok" if checked.holds else "bad"}">{checked.state}</span>'
+    cells = [name, _thumbnail(folder / checked.name / 'map.pgm'), state]
     for measure in COLUMNS:
         value = checked.measured.get(measure)
         text = '' if value is None else number(value)
         cells.append(f'<span class="bad">{text}</span>' if measure in failing else text)
     return '<tr>' + ''.join(f'<td>{cell}</td>' for cell in cells) + '</tr>'
-
-
-def _state(checked: Checked) -> str:
-    if checked.holds:
-        return '<span class="ok">ok</span>'
-    return f'<span class="bad">{"no map" if checked.problem else "fails"}</span>'
 
 
 def _heading(name: str) -> str:
@@ -92,3 +88,47 @@ def _thumbnail(path: Path) -> str:
     small = cv2.resize(image, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
     data = base64.b64encode(bytes(cv2.imencode('.png', small)[1])).decode()
     return f'<img alt="map" src="data:image/png;base64,{data}">'
+
+
+class _Suite(TestSuite):
+    """A suite among others, as Ant's schema wants it."""
+
+    id = IntAttr()
+    package = Attr()
+
+
+def write_junit(result: SuiteResult, path: Path) -> None:
+    """Write a test case for each recording's map and for each of its bounds."""
+    suite = _Suite(result.name)
+    suite.id, suite.package = 0, 'segfloor'
+    suite.hostname = socket.gethostname()
+    now = datetime.datetime.now(tz=datetime.timezone.utc)
+    suite.timestamp = now.strftime('%Y-%m-%dT%H:%M:%S')
+    suite.add_property('segfloor_ros', __version__)
+    suite.add_testcases([case for c in result.recordings for case in _cases(result.name, c)])
+    complaints = [line for checked in result.recordings for line in checked.complaints]
+    for element, text in ((SystemOut(), ''), (SystemErr(), '\n'.join(complaints))):
+        element.text = text
+        suite.append(element)
+    document = JUnitXml()
+    document.append(suite)
+    document.write(str(path), pretty=True)
+
+
+def _cases(suite: str, checked: Checked) -> list[TestCase]:
+    mapped = TestCase('map', f'{suite}.{checked.name}', round(checked.seconds, 3))
+    if checked.problem:
+        mapped.result = [Error(checked.problem, 'no map')]
+    cases = [mapped]
+    for verdict in checked.verdicts:
+        case = TestCase(_case_name(verdict.bound), f'{suite}.{checked.name}', 0.0)
+        if checked.problem:
+            case.result = [Skipped('there is no map')]
+        elif not verdict.holds:
+            case.result = [Failure(str(verdict), 'bound')]
+        cases.append(case)
+    return cases
+
+
+def _case_name(bound: Bound) -> str:
+    return f'{bound.measure} against the baseline' if bound.origin else bound.measure

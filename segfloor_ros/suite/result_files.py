@@ -1,7 +1,11 @@
-"""Results folders, packed to be sent, and kept by what they were made from."""
+"""Results folders, packed to be sent, and kept by what they were made from; recordings by path,
+pattern or URL: found, copied to this machine, and told apart by content.
+"""
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import io
 import json
 import os
@@ -9,9 +13,16 @@ import shutil
 import tarfile
 import tempfile
 from pathlib import Path
+from typing import Any
+
+from segfloor_ros.errors import InputError
 
 MEASURED = 'measured.json'
 ARCHIVE = 'results.tar'
+
+CHUNK = 1 << 20
+
+WILDCARDS = '*?['
 
 
 def pack(folder: Path) -> bytes:
@@ -63,3 +74,91 @@ class Cache:
             os.rename(staging, self._folder / key)
         except OSError:
             shutil.rmtree(staging, ignore_errors=True)
+
+
+def is_url(text: str) -> bool:
+    """Whether a recording is named by a URL (`s3://`, `gs://`, `https://`, `file://`)."""
+    return '://' in text
+
+
+def find_recordings(pattern: str) -> dict[str, str]:
+    """Return paths or URLs by short name: the one given, or all that a pattern matches. Raises
+    InputError where there is none.
+    """
+    if not any(c in pattern for c in WILDCARDS):
+        if not is_url(pattern) and not Path(pattern).exists():
+            raise InputError(f'{pattern}: no such recording')
+        return {_stem(pattern): pattern}
+    if is_url(pattern):
+        system, path = _open_system(pattern)
+        found = sorted(system.unstrip_protocol(match) for match in system.glob(path))
+    else:
+        found = sorted(glob.glob(pattern))
+    if not found:
+        raise InputError(f'{pattern}: matches no recording')
+    return {_stem(path): path for path in found}
+
+
+def local_copy(path_or_url: str, folder: Path) -> Path:
+    """Return a path as it is, or that of a copy of what a URL names, made in `folder` unless it is
+    there. Raises InputError.
+    """
+    if not is_url(path_or_url):
+        return Path(path_or_url)
+    system, path = _open_system(path_or_url)
+    try:
+        # Size, time and tag tell whether what the URL names has changed.
+        facts = repr(sorted((k, str(v)) for k, v in system.info(path).items()))
+        target = folder / hashlib.sha256((path_or_url + facts).encode()).hexdigest()[:16]
+        copy = target / path.rstrip('/').rpartition('/')[2]
+        if not target.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            staging = Path(tempfile.mkdtemp(dir=folder, prefix='.copy-'))
+            system.get(path.rstrip('/'), str(staging / copy.name), recursive=True)
+            _move(staging, target)
+    except (OSError, ValueError, ImportError) as error:
+        raise InputError(f'{path_or_url}: cannot be read ({error})') from None
+    return copy
+
+
+def digest_of(path: Path) -> str:
+    """Return a hash of what a file or all files of a folder hold, names included; modules that
+    Python has compiled differ from machine to machine and do not count.
+    """
+    result = hashlib.blake2b(digest_size=16)
+    files = sorted(path.rglob('*')) if path.is_dir() else [path]
+    for file in files:
+        if not file.is_file() or file.parent.name == '__pycache__':
+            continue
+        result.update(f'{file.relative_to(path)}\0{file.stat().st_size}\0'.encode())
+        with file.open('rb') as opened:
+            while chunk := opened.read(CHUNK):
+                result.update(chunk)
+    return result.hexdigest()
+
+
+def _open_system(url: str) -> tuple[Any, str]:
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError:
+        raise InputError(
+            f"{url}: URLs need fsspec; install the extra: pip install 'segfloor_ros[cluster]'"
+        ) from None
+    try:
+        return url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise InputError(f'{url}: {error}') from None
+
+
+def _move(staging: Path, target: Path) -> None:
+    """Move a folder to its place, unless another process has been faster."""
+    try:
+        staging.rename(target)
+    except OSError:
+        shutil.rmtree(staging, ignore_errors=True)
+        if not target.is_dir():
+            raise
+
+
+def _stem(path: str) -> str:
+    return Path(path.rstrip('/').rpartition('/')[2]).stem

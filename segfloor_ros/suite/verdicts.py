@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.suite.bounds import Verdict, bounds_of_baseline, judge
+from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
+from segfloor_ros.suite.measures import Verdict, bounds_of_baseline, judge
 
 FORMAT = 1
 Baseline = Mapping[str, Mapping[str, float]]
@@ -18,20 +18,20 @@ Baseline = Mapping[str, Mapping[str, float]]
 
 
 @dataclass(frozen=True)
-class Checked:
-    """A recording, its measures, and what they say to its bounds. problem: why there is no map."""
+class Checked(Outcome):
+    """What came of a recording, and what its measures say to its bounds."""
 
-    name: str
-    measured: Mapping[str, float]
-    verdicts: list[Verdict]
-    problem: str
-    seconds: float
-    reused: bool
+    verdicts: tuple[Verdict, ...] = ()
 
     @property
     def holds(self) -> bool:
         """Whether there is a map and every bound is kept."""
         return not self.problem and all(verdict.holds for verdict in self.verdicts)
+
+    @property
+    def state(self) -> str:
+        """How it went, in words."""
+        return 'ok' if self.holds else 'no map' if self.problem else 'fails'
 
     @property
     def complaints(self) -> list[str]:
@@ -59,25 +59,18 @@ def check(entry: Entry, outcome: Outcome, baseline: Baseline | None) -> Checked:
     bounds = list(entry.bounds)
     if baseline is not None:
         bounds += bounds_of_baseline(baseline.get(entry.name, {}), entry.slacks)
-    return Checked(
-        entry.name,
-        outcome.measured,
-        judge(bounds, outcome.measured),
-        outcome.problem,
-        outcome.seconds,
-        outcome.reused,
-    )
+    # The archive is in the suite's folder by now.
+    known = {**vars(outcome), 'archive': b''}
+    return Checked(**known, verdicts=tuple(judge(bounds, outcome.measured)))
 
 
 def write_baseline(result: SuiteResult, path: Path) -> None:
     """Write the measures of all recordings that have a map."""
     measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
     document = {'version': FORMAT, 'recordings': measures}
-    try:
+    with os_errors(f'{path}: cannot be written'):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(document, indent=2) + '\n')
-    except OSError as error:
-        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
 
 
 def read_baseline(path: Path) -> Baseline:

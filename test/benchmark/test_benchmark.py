@@ -10,12 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from segfloor_ros.benchmark.chain import MeasuredStages
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, floor_mask
-from segfloor_ros.benchmark.corridor_images import CorridorImages
-from segfloor_ros.benchmark.figures import UpdateTimes
-from segfloor_ros.benchmark.processes import run_apart
-from segfloor_ros.benchmark.stages import BenchmarkPlan, measure_map
+from segfloor_ros.benchmark.chain import MeasuredStages, UpdateTimes
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, CorridorImages, floor_mask
+from segfloor_ros.benchmark.stages import BenchmarkPlan, measure_map, run_apart
 from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError

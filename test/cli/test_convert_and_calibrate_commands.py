@@ -2,8 +2,8 @@
 
 import numpy as np
 from chessboards import BOARD, K_TRUE, SQUARE_M, write_boards
+from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
-from test_run_command import segfloor
 
 from segfloor_ros.camera.calibration_files import read_calibration
 from segfloor_ros.camera.settings import StereoCameraSettings

@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from segfloor_ros.cli.replay_graph import DOMAINS, free_domain
+from segfloor_ros.cli.replay_nodes import DOMAINS, free_domain
 
 SAME_PID = 7
 ASK = """
 import os
 os.getpid = lambda: 7
-from segfloor_ros.cli.replay_graph import free_domain
+from segfloor_ros.cli.replay_nodes import free_domain
 print(free_domain())
 """
 

@@ -1,51 +1,21 @@
 """`segfloor run` for real: a small recording to a results folder, and every kind of bad input."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from command_line import segfloor, segfloor_process
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.cli.main import main
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 FRAMES = 16
-
-
-def segfloor(*arguments):
-    """Run the command line in a process of its own."""
-    environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parents[2])}
-    return subprocess.run(
-        [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=120,
-    )
-
-
-@pytest.fixture
-def segfloor_here(monkeypatch, capsys):
-    """Run the command line in this process, for what ends before any work."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, 'argv', ['segfloor', *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return SimpleNamespace(returncode=ended.value.code, stderr=capsys.readouterr().err)
-
-    return run
 
 
 def with_mount():
@@ -66,7 +36,7 @@ def recording(tmp_path_factory):
 @pytest.fixture(scope='module')
 def result(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp('result') / 'out'
-    done = segfloor(
+    done = segfloor_process(
         'run', recording, '--out', out, '--save-masks', 'all', '--save-debug', *with_mount()
     )
     assert done.returncode == 0, done.stderr
@@ -149,7 +119,7 @@ def test_masks_show_floor_low_and_none_above_the_horizon(result):
 
 
 def test_a_second_run_gives_the_same_bytes(recording, result, tmp_path):
-    again = segfloor(
+    again = segfloor_process(
         'run', recording, '--out', tmp_path / 'out', '--save-masks', 'none', *with_mount()
     )
     assert again.returncode == 0, again.stderr
@@ -179,7 +149,7 @@ def test_a_truncated_image_is_skipped_and_counted(recording, tmp_path):
     shutil.copytree(recording, spoiled)
     image = spoiled / 'image_1' / '000003.png'
     image.write_bytes(image.read_bytes()[:200])
-    done = segfloor('run', spoiled, '--out', tmp_path / 'out', *with_mount())
+    done = segfloor_process('run', spoiled, '--out', tmp_path / 'out', *with_mount())
     assert done.returncode == 0, done.stderr
     assert '000003.png' in done.stderr
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
@@ -249,11 +219,11 @@ def backwards_stamps(folder):
         backwards_stamps,
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(segfloor_here, recording, tmp_path, spoil):
+def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, spoil):
     folder = tmp_path / 'drive'
     shutil.copytree(recording, folder)
     given, words = spoil(folder)
-    done = segfloor_here('run', given, '--out', tmp_path / 'out')
+    done = segfloor('run', given, '--out', tmp_path / 'out')
     assert done.returncode == 2
     assert words in done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith('segfloor')]) == 1
@@ -262,7 +232,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(segfloor_here, recording, tmp_
 
 
 def test_bad_input_ends_the_program_with_status_2(tmp_path):
-    done = segfloor('run', tmp_path / 'nowhere', '--out', tmp_path / 'out')
+    done = segfloor_process('run', tmp_path / 'nowhere', '--out', tmp_path / 'out')
     assert done.returncode == 2
     assert done.stderr.startswith('segfloor: ')
     assert done.stderr.count('\n') == 1
@@ -277,8 +247,8 @@ def test_bad_input_ends_the_program_with_status_2(tmp_path):
         (['--masks', 'nowhere'], 'nowhere: no such folder'),
     ],
 )
-def test_bad_settings_are_one_line(segfloor_here, recording, tmp_path, arguments, words):
-    done = segfloor_here('run', recording, '--out', tmp_path / 'out', *arguments)
+def test_bad_settings_are_one_line(recording, tmp_path, arguments, words):
+    done = segfloor('run', recording, '--out', tmp_path / 'out', *arguments)
     assert done.returncode == 2
     assert words in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -332,12 +302,10 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
         (('--load-map', 'short.map', '--localize', '--save-map', 'x'), 'leave --save-map out'),
     ],
 )
-def test_a_map_that_cannot_be_used_is_one_line(
-    segfloor_here, monkeypatch, recording, tmp_path, options, words
-):
+def test_a_map_that_cannot_be_used_is_one_line(monkeypatch, recording, tmp_path, options, words):
     (tmp_path / 'short.map').write_bytes(b'PK\x03\x04 not much')
     monkeypatch.chdir(tmp_path)
-    done = segfloor_here('run', recording, '--out', tmp_path / 'out', *options)
+    done = segfloor('run', recording, '--out', tmp_path / 'out', *options)
     assert done.returncode == 2
     assert words in ' '.join(done.stderr.split())
     assert not (tmp_path / 'out').exists()

@@ -6,14 +6,17 @@ import pytest
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.alignment import find_alignment
-from segfloor_ros.evaluation.map_score import compare, opened, score_cells, score_map
-from segfloor_ros.evaluation.overlay import (
+from segfloor_ros.evaluation.map_score import (
     AGREE_FREE,
     AGREE_OCCUPIED,
     FALSE_FREE,
     MISSED_FLOOR,
+    compare,
     draw_overlay,
+    opened,
     save_overlay,
+    score_cells,
+    score_map,
 )
 from segfloor_ros.evaluation.prm import (
     RoadMapPlan,

@@ -5,9 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.evaluation.trajectory import (
+    match_files,
+    plane_axes,
+    save_trajectory_plot,
+    score_trajectory,
+)
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.evaluation.trajectory_plot import plane_axes, save_trajectory_plot
 from segfloor_ros.geometry import se3_exp
 
 

@@ -6,8 +6,16 @@ import pytest
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.simulation.drive import plan_drive
-from segfloor_ros.simulation.imaging import brightness, develop, plan_imaging, undistort
-from segfloor_ros.simulation.rig import RigMotion, raw_cameras, rectified_camera, shake
+from segfloor_ros.simulation.rig import (
+    RigMotion,
+    brightness,
+    develop,
+    plan_imaging,
+    raw_cameras,
+    rectified_camera,
+    shake,
+    undistort,
+)
 from segfloor_ros.simulation.scene import CameraRig, Lighting, Route, Scene, Slope, Vibration
 from segfloor_ros.simulation.solids import floors
 

@@ -228,7 +228,7 @@ def test_without_a_gl_library_one_line_names_the_package(tmp_path):
     program = (
         'import sys\n'
         'from segfloor_ros.errors import SegfloorError\n'
-        'from segfloor_ros.simulation.any_scene import open_scene\n'
+        'from segfloor_ros.simulation.scene_file import open_scene\n'
         'from segfloor_ros.simulation.simulation import Simulation\n'
         'try: Simulation(open_scene("corridor2"))\n'
         'except SegfloorError as error: print(error)\n'

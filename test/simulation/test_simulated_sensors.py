@@ -70,6 +70,16 @@ def test_an_accelerometer_feels_the_floor_push_upwards_and_the_robot_speed_up():
     assert readings.accel_m_s2[speeding_up, 2].mean() == pytest.approx(0.3, abs=0.05)
 
 
+def test_an_imu_ahead_of_the_camera_feels_its_circle():
+    imus = [replace(EXACT_IMU, place_m=place) for place in ((0.0, 0.0, 0.0), (0.0, 0.0, 0.3))]
+    at_camera, ahead = (imu_readings(*motion_of(CORNER, imu=imu)) for imu in imus)
+    rate = at_camera.gyro_rad_s[:, 1]
+    turning = np.abs(rate) > 0.3
+    felt = (ahead.accel_m_s2 - at_camera.accel_m_s2)[turning, 2]
+    np.testing.assert_allclose(felt, -0.3 * rate[turning] ** 2, atol=0.01)
+    np.testing.assert_allclose(ahead.T_left_imu[:3, 3], [0.0, 0.0, 0.3])
+
+
 def test_noise_and_bias_have_the_declared_size():
     scene, motion = motion_of(STRAIGHT, imu=replace(EXACT_IMU, gyro_bias_deg_s=0.5))
     gyro = imu_readings(scene, motion).gyro_rad_s

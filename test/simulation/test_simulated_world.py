@@ -8,16 +8,19 @@ import pytest
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import load_map, save_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.floor_plan import merged_rectangles
-from segfloor_ros.simulation.mesh import caps, merge, sides
+from segfloor_ros.simulation.floor_plan import CLEARANCE_M, merged_rectangles, plan_tour
 from segfloor_ros.simulation.movers import is_moving, part_poses
 from segfloor_ros.simulation.scene import Person, Scene
-from segfloor_ros.simulation.scene_file import load_scene, scene_from_mapping, shipped_scenes
+from segfloor_ros.simulation.scene_file import (
+    open_scene,
+    read_scene_values,
+    scene_from_mapping,
+    shipped_scenes,
+)
 from segfloor_ros.simulation.solids import block, cylinder, floors, obstacles
 from segfloor_ros.simulation.textures import GENERATORS, make_texture
-from segfloor_ros.simulation.tour import CLEARANCE_M, plan_tour
 from segfloor_ros.simulation.truth_map import floor_height_m, true_map
+from segfloor_ros.simulation.world import caps, merge, sides
 
 PATH = {'waypoints': [[0.5, 0.5], [1.5, 0.5]]}
 ROOM = [[0, 0], [4, 0], [4, 3], [0, 3]]
@@ -68,13 +71,13 @@ def test_scene_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match='no such scene'):
         open_scene('corridor_1')
     with pytest.raises(InputError, match=r'none\.yaml: cannot be read'):
-        load_scene(tmp_path / 'none.yaml')
+        read_scene_values(tmp_path / 'none.yaml')
     (tmp_path / 'bad.yaml').write_text('walls: [\n')
     with pytest.raises(InputError, match=r'bad\.yaml, line 2'):
-        load_scene(tmp_path / 'bad.yaml')
+        read_scene_values(tmp_path / 'bad.yaml')
     (tmp_path / 'bad.yaml').write_text('like: halls\n')
     with pytest.raises(InputError, match='did you mean hall'):
-        load_scene(tmp_path / 'bad.yaml')
+        read_scene_values(tmp_path / 'bad.yaml')
 
 
 def test_a_scene_takes_over_what_it_does_not_say(tmp_path):

@@ -21,7 +21,7 @@ from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.suite.description import RESULTS, Entry
 from segfloor_ros.suite.job import Job, do_job
-from segfloor_ros.suite.recordings import digest_of
+from segfloor_ros.suite.result_files import digest_of
 
 SAME = ('map.pgm', 'map.yaml', 'trajectory.txt', 'labelled_cloud.ply', 'floor_masks')
 SUITE = """

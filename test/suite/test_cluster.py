@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from segfloor_ros.suite.recordings import digest_of
+from segfloor_ros.suite.result_files import digest_of
 
 distributed = pytest.importorskip('distributed')
 

@@ -7,8 +7,8 @@ import re
 import pytest
 
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.suite.bounds import Bound, Slack
 from segfloor_ros.suite.description import SCENE, read_suite
+from segfloor_ros.suite.measures import Bound, Slack
 
 
 def write(folder, text):

@@ -8,8 +8,14 @@ import tarfile
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.suite.recordings import digest_of, find_recordings, local_copy
-from segfloor_ros.suite.result_files import Cache, pack, unpack
+from segfloor_ros.suite.result_files import (
+    Cache,
+    digest_of,
+    find_recordings,
+    local_copy,
+    pack,
+    unpack,
+)
 
 
 def test_a_url_is_copied_once_and_again_when_it_changed(tmp_path):
@@ -48,6 +54,7 @@ def test_a_digest_follows_names_and_content_and_not_the_place(tmp_path):
     digest = folder('one', a='1', b='2')
     assert folder('two', a='1', b='2') == digest
     assert len({digest, folder('three', a='1', b='3'), folder('four', a='1', c='2')}) == 3
+    assert folder('five', a='1', b='2', **{'__pycache__/m.pyc': '5'}) == digest
 
 
 def test_results_survive_packing_and_the_cache(tmp_path):

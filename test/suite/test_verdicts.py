@@ -9,12 +9,17 @@ from junitparser import JUnitXml
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.suite.bounds import Bound, Slack, bounds_of_baseline, judge
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
-from segfloor_ros.suite.junit import write_junit
-from segfloor_ros.suite.measures import agreement, measure_run
-from segfloor_ros.suite.page import write_page
+from segfloor_ros.suite.measures import (
+    Bound,
+    Slack,
+    agreement,
+    bounds_of_baseline,
+    judge,
+    measure_run,
+)
+from segfloor_ros.suite.page import write_junit, write_page
 from segfloor_ros.suite.verdicts import SuiteResult, check, read_baseline, write_baseline
 
 GOOD = {'tracked_percent': 100.0, 'path_error_m': 0.012, 'recall_percent': 93.0}

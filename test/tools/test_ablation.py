@@ -9,7 +9,7 @@ from stereo_room import MOUNT
 from typer.testing import CliRunner
 
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.configuration import Configuration
+from segfloor_ros.configuration import resolve
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert
 from tools.ablation import app, drawn
@@ -23,7 +23,7 @@ ALL = {**SLAM, **FLOOR_MECHANISMS, **GRID, **RECORDED}
 @pytest.mark.parametrize('name', sorted(ALL))
 def test_what_is_left_out_is_part_of_the_package(name) -> None:
     with ALL[name].left_out():
-        changed = ALL[name].configured(Configuration())
+        changed = ALL[name].configured(resolve())
     for setting, value in ALL[name].settings.items():
         assert getattr(changed.stereo_slam, setting) == value
     assert bool(ALL[name].patches or ALL[name].settings) is (name != 'nothing')

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from segfloor_ros.configuration import Configuration
+from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
 from segfloor_ros.floor.settings import FloorSegmentationSettings
@@ -46,7 +46,7 @@ def shifted_pair(name: str = 'shifted') -> TruePair:
 
 def test_shares_of_the_steps_add_up():
     camera, keyframes = generated_keyframes(5, seed=0)
-    times = time_steps('generated', camera, keyframes, Configuration(), threads=1)
+    times = time_steps('generated', camera, keyframes, resolve(), threads=1)
     assert times.keyframes == 3
     shares = {name: step['share'] for name, step in times.steps.items()}
     assert shares[WHOLE] == 1.0
@@ -62,7 +62,7 @@ def test_shares_of_the_steps_add_up():
 def test_too_few_keyframes_are_refused():
     camera, keyframes = generated_keyframes(2, seed=0)
     with pytest.raises(MapError, match='2 keyframes'):
-        time_steps('short', camera, keyframes, Configuration(), threads=1)
+        time_steps('short', camera, keyframes, resolve(), threads=1)
 
 
 def test_pixels_that_the_right_camera_does_not_see():

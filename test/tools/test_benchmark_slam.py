@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import Configuration
+from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import invert
@@ -45,7 +45,7 @@ def drive(tmp_path_factory) -> Path:
 
 def test_a_drive_is_scored_against_its_true_path(drive) -> None:
     told: list[int] = []
-    result = measure_drive('room', drive, Configuration(), told.append)
+    result = measure_drive('room', drive, resolve(), told.append)
     assert told == list(range(1, FRAMES + 1))
     assert (result.score.frames, result.score.tracked) == (FRAMES, 1.0)
     assert result.score.ate_rmse_m < 0.01 < result.score.path_length_m
@@ -61,7 +61,7 @@ def test_a_drive_is_scored_against_its_true_path(drive) -> None:
 
 def test_a_recording_without_its_true_path_is_refused(drive, tmp_path) -> None:
     with pytest.raises(InputError, match=r'poses\.txt'):
-        measure_drive('room', tmp_path, Configuration(), lambda done: None)
+        measure_drive('room', tmp_path, resolve(), lambda done: None)
     result = CliRunner().invoke(app, ['corridr1'])
     assert isinstance(result.exception, InputError)
     assert 'corridor1' in str(result.exception)
@@ -94,7 +94,7 @@ def test_a_soak_goes_to_and_fro_and_its_map_does_not_grow(drive, tmp_path) -> No
     path = write_endless_drive(source, tmp_path / 'drive', duration_s=48.0, rate_hz=2.0)
     endless = open_source(StereoCameraSettings(input=str(path)))
     _, truth = read_trajectory(drive / 'poses.txt')
-    pipeline = Pipeline(endless.camera, Configuration())
+    pipeline = Pipeline(endless.camera, resolve())
     parts = Soak(pipeline, endless, truth).run(lambda done: None)
     assert [part.frames for part in parts] == list(range(12, 97, 12))
     assert parts[-1].tracked == 96

@@ -8,9 +8,9 @@ import pytest
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.simulation.any_scene import open_scene
+from segfloor_ros.configuration import resolve
 from segfloor_ros.simulation.renderer import RenderingError
+from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.simulation import FrameTruth
 from tools.floor_masks import (
     SCENES,
@@ -77,7 +77,7 @@ def test_a_low_box_is_not_floor(tmp_path):
     assert len(list((recording / 'floor').iterdir())) == started[0][1]
     truth = read_truth(recording, 0, open_source(StereoCameraSettings(input=str(recording))).camera)
     assert truth.depth_m[truth.floor > 0].max() < truth.depth_m.max()
-    score = score_recording('low_box', recording, mount_of(scene), Configuration())
+    score = score_recording('low_box', recording, mount_of(scene), resolve())
     assert score.precision > 0.99
     assert score.recall > 0.97
     assert score.low_called_floor < 0.08
