@@ -203,7 +203,7 @@ def segment(file: Path, configuration: Configuration, every: int) -> list[Seen]:
     seen = []
     for index, (mount, key) in enumerate(keyframes):
         if index % every == 0:
-            found = floor.process(key.left, key.right, mount, key.T_map_base)
+            found = floor.process(key.left, key.right, mount, key.T_map_base, key.moving)
             empty = np.zeros((0, 0), np.uint8)
             bare = dataclasses.replace(key, left=empty, right=empty)
             seen.append(Seen(bare, found.mask, found.scan))

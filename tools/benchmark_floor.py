@@ -13,8 +13,8 @@ import cv2
 import typer
 from rich.table import Table
 
+from segfloor_ros.cli import options
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.options import ParamsOption, SetOption
 from segfloor_ros.cli.output import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
 from tools.disparity_choices import (
@@ -62,8 +62,8 @@ def benchmark_floor(
         Optional[Path],  # noqa: UP045
         typer.Option(help='Keep renderings here; what is there is used again.'),
     ] = None,
-    params: ParamsOption = None,
-    assignments: SetOption = None,
+    params: options.Params = None,
+    assignments: options.Set = None,
 ) -> None:
     """Time each step of floor segmentation; with --middlebury, score the disparity; with
     --simulated, score the masks.

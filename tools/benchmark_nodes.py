@@ -13,9 +13,9 @@ import typer
 from rich.table import Table
 
 from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli import options
 from segfloor_ros.cli.benchmark import print_node_figures
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.options import InputArgument, ParamsOption, SetOption
 from segfloor_ros.cli.output import console
 from segfloor_ros.configuration import resolve
 from tools.endless_drive import write_endless_drive
@@ -23,7 +23,7 @@ from tools.idle_nodes import longest_s, measure_idle
 
 
 def benchmark_nodes(
-    input: InputArgument,
+    input: options.Input,
     rate: Annotated[float, typer.Option(min=0.01, help='Speed against real time.')] = 1.0,
     soak_minutes: Annotated[
         float,
@@ -41,8 +41,8 @@ def benchmark_nodes(
             'stands, and while nobody listens to what they make; 0: drive.',
         ),
     ] = 0.0,
-    params: ParamsOption = None,
-    assignments: SetOption = None,
+    params: options.Params = None,
+    assignments: options.Set = None,
 ) -> None:
     """Measure the nodes on a recording: image to map, CPU and memory of each, what is lost."""
     configuration = resolve(params, assignments or (), stereo_camera={'input': input})

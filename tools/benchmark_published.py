@@ -16,27 +16,23 @@ import typer
 from rich.table import Table
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark.chain import MeasuredStages
-from segfloor_ros.benchmark.figures import Workload
-from segfloor_ros.benchmark.processes import Progress, run_apart
-from segfloor_ros.benchmark.stages import JSON_VERSION, machine
-from segfloor_ros.cli.benchmark import write_json
-from segfloor_ros.cli.benchmark_tables import stage_table, workload_table
+from segfloor_ros.benchmark.chain import MeasuredStages, Workload
+from segfloor_ros.benchmark.stages import JSON_VERSION, Progress, machine, run_apart
+from segfloor_ros.cli import options
+from segfloor_ros.cli.benchmark import stage_table, workload_table, write_json
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.options import ParamsOption, SetOption
 from segfloor_ros.cli.output import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.map_score import MapScore, compare, score_map
-from segfloor_ros.evaluation.overlay import save_overlay
+from segfloor_ros.evaluation.map_score import MapScore, compare, save_overlay, score_map
 from segfloor_ros.evaluation.prm import RoadMapPlan, RoadMapScore
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.render_once import render_once
+from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.scene_file import open_scene
 from tools.driving import drive, open_recording
 from tools.published_figures import (
     PUBLISHED,
@@ -179,8 +175,8 @@ def benchmark_published(
         Optional[Path],  # noqa: UP045
         typer.Option('--json', help='Write all figures to this file.'),
     ] = None,
-    params: ParamsOption = None,
-    assignments: SetOption = None,
+    params: options.Params = None,
+    assignments: options.Set = None,
 ) -> None:
     """Simulate, map and score the scenes of the published evaluation."""
     configuration, names = resolve(params, assignments or ()), parse_scenes(scenes)

@@ -12,8 +12,8 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from segfloor_ros.cli import options
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.options import ParamsOption, SetOption
 from segfloor_ros.cli.output import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
@@ -49,8 +49,8 @@ def benchmark_slam(
     rate: Annotated[
         float, typer.Option(min=0.0, help='Frames a second of a soak. [default: as recorded]')
     ] = 0.0,
-    params: ParamsOption = None,
-    assignments: SetOption = None,
+    params: options.Params = None,
+    assignments: options.Set = None,
 ) -> None:
     """Track drives whose path is known: error of the path, time per frame and keyframe."""
     configuration = resolve(params, assignments or ())

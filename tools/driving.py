@@ -15,8 +15,8 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.render_once import render_once
+from segfloor_ros.simulation.drive_files import render_once
+from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult
 
 

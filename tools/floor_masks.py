@@ -17,10 +17,9 @@ from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOptions
-from segfloor_ros.simulation.render_once import render_once
+from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOptions, render_once
 from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.simulation import FrameTruth
 from tools.driving import open_recording
 

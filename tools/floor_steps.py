@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT
-from segfloor_ros.benchmark.corridor_images import STEP_M, CorridorImages
+from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, STEP_M, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration

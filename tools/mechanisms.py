@@ -12,6 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.configuration import Configuration
+from segfloor_ros.floor.contact import fill_to_contact
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
@@ -55,6 +56,12 @@ def _nowhere(like: Any, *_: object) -> Any:
     return np.zeros(like.shape, np.bool_)
 
 
+def _with_any_contact(
+    view: Any, mask: Any, alike: Any, disparity: Any, compared: Any, textured: Any
+) -> Any:
+    return fill_to_contact(view, mask, alike, disparity, compared, np.ones_like(textured))
+
+
 SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
     'deblocking': Mechanism({'camera.rectification.deblocked': _first}),
@@ -69,9 +76,14 @@ SLAM: dict[str, Mechanism] = {
     'known views': Mechanism({'slam.places.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.retire_redundant': _none}),
     'loops': Mechanism({'slam.back_end.BackEnd._close_loop': lambda *_: False}),
+    'relocalisation by two frames': Mechanism(
+        {'slam.relocalisation.FRAMES_IN_A_ROW': 1, 'slam.relocalisation.MIN_AGREEMENT': 0.0}
+    ),
+    'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions told apart': Mechanism(
         {'slam.consensus._differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
     ),
+    'motion so far': Mechanism({'slam.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
     'scene flow': Mechanism({'slam.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'slam.sparse_map.GONE_AFTER': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
@@ -83,10 +95,12 @@ FLOOR: dict[str, Mechanism] = {
     'memory': Mechanism(
         {'floor.remembered_floor.FloorMemory.fill': lambda self, view, mask, *_: mask}
     ),
-    'slope ahead': Mechanism({'floor.segmentation.FloorSegmentation._slope': _none}),
+    'slope ahead': Mechanism({'floor.frame_plane._slope_ahead': _none}),
+    'a slope needs texture': Mechanism({'floor.frame_plane._TEXTURED_SHARE': 0.0}),
+    'a bend needs a measurement': Mechanism({'floor.profile._LINE_ITERATIONS': -1}),
     'level expectation': Mechanism(
         {
-            'floor.segmentation.FloorSegmentation._expectations': lambda self, mount, _: np.array(
+            'floor.segmentation.expectations': lambda mount, _: np.array(
                 [[mount.pitch_rad, mount.roll_rad, mount.height_m]]
             )
         }
@@ -95,6 +109,14 @@ FLOOR: dict[str, Mechanism] = {
     'floor up to contacts': Mechanism(
         {'floor.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
     ),
+    'contacts with what has texture alone': Mechanism(
+        {'floor.filling.fill_to_contact': _with_any_contact}
+    ),
+    'feet of blank faces': Mechanism(
+        {'floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
+    ),
+    'narrow gaps closed': Mechanism({'floor.scan._NARROW_M': 0.0}),
+    'noise stands nowhere': Mechanism({'floor.segmentation._LEAST_SHARE': 0.0}),
     'boards count twice': Mechanism({'floor.segmentation._BOARD': 1}),
     'filling of regions': Mechanism(
         {'floor.segmentation.fill_regions': lambda view, mask, *_: mask}
@@ -111,6 +133,9 @@ FLOOR: dict[str, Mechanism] = {
     'what hangs at the height of the robot': Mechanism(
         {'floor.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
     ),
+    'boards known by their ends': Mechanism(
+        {'floor.overhead._with_boards': lambda disparity, known, telling: telling}
+    ),
 }
 """What makes the masks and the floor scan."""
 
@@ -118,8 +143,16 @@ GRID: dict[str, Mechanism] = {
     'ray limit Q3 + 1.5 IQR': Mechanism({'grid.keyframe_evidence.ray_length_limit': lambda _: 1e9}),
     'rays shortened': Mechanism({'grid.keyframe_evidence._certain': _first}),
     'partly free edges': Mechanism({'grid.fan.Fan.edges': lambda self: _nowhere(self.lengths)}),
+    'evidence ends where it is sure': Mechanism({'grid.fold.MOST': 2.8}),
     'dilation of hits': Mechanism({'grid.fold._AROUND': np.ones((1, 1), np.uint8)}),
     'slant': Mechanism({'grid.keyframe_evidence.slant': lambda range_m, _: np.ones(len(range_m))}),
+    'nothing free right behind faces': Mechanism(
+        {
+            'grid.fold.EvidenceFolder._draw_behind': lambda self, shape, placed: np.zeros(
+                shape, np.uint8
+            )
+        }
+    ),
     'shadows of what stands': Mechanism({'grid.fan.Fan.shadow': _none}),
 }
 """What makes the map of masks, scans and points."""

@@ -75,12 +75,52 @@ def make_ahead(seed: int, people: int) -> Scene:
     return scene | {'people': walks, 'description': f'{people} people walk ahead, {seed}.'}
 
 
+def make_over(seed: int, people: int) -> Scene:
+    """Return two rooms; people step over the robot while it turns into the second, which it has
+    not seen. It comes back to the first.
+    """
+    rng = np.random.default_rng(2000 + seed)
+    x, depth, half = rng.uniform(3.0, 3.6), rng.uniform(4.2, 5.0), rng.uniform(2.3, 2.8)
+    door, y = rng.uniform(-0.4, 0.4), -rng.uniform(0.9, 1.2)
+    way = [[-x + 0.9, y], [door, y], [door, 2.2], [door + 1.2, depth - 1.3], [door, depth - 0.8]]
+    way += [[door - 1.2, depth - 1.3], [door, 2.0], [door, 0.1], [-x + 1.3, -0.2]]
+    scene = _scene(rng, seed, _rounded([*way, [-x + 1.0, y], [1.0, y]]))
+    outlines = [
+        [[-x, 1.0], [-x, -2.2], [x, -2.2], [x, 1.0]],
+        [[-half, 1.0], [-half, depth + 0.6], [half, depth + 0.6], [half, 1.0]],
+        [[-x, 1.0], [door - 0.6, 1.0]],
+        [[door + 0.6, 1.0], [x, 1.0]],
+    ]
+    look = {'texture': str(rng.choice(WALLS)), 'posters': int(rng.integers(3, 6))}
+    scene['walls'] = [{'points': _rounded(points)} | look for points in outlines]
+    scene['boxes'] = [
+        {'at': _rounded(at), 'size': _rounded(rng.uniform((0.5, 0.3, 0.4), (1.0, 0.5, 1.6)))}
+        | {'texture': str(rng.choice(('books', 'goods', 'wood', 'granite')))}
+        for at in ([x - 0.5, -0.2], [x - 0.6, -1.8], [half - 0.5, depth], [-half + 0.6, depth])
+    ]
+    drive = _drive(scene)
+    first = drive.xy_yaw[: len(drive.times_s) // 3, :2]
+    turns_s = drive.times_s[np.hypot(*(first - (door, y)).T).argmin()]
+    scene['furniture'] = []
+    walks = [_over(drive, rng, float(turns_s) + 1.0 * k) for k in range(people)]
+    return scene | {'people': walks, 'description': f'{people} people step over the robot, {seed}.'}
+
+
+def _over(drive: Drive, rng: np.random.Generator, meeting_s: float) -> Scene:
+    """Return someone who walks slowly towards a robot and over it."""
+    x, y, yaw = drive.at(np.array([meeting_s]))[0]
+    ahead = np.array([np.cos(yaw), np.sin(yaw)])
+    walk = _person(rng, _rounded([(x, y) + 1.2 * ahead, (x, y) - 1.0 * ahead]), 0.35, 0.0)
+    return walk | {'start_s': round(max(0.0, meeting_s - 1.0 / 0.35), 1), 'returns': False}
+
+
 KINDS: dict[str, Callable[[int, int], Scene]] = {
     'room': make_room,
     'crossing': make_crossing,
     'leaving': make_leaving,
     'corridor': make_corridor,
     'ahead': make_ahead,
+    'over': make_over,
 }
 
 

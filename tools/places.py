@@ -32,11 +32,11 @@ from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_tra
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.map_file import from_bytes, to_bytes
-from segfloor_ros.resident_memory import rss_mb
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
+from segfloor_ros.timing import rss_mb
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
 from tools.driving import open_recording
 

@@ -24,8 +24,8 @@ from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.simulation.any_scene import open_scene
-from segfloor_ros.simulation.render_once import render_once
+from segfloor_ros.simulation.drive_files import render_once
+from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.stages import make_slam
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory

@@ -14,8 +14,8 @@ from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import MapError
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.resident_memory import rss_mb
 from segfloor_ros.slam.results import FrameResult
+from segfloor_ros.timing import rss_mb
 from tools.driving import drive
 from tools.endless_drive import place_of
 
