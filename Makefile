@@ -22,7 +22,10 @@ IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 PARALLEL := -n 2 --dist worksteal
 CODE := segfloor_ros test launch_configs docs tools .ci setup.py
 
-.PHONY: all test test-slow test-noble noble-python demo lint format docs clean
+# The tests start many processes, which need not compile the same modules again.
+export PYTHONDONTWRITEBYTECODE :=
+
+.PHONY: all test fast-tests test-slow test-noble noble-python demo lint format docs clean
 
 all: $(STAMP) $(TF)
 
@@ -46,7 +49,11 @@ $(TF): $(wildcard tools/tf2_msgs/*) $(STAMP)
 	@$(BIN)/python tools/tf2_msgs/build.py
 	@touch $@
 
-test: $(STAMP) $(TF) lint
+# Types are checked beside the tests: mypy uses one processor.
+test: $(STAMP) $(TF)
+	@$(MAKE) --no-print-directory -j 2 lint fast-tests
+
+fast-tests: $(STAMP) $(TF)
 	$(BIN)/python -m pytest $(PARALLEL) -m 'not slow'
 
 test-slow: $(STAMP) $(TF)

@@ -43,7 +43,8 @@ setup(
     maintainer_email='segfloor@example.org',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
-        f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*'],
+        f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*', 'furniture.yaml', 'world.xml'],
+        f'{PACKAGE}.evaluation': ['report.css'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
         f'{PACKAGE}.slam': ['vocabulary.npy'],
     },

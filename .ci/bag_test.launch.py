@@ -15,11 +15,11 @@ from launch import LaunchDescription
 from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from rclpy.time import Time
+from segfloor_ros.messages.grids import grid_arrays
 from tf2_ros import Buffer, TransformListener
 
 import segfloor_ros.simulation
 from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.messages.grids import grid_arrays
 from segfloor_ros.messages.topics import TOPICS
 
 DRIVE = Path(segfloor_ros.simulation.__file__).parent / 'demo' / 'drive.mcap'

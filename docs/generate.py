@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from topic_texts import ABOUT
+
 from segfloor_ros.configuration import STAGE_SETTINGS
 from segfloor_ros.messages.qos import describe
 from segfloor_ros.messages.topics import (
@@ -42,7 +44,7 @@ and on `/tf_static` the mount where tf lacks it; where the camera's frame hangs 
 already, that one is put on the base. With `publish_odom_tf: false` another node owns `odom` →
 `base_link`, e.g. robot_localization with wheels and IMU: `map` → `odom` is then what lies between
 that node's base and the one SLAM sees at the same time, and stays as it was while tracking is lost.
-tf needs tf2_ros or, from pip wheels, the message that `make` builds.""",
+tf needs tf2_msgs, which ROS has; with pip wheels `make` builds it.""",
     FLOOR: """\
 Computes the disparity of every keyframe and marks the pixels that show floor.""",
     CLOUD: """\
@@ -111,6 +113,7 @@ STATUS = {
     SLAM: 'One status per frame: OK while tracking, WARN while the mount is measured, ERROR while '
     'lost, with the reason. Values: `tracked`, `keyframe`, `matches`, `reference_keyframe_ns` (the '
     'keyframe a pose is relative to), `lost_s` (for how long), `recovered_after_s` (once), '
+    '`apart` (1: mapped, before it was known where in the map), '
     '`processing_ms`, `rss_mb`.',
     FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',
@@ -123,7 +126,9 @@ STATUS = {
 
 def page(node: str) -> str:
     """Return the page of a node in Markdown."""
-    stage, own = STAGE_SETTINGS[node].specs(), NODE_SETTINGS[node].specs()
+    stage = STAGE_SETTINGS[node].specs()
+    names = {spec.name for spec in stage}
+    own = [spec for spec in NODE_SETTINGS[node].specs() if spec.name not in names]
     sections = [
         f'# {node}',
         PURPOSE[node],
@@ -151,7 +156,7 @@ def page(node: str) -> str:
 
 
 def _topics(topics: list[Topic]) -> str:
-    rows = [(f'`{t.name}`', f'`{t.type_name}`', describe(t.profile), t.about) for t in topics]
+    rows = [(f'`{t.name}`', f'`{t.type_name}`', describe(t.profile), ABOUT[t.name]) for t in topics]
     return _table(('topic', 'type', 'QoS', 'what it holds'), rows) if rows else ''
 
 

@@ -1,0 +1,112 @@
+"""What the messages of each topic hold, for the documentation: with units and frames."""
+
+from __future__ import annotations
+
+ABOUT = {
+    'wheel_odometry': (
+        'Where the wheels have base_link, in any frame of their own. stereo_camera publishes that '
+        'of a recording.'
+    ),
+    'depth/image_raw': (
+        'Depth aligned with the left image, 16UC1 (mm) or 32FC1 (m); taken instead of right '
+        'images by parameter, or where nobody publishes those.'
+    ),
+    'imu': (
+        'Angular velocity and acceleration, in a frame that tf ties to the camera. stereo_camera '
+        'publishes those of a recording.'
+    ),
+    'odometry': (
+        'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
+        'lost.'
+    ),
+    'initialpose': (
+        'About where base_link is in map, as RViz publishes it: the camera is looked for there.'
+    ),
+    'pose': 'Every tracked frame: base_link in map. Published while someone listens.',
+    'dynamic_mask': (
+        'mono8, 255 where something moves, of the left image that stereo_slam receives, with its '
+        'stamp; from a segmentation network. Used when there, never waited for.'
+    ),
+    'moving_points': (
+        'What moves, every few frames: x y z in map (m), vx vy vz (m/s, NaN where not known). '
+        'Empty where nothing does.'
+    ),
+    'keyframe/moving_mask': (
+        'mono8 on the rectified left image of the keyframe: 255 where something moves.'
+    ),
+    'frame_done': 'The header of every frame that SLAM has done with: tracked, skipped or refused.',
+    'camera_mount': 'Left optical frame in base_link: given, from tf, or measured from the floor.',
+    'keyframe/odometry': 'base_link in map at the keyframe.',
+    'keyframe/map_start': (
+        'The keyframe, and as time_ref when its map began: another time_ref is another map.'
+    ),
+    'map_file/loaded': (
+        'What the nodes behind need of a map that was loaded, as the bytes of a map file.'
+    ),
+    'map_file/wanted': 'The header of the latest keyframe of a map that is to be saved.',
+    'map_file/part': 'What a node knows of the map at that keyframe, as the bytes of a map file.',
+    'keyframe/features': (
+        'Features of the keyframe: x y z in map (m, NaN where unknown), u v (px), id (-1: none).'
+    ),
+    'keyframe/path': (
+        'base_link in map of all keyframes as now optimised; each pose with its own stamp.'
+    ),
+    'map_points': 'The whole sparse map: x y z in map (m) and id; a removed point disappears.',
+    'keyframe/disparity': (
+        'Disparity of the keyframe, 0 where there is no match. Published while someone listens.'
+    ),
+    'keyframe/floor_mask': (
+        'mono8 on the rectified left image: 255 floor, 127 no evidence, 0 not floor.'
+    ),
+    'keyframe/floor_overlay': (
+        'bgr8, for people: the rectified left image tinted green for floor, blue for no evidence, '
+        'red for not floor. Published while someone listens.'
+    ),
+    'keyframe/v_disparity': (
+        'bgr8, for people: the filtered v-disparity (rows: of the de-rolled image; columns: half '
+        "pixels) and the floor's profile in green. Published while someone listens."
+    ),
+    'keyframe/floor_scan': (
+        "How far the floor was seen per bearing, in the base's plane (m); 0: blocked right in "
+        'front, NaN: not seen. Intensities: distance of the nearest upright thing (m) or NaN.'
+    ),
+    'scan': (
+        "How far the floor is free per bearing at every tracked frame, in the base's plane (m), "
+        'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
+        'not seen. Published while someone listens.'
+    ),
+    'labelled_points': (
+        'The sparse map with labels: x y z in map (m), id, confidence (0 to 1), label (0 unknown, '
+        '1 floor, 2 obstacle).'
+    ),
+    'floor_points': 'The floor points alone: x y z id. Published while someone listens.',
+    'obstacle_points': (
+        'The obstacle points alone: x y z id. Published while someone listens: at every keyframe, '
+        'and twice a second while the camera is tracked but makes none.'
+    ),
+    'keyframe/done': (
+        'The header of every keyframe that goes no further: it is in the map, or a node could not '
+        'process it.'
+    ),
+    'map': 'The map: 0 free to 100 occupied, -1 unknown; its stamp is that of the latest keyframe.',
+    '/diagnostics': (
+        'Status of the node; the header carries the stamp of the frame or keyframe it is about.'
+    ),
+}
+"""By topic name."""
+
+for _side in ('left', 'right'):
+    _raw, _rect, _name = f'{_side}/image_raw', f'{_side}/image_rect', f'{_side.capitalize()} image'
+    _packed = 'as JPEG or PNG; instead of'
+    ABOUT |= {
+        _raw: f'{_name}, raw.',
+        f'{_raw}/compressed': f'{_name}, raw, {_packed} {_raw} by parameter.',
+        _rect: f'{_name}, rectified; taken instead of {_raw} by parameter.',
+        f'{_rect}/compressed': f'{_name}, rectified, {_packed} {_rect} by parameter.',
+        f'{_side}/camera_info': f'Calibration for {_raw}.',
+        f'keyframe/{_rect}': f'{_name} of the keyframe, rectified, mono8.',
+        f'keyframe/{_side}/camera_info': f'Calibration for keyframe/{_rect}.',
+        f'frame/{_rect}': 'Every tracked frame, rectified, some 240 pixels wide; published while '
+        'someone listens.',
+        f'frame/{_side}/camera_info': f'Calibration for frame/{_rect}.',
+    }
