@@ -101,12 +101,12 @@ class BackEnd:
         """Whether the map is a part of its own, beside one that is known."""
         return self._known is not None
 
-    def map_apart(self) -> None:
+    def map_apart(self, of_drive: bool) -> None:
         """Go on with an empty map, until the known one, which is all there is so far, is
-        recognised.
+        recognised. of_drive: whether this drive made it, and got lost.
         """
         known = map_to_arrays(self._map) | self.places.to_arrays()
-        self._known = KnownMap(self._camera, self._tracker, self._map, known)
+        self._known = KnownMap(self._camera, self._tracker, self._map, known, of_drive)
         self._map.reset(int(known['num_ever'][0]))
         self._forget_places()
 

@@ -32,7 +32,8 @@ NEIGHBOURS = 20
 MAX_MISSES = 1
 TIMES_A_LOOP = 2
 """No drift tells where the known map can be: so many times the sightings of a loop are asked for.
-With as many as for a loop, walls with the same paper were taken for one.
+With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
+be no further away than it can have driven, too.
 """
 
 
@@ -48,12 +49,18 @@ class Sighting:
 
 
 class KnownMap:
-    """The known map, beside the drive's own."""
+    """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
 
     def __init__(
-        self, camera: StereoCamera, tracker: Tracker, own: SparseMap, arrays: Arrays
+        self,
+        camera: StereoCamera,
+        tracker: Tracker,
+        own: SparseMap,
+        arrays: Arrays,
+        of_drive: bool,
     ) -> None:
         self._own = own
+        self._of_drive = of_drive
         self._camera = camera
         self._map = SparseMap()
         fill_map(self._map, arrays)
@@ -69,7 +76,7 @@ class KnownMap:
     ) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
         match = self._look(keyframe, images, offset_px)
-        if match is not None and not self._checks.objection(keyframe, match, mount):
+        if match is not None and self._is_possible(keyframe, match, mount):
             self._sightings.append(self._sighting(keyframe, match))
             self._misses = 0
         else:
@@ -78,6 +85,11 @@ class KnownMap:
                 self._sightings = []
         matches = [sighting.match for sighting in self._sightings]
         return are_certain(self._own, matches, TIMES_A_LOOP)
+
+    def _is_possible(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> bool:
+        if self._of_drive and not self._checks.is_within_reach(match):
+            return False
+        return not self._checks.objection(keyframe, match, mount)
 
     def is_seen(self, images: Images, features: Features, offset_px: float) -> bool:
         """Whether enough frames in a row see the known map, this one the last of them."""

@@ -24,6 +24,11 @@ LEAST_DRIFT_RAD = 0.005
 FREE_DRIFT_M = 0.3
 FREE_DRIFT_RAD = 0.1
 
+FREE_WAY_M = 0.5
+SPEED_FACTOR = 2.0
+LEAST_SPEED_MPS = 0.5
+"""While it is lost, a robot drives at most so many times as fast as it ever did, this at least."""
+
 MAX_STEP_UP_M = 0.1
 MAX_SLOPE = 0.15
 MAX_TILT_RAD = 0.2
@@ -89,6 +94,20 @@ class LoopChecks:
         ):
             return 'more than drift'
         return ''
+
+    def is_within_reach(self, match: Match) -> bool:
+        """Whether the robot can have driven there while it was lost: from the last keyframe of the
+        known map to the first of its own.
+        """
+        first, known = self._map.keyframes[0], self._known.keyframes
+        T_own_known = drift(self._map, match)
+        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
+        stamp_s = np.array([k.stamp_ns for k in (*known, first)]) / 1e9
+        steps = np.diff([k.T_world_camera[:3, 3] for k in known], axis=0)
+        speeds = np.linalg.norm(steps, axis=1) / np.maximum(np.diff(stamp_s[:-1]), 1e-3)
+        speed = SPEED_FACTOR * speeds.max(initial=LEAST_SPEED_MPS)
+        reach_m = FREE_WAY_M + speed * (stamp_s[-1] - stamp_s[-2])
+        return bool(np.linalg.norm(way[:3, 3]) <= reach_m)
 
     def objection(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> str:
         """Return what else speaks against a match, '' for nothing."""

@@ -232,7 +232,7 @@ class StereoSlam:
         """
         self._lost_ns = None
         self._take_adjustment(wait=True)
-        self._back_end.map_apart()
+        self._back_end.map_apart(self._is_shown)
         if not self._is_shown:
             self._front_end.motion.reset()
             self._body.reset_world()
