@@ -25,25 +25,16 @@ UNITS = {'_m': 'm', '_s': 's', '_px': 'px', '_hz': 'Hz', '_rad': 'rad', '_mps': 
 """Of a setting by the end of its name, unless it says otherwise."""
 
 
-def setting(
-    default: Value,
-    description: str,
-    within: tuple[float, float] | None = None,
-    **facts: Any,
-) -> Any:
-    """Declare one setting of a stage. within: the least and the greatest value, both inclusive.
-    facts: of `SettingSpec`, beside name, type and default.
-    """
-    limits = {} if within is None else {'minimum': within[0], 'maximum': within[1]}
-    metadata = {'description': description, **limits, **facts}
-    return dataclasses.field(default=default, metadata=metadata)
+def setting(default: Value, description: str, **facts: Any) -> Any:
+    """Declare one setting of a stage. facts: of `SettingSpec`, beside name, type and default."""
+    return dataclasses.field(default=default, metadata={'description': description, **facts})
 
 
 @dataclasses.dataclass(frozen=True)
 class SettingSpec:
-    """What is known of one setting. minimum and maximum are inclusive; without them, or choices,
-    anything of the type goes. live: it may change while a node runs; the others are read-only after
-    the start.
+    """What is known of one setting. within: the least and the greatest value, both inclusive;
+    without it, or choices, anything of the type goes. live: it may change while a node runs; the
+    others are read-only after the start.
     """
 
     name: str
@@ -51,8 +42,7 @@ class SettingSpec:
     default: Value
     description: str
     unit: str = ''
-    minimum: float | None = None
-    maximum: float | None = None
+    within: tuple[float, float] | None = None
     choices: tuple[str, ...] = ()
     live: bool = False
 
@@ -60,16 +50,12 @@ class SettingSpec:
         """Return the accepted values in words, e.g. `0.01 to 0.2 m`, or '' where anything of the
         type goes.
         """
-        unit = f' {self.unit}' if self.unit else ''
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
-        if self.minimum is not None and self.maximum is not None:
-            return f'{self.minimum:g} to {self.maximum:g}{unit}'
-        if self.minimum is not None:
-            return f'at least {self.minimum:g}{unit}'
-        if self.maximum is not None:
-            return f'at most {self.maximum:g}{unit}'
-        return ''
+        if self.within is None:
+            return ''
+        unit = f' {self.unit}' if self.unit else ''
+        return f'{self.within[0]:g} to {self.within[1]:g}{unit}'
 
     def check(self, value: Any, stage: str) -> Any:
         """Return `value` as this setting's type. Raises SettingsError naming parameter, value and
@@ -92,11 +78,9 @@ class SettingSpec:
         if isinstance(value, float) and math.isnan(value):
             # NaN stands for "not given" where it is the default, e.g. a height to be measured.
             return isinstance(self.default, float) and math.isnan(self.default)
-        return (
-            (not self.choices or value in self.choices)
-            and (self.minimum is None or value >= self.minimum)
-            and (self.maximum is None or value <= self.maximum)
-        )
+        if self.within is not None:
+            return bool(self.within[0] <= value <= self.within[1])
+        return not self.choices or value in self.choices
 
 
 _TYPE_NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}

@@ -17,11 +17,11 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class TwoWordSettings(StageSettings):
-    size_m: float = setting(0.5, 'A size.', unit='m', minimum=0.1, maximum=2.0, live=True)
-    count: int = setting(3, 'A count.', minimum=1)
+    size_m: float = setting(0.5, 'A size.', unit='m', within=(0.1, 2.0), live=True)
+    count: int = setting(3, 'A count.', within=(1, 9))
     kind: str = setting('a', 'A kind.', choices=('a', 'b'))
     fast: bool = setting(False, 'A switch.')
-    height_m: float = setting(float('nan'), 'Measured when not given.', minimum=0.0)
+    height_m: float = setting(float('nan'), 'Measured when not given.', within=(0.0, 9.0))
 
 
 def test_stage_name_comes_from_the_class():
@@ -47,7 +47,7 @@ def test_whole_numbers_serve_as_floats_and_nothing_else_is_converted():
     ('bad', 'words'),
     [
         ({'size_m': 5.0}, ['two_word.size_m', '5.0', '0.1 to 2 m']),
-        ({'count': 0}, ['two_word.count', '0', 'at least 1']),
+        ({'count': 0}, ['two_word.count', '0', '1 to 9']),
         ({'kind': 'c'}, ['two_word.kind', "'c'", 'one of a, b']),
         ({'size_m': math.inf}, ['two_word.size_m', 'finite']),
         ({'size_m': math.nan}, ['two_word.size_m', 'nan']),

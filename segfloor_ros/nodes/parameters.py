@@ -25,9 +25,6 @@ from segfloor_ros.settings import SettingSpec, suggestion
 
 Settings = TypeVar('Settings', bound=NodeSettings)
 
-INT_RANGE = (-(2**63), 2**63 - 1)
-FLOAT_RANGE = (-sys.float_info.max, sys.float_info.max)
-
 
 def descriptor(spec: SettingSpec) -> ParameterDescriptor:
     """Return the descriptor of a setting. The type stays open, so that `1` is taken for 1.0 as on
@@ -41,13 +38,13 @@ def descriptor(spec: SettingSpec) -> ParameterDescriptor:
         read_only=not spec.live,
         dynamic_typing=True,
     )
-    bounded = spec.minimum is not None or spec.maximum is not None
-    if bounded and spec.type is int:
-        low, high = _bounds(spec, INT_RANGE)
+    if spec.within is None:
+        return result
+    low, high = spec.within
+    if spec.type is int:
         result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
     # rclpy holds not-a-number ("to be measured") to be out of every range.
-    if bounded and spec.type is float and spec.default == spec.default:
-        low, high = _bounds(spec, FLOAT_RANGE)
+    if spec.type is float and spec.default == spec.default:
         result.floating_point_range = [
             FloatingPointRange(from_value=float(low), to_value=float(high), step=0.0)
         ]
@@ -134,9 +131,3 @@ def _parsed(text: str, spec: SettingSpec) -> Any:
         with contextlib.suppress(ValueError):
             return float(value)
     return '' if value is None and spec.type is str else value
-
-
-def _bounds(spec: SettingSpec, widest: tuple[float, float]) -> tuple[float, float]:
-    low = widest[0] if spec.minimum is None else spec.minimum
-    high = widest[1] if spec.maximum is None else spec.maximum
-    return low, high

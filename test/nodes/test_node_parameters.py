@@ -34,8 +34,7 @@ def test_every_setting_is_a_parameter_with_description_and_range(make_graph, mak
         assert described.read_only is not spec.live
         assert described.additional_constraints == spec.range_text()
         for found in (*described.floating_point_range, *described.integer_range):
-            assert spec.minimum is None or found.from_value == spec.minimum
-            assert spec.maximum is None or found.to_value == spec.maximum
+            assert (found.from_value, found.to_value) == spec.within
     assert set(node.get_parameters_by_prefix('')) - {s.name for s in specs} <= {
         'use_sim_time',
         'start_type_description_service',
@@ -112,8 +111,8 @@ def another(spec):
         return spec.choices[-1]
     if spec.type is str:
         return f'{spec.default}_2'
-    for value in (spec.maximum, spec.minimum, spec.default + 1):
-        if value is not None and value != spec.default:
+    for value in (*reversed(spec.within or ()), spec.default + 1):
+        if value != spec.default:
             return spec.type(value)
     return spec.default
 
