@@ -17,6 +17,7 @@ import yaml
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError
+from segfloor_ros.files import read_yaml
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.node_settings import is_node_parameter
@@ -88,19 +89,8 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
     `/**` applies to every stage that has the parameter; names of nodes outside this package are
     passed over. Raises SettingsError when the file is missing or not of that form.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise SettingsError(f'{path}: cannot read the parameter file ({error.strerror})') from None
-    except UnicodeDecodeError as error:
-        raise SettingsError(
-            f'{path}, byte {error.start}: the parameter file is not UTF-8; save it as that'
-        ) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        line = getattr(getattr(error, 'problem_mark', None), 'line', 0) + 1
-        raise SettingsError(f'{path}, line {line}: not valid YAML') from None
-    if not isinstance(document, dict):
-        raise SettingsError(f'{path}: expected node names with ros__parameters below them')
+    expected = 'node names with ros__parameters below them'
+    document = read_yaml(path, expected, SettingsError)
     values: dict[str, dict[str, Any]] = {}
     # What is said of one node wins over what is said of all, as in ROS.
     of_all_first = sorted(document.items(), key=lambda item: not str(item[0]).endswith('**'))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.files import replacing
 
 FORMAT = 'segfloor map'
 VERSION = 1
@@ -43,26 +43,12 @@ class MapFile:
 def write_map_file(path: Path, saved: MapFile) -> None:
     """Write a map in place of an older file. Raises InputError where that is not possible."""
     path = path.absolute()
-    written: Path | None = None
-    try:
+    with os_errors(f'{path}: cannot be written'):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.part', delete=False) as file:
-            written = Path(file.name)
+        with replacing(path) as file:
             write_to(file, saved)
             file.flush()
             os.fsync(file.fileno())
-        written.chmod(0o666 & ~_umask())
-        written.replace(path)
-    except OSError as error:
-        if written is not None:
-            written.unlink(missing_ok=True)
-        raise InputError(f'{path}: cannot be written ({error.strerror})') from None
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def read_map_file(path: Path) -> MapFile:

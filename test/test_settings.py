@@ -135,7 +135,7 @@ def test_bad_parameter_files_are_refused_in_one_line(tmp_path, text, words):
 
 
 def test_missing_parameter_file_is_named(tmp_path):
-    with pytest.raises(SettingsError, match=r'nowhere.*cannot read'):
+    with pytest.raises(SettingsError, match=r'nowhere.*cannot be read'):
         resolve(tmp_path / 'nowhere.yaml')
 
 

@@ -29,8 +29,9 @@ from segfloor_ros.evaluation.prm import Mask, RoadMapPlan, score_road_maps
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, cell_centres, observable, states
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.trajectory_files import read_table
-from segfloor_ros.evaluation.truth import MapTruth, load_truth, read_map
+from segfloor_ros.evaluation.truth import MapTruth, load_truth
 from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun
 from segfloor_ros.results_folder import OutputFolder
 from segfloor_ros.simulation.drive_files import render_once
@@ -84,7 +85,7 @@ def run(drive: Path, results: Path, assignments: list[str]) -> None:
 def measure(scene: Scene, drive: Path, results: Path) -> Outcome:
     """Score what came of a drive."""
     path = score_trajectory(match_files(results, drive))
-    estimate, truth = read_map(results / 'map.yaml'), load_truth(drive)
+    estimate, truth = load_map(results / 'map.yaml'), load_truth(drive)
     alignment = truth.start_pose or (0.0, 0.0, 0.0)
     score, maps = score_map(estimate, truth, alignment), compare(estimate, truth, alignment)
     in_sight, long_ago = _seen_again(scene, truth, _stamped_poses(drive))

@@ -13,7 +13,8 @@ from segfloor_ros.cli.output import console
 from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.evaluation.map_score import compare, save_overlay, score_map
-from segfloor_ros.evaluation.truth import load_truth, read_map
+from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.grid.map_file import load_map
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 """A drive through the shipped scene corridor1 with its truth, made by `segfloor simulate corridor1
@@ -52,7 +53,7 @@ def _print_scores(out: Path) -> None:
 
     truth = load_truth(DRIVE)
     pose = truth.start_pose or (0.0, 0.0, 0.0)
-    grid = read_map(out / 'map.yaml')
+    grid = load_map(out / 'map.yaml')
     console.print(map_table(score_map(grid, truth, pose)))
     path = score_trajectory(match_files(out, DRIVE))
     console.print(

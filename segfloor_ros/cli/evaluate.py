@@ -25,7 +25,8 @@ from segfloor_ros.evaluation.map_score import (
 from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
 from segfloor_ros.evaluation.raster import from_frame
 from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
-from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses, read_map
+from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
@@ -69,7 +70,7 @@ def evaluate_map(
     as_json: JsonOption = False,
 ) -> None:
     """Road-map precision and recall, raw and after opening, and precision and recall per cell."""
-    grid = read_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
+    grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
     known = load_truth(truth)
     pose = resolve_alignment(align, grid, known)
     known = _with_drive(known, trajectory, fov, pose)

@@ -20,9 +20,10 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.cloud.ply import read_ply
 from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.evaluation.truth import MapTruth, load_truth, read_map
+from segfloor_ros.evaluation.truth import MapTruth, load_truth
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
 STRIP_LENGTH = 6
@@ -83,7 +84,7 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
             summary['camera_pitch_rad'],
             summary.get('camera_roll_rad', 0.0),
         ),
-        grid=read_map(folder / 'map.yaml'),
+        grid=load_map(folder / 'map.yaml'),
         trajectory=read_trajectory(folder / 'trajectory.txt')[1],
         keyframes=read_trajectory(folder / 'keyframes.txt')[1],
         cloud=read_ply(folder / 'labelled_cloud.ply'),

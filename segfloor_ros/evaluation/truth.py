@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory_files import read_table, read_trajectory
+from segfloor_ros.files import read_yaml
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
@@ -33,21 +33,13 @@ class MapTruth:
     fov_rad: float = float(DEFAULT_FOV_RAD)
 
 
-def read_map(path: Path) -> OccupancyGrid:
-    """Read a map YAML that a user named. Raises InputError naming the file."""
-    try:
-        return load_map(path)
-    except MapError as error:
-        raise InputError(str(error)) from None
-
-
 def load_truth(path: Path) -> MapTruth:
     """Read a true map from a map YAML, or with poses from a scene folder (map.yaml, scene.yaml,
     base_poses.txt). Raises InputError naming the file.
     """
     if not path.is_dir():
-        return MapTruth(read_map(path))
-    grid = read_map(path / 'map.yaml')
+        return MapTruth(load_map(path))
+    grid = load_map(path / 'map.yaml')
     scene_file = path / 'scene.yaml'
     if not scene_file.is_file():
         return MapTruth(grid)
@@ -68,7 +60,7 @@ def read_base_poses(path: Path) -> Array:
 
 
 def _read_scene(path: Path) -> tuple[Pose2d, float]:
-    scene = yaml.safe_load(path.read_text())
+    scene = read_yaml(path, 'names and values')
     try:
         x, y, yaw = (float(value) for value in scene['start_pose_world'])
         fov_rad = float(np.radians(scene['fov_x_deg']))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,49 +11,45 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import MapError
+from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.files import read_yaml, replacing
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 OCCUPIED_THRESH = 0.65
 FREE_THRESH = 0.196
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
-RAW_UNKNOWN_PIXEL = 255
 MODES = ('trinary', 'scale', 'raw')
 
 
-def save_map(grid: OccupancyGrid, path: Path, mode: str = 'trinary') -> None:
+def save_map(grid: OccupancyGrid, path: Path) -> None:
     """Write `path` (YAML) and the PGM of the same name beside it; both appear whole or not at all.
 
-    mode: `trinary` keeps free, occupied and unknown; `raw` keeps every value 0 to 100 as it is.
-    Raises MapError when the mode is another one or the folder cannot be written.
+    Free, occupied and unknown are kept. Raises MapError when the folder cannot be written.
     """
-    if mode not in ('trinary', 'raw'):
-        raise MapError(f'{path}: maps are saved in mode trinary or raw, not {mode!r}')
     image_path = path.with_suffix('.pgm')
     description = {
         'image': image_path.name,
-        'mode': mode,
+        'mode': 'trinary',
         'resolution': float(grid.resolution_m),
         'origin': [float(grid.origin_xy_m[0]), float(grid.origin_xy_m[1]), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_THRESH,
         'free_thresh': FREE_THRESH,
     }
-    pixels = _trinary_pixels(grid.cells) if mode == 'trinary' else _raw_pixels(grid.cells)
-    _replace_file(image_path, _pgm_bytes(pixels[::-1]))
+    _replace_file(image_path, _pgm_bytes(_trinary_pixels(grid.cells)[::-1]))
     _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
 
 
 def load_map(path: Path) -> OccupancyGrid:
     """Read a map YAML and its image, by the rules of map_server (modes trinary, scale and raw).
 
-    Raises MapError naming the file when either is missing or malformed.
+    Raises InputError naming the file when either is missing or malformed.
     """
     description = _read_description(path)
     image_path = path.parent / description['image']
     image = cv2.imread(str(image_path), cv2.IMREAD_UNCHANGED) if image_path.is_file() else None
     if image is None or image.dtype != np.uint8:
-        raise MapError(f'{image_path}: the image of {path.name} is missing or no 8-bit image')
+        raise InputError(f'{image_path}: the image of {path.name} is missing or no 8-bit image')
     grey, opaque = _grey_and_opaque(image)
     cells = _cells(grey, opaque, description)
     x, y, _ = description['origin']
@@ -68,38 +63,25 @@ def _trinary_pixels(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
     return pixels
 
 
-def _raw_pixels(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
-    return np.where(cells < 0, RAW_UNKNOWN_PIXEL, cells).astype(np.uint8)
-
-
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
     rows, columns = pixels.shape
     return f'P5\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
 
 
 def _replace_file(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
     try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
+        with replacing(path) as file:
+            file.write(content)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise MapError(f'{path}: cannot write the map ({error.strerror})') from None
 
 
 def _read_description(path: Path) -> dict[str, Any]:
     """Return the checked values of a map YAML, with the defaults of map_server."""
-    try:
-        document = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise MapError(f'{path}: cannot read the map ({error.strerror})') from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise MapError(f'{path}: not valid YAML') from None
-    if not isinstance(document, dict):
-        raise MapError(f'{path}: expected image, resolution and origin')
+    document = read_yaml(path, 'image, resolution and origin')
     missing = [key for key in ('image', 'resolution', 'origin') if key not in document]
     if missing:
-        raise MapError(f'{path}: {missing[0]} is missing')
+        raise InputError(f'{path}: {missing[0]} is missing')
     try:
         checked = {
             'image': str(document['image']),
@@ -111,22 +93,22 @@ def _read_description(path: Path) -> dict[str, Any]:
             'free_thresh': float(document.get('free_thresh', FREE_THRESH)),
         }
     except (TypeError, ValueError):
-        raise MapError(f'{path}: a value is not a number where one is needed') from None
+        raise InputError(f'{path}: a value is not a number where one is needed') from None
     _check_description(path, checked)
     return checked
 
 
 def _check_description(path: Path, values: dict[str, Any]) -> None:
     if values['mode'] not in MODES:
-        raise MapError(f'{path}: mode {values["mode"]!r}: expected one of {", ".join(MODES)}')
+        raise InputError(f'{path}: mode {values["mode"]!r}: expected one of {", ".join(MODES)}')
     if not (math.isfinite(values['resolution']) and values['resolution'] > 0):
-        raise MapError(f'{path}: resolution {values["resolution"]:g} m must be positive')
+        raise InputError(f'{path}: resolution {values["resolution"]:g} m must be positive')
     if len(values['origin']) != 3 or not all(map(math.isfinite, values['origin'])):
-        raise MapError(f'{path}: origin must be three numbers: x, y, yaw')
+        raise InputError(f'{path}: origin must be three numbers: x, y, yaw')
     if values['origin'][2] != 0:
-        raise MapError(f'{path}: origin is turned by {values["origin"][2]:g} rad, expected yaw 0')
+        raise InputError(f'{path}: origin is turned by {values["origin"][2]:g} rad, expected yaw 0')
     if not 0 < values['free_thresh'] < values['occupied_thresh'] < 1:
-        raise MapError(f'{path}: expected 0 < free_thresh < occupied_thresh < 1')
+        raise InputError(f'{path}: expected 0 < free_thresh < occupied_thresh < 1')
 
 
 def _grey_and_opaque(image: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

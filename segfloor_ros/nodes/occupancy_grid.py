@@ -101,10 +101,7 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
         path = FilePath(name).expanduser().absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
-        try:
-            save_map(self._stage.grid(), path)
-        except OSError as error:
-            raise MapError(f'{path}: {error}') from None
+        save_map(self._stage.grid(), path)
         return str(path)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, OccupancyGrid
@@ -55,10 +55,7 @@ def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     """Return a scene's values: boxes for the occupied cells and, unless `overrides` has waypoints,
     a tour through the free space. Raises InputError naming the file.
     """
-    try:
-        grid = load_map(file)
-    except MapError as error:
-        raise InputError(str(error)) from None
+    grid = load_map(file)
     occupied = grid.cells == OCCUPIED
     if not occupied.any():
         raise InputError(f'{file}: the map has no occupied cell to build walls from')

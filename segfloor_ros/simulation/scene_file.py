@@ -13,10 +13,13 @@ from typing import Any
 import yaml
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files import read_yaml
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.floor_plan import is_map_file, scene_of_map
 from segfloor_ros.simulation.scene import Scene
+
+EXPECTED = 'names and values, e.g. `walls:`'
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -29,7 +32,7 @@ def read_scene_values(path: Path) -> dict[str, Any]:
     """Return what a scene file says. `like: NAME` takes over everything from a shipped scene that
     the file does not say itself; lists are replaced as a whole. Raises InputError.
     """
-    values = read_yaml(path)
+    values = read_yaml(path, EXPECTED)
     if 'like' not in values:
         return values
     name, shipped = str(values.pop('like')), shipped_scenes()
@@ -45,20 +48,6 @@ def _merged(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(inner, dict) and isinstance(change, dict)
         result[key] = _merged(inner, change) if both else change  # type: ignore[arg-type]
     return result
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping that a YAML file holds. Raises InputError."""
-    try:
-        document = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line = getattr(getattr(error, 'problem_mark', None), 'line', 0) + 1
-        raise InputError(f'{path}, line {line}: not valid YAML') from None
-    if not isinstance(document, dict):
-        raise InputError(f'{path}: expected names and values, e.g. `walls:`')
-    return document
 
 
 def scene_from_mapping(values: dict[str, Any], where: str) -> Scene:
@@ -120,7 +109,7 @@ def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
     file = path if path.exists() else shipped[name]
     if file.is_dir():
         raise InputError(f'{name}: is a folder; name a scene file or a map YAML')
-    if is_map_file(read_yaml(file)):
+    if is_map_file(read_yaml(file, EXPECTED)):
         values = scene_of_map(file, assigned({}, assignments))
     else:
         values = read_scene_values(file)

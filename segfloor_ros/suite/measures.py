@@ -16,7 +16,8 @@ from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.evaluation.truth import Pose2d, load_truth, read_map
+from segfloor_ros.evaluation.truth import Pose2d, load_truth
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
@@ -75,7 +76,7 @@ def measure_run(
     frame lies in the truth's. reference_ms: median time of the reference workload. Raises
     InputError naming what cannot be read.
     """
-    grid = read_map(run / 'map.yaml')
+    grid = load_map(run / 'map.yaml')
     known = float((states(grid) != UNKNOWN).sum())
     measured = {'known_area_m2': known * grid.resolution_m**2}
     if (run / 'summary.json').is_file():
@@ -85,7 +86,7 @@ def measure_run(
     if truth is not None:
         measured.update(_against_truth(run, grid, truth, start_pose))
     if reference_map is not None:
-        measured['agreement_percent'] = 100 * agreement(grid, read_map(reference_map))
+        measured['agreement_percent'] = 100 * agreement(grid, load_map(reference_map))
     return {name: round(value, 6) for name, value in measured.items() if np.isfinite(value)}
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.evaluation.truth import read_map
+from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.simulation.renderer import RenderingError
 from segfloor_ros.simulation.scene_file import open_scene, shipped_scenes
 from tools.benchmark_published import as_document, published_table, run_scene
@@ -51,11 +51,11 @@ def test_a_scene_is_rendered_once_mapped_and_scored(tmp_path):
     assert steps == [('rendering corridor2', frames), ('mapping corridor2', frames)]
     assert first.workload.tracked == frames
     assert first.score.nodes == 20
-    assert first.cell_m == read_map(tmp_path / 'map.yaml').resolution_m == 0.01
-    assert read_map(tmp_path / 'recording' / 'map.yaml').resolution_m == 0.01
+    assert first.cell_m == load_map(tmp_path / 'map.yaml').resolution_m == 0.01
+    assert load_map(tmp_path / 'recording' / 'map.yaml').resolution_m == 0.01
     assert first.score.observable_only
     assert first.score.raw.precision.mean > 0.8
-    assert read_map(tmp_path / 'map.yaml').cells.size == first.workload.cells
+    assert load_map(tmp_path / 'map.yaml').cells.size == first.workload.cells
     assert cv2.imread(str(tmp_path / 'overlay.png')) is not None
 
     second = scene_result(way)
