@@ -11,7 +11,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -130,7 +130,7 @@ def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
     return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
 
 
-def check_lengths(arrays: Mapping[str, NDArray[Any]]) -> None:
+def check_lengths(arrays: Mapping[str, Sized]) -> None:
     """Raise ValueError unless all arrays have the same length."""
     if len({len(array) for array in arrays.values()}) > 1:
         raise ValueError('columns of different lengths')

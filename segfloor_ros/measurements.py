@@ -50,9 +50,6 @@ Measurement = WheelPose | ImuSample
 DEPTH = 'depth'
 """Name of the depth images among the sensors of a recording."""
 
-DEPTH = 'depth'
-"""Name of the depth images among the sensors of a recording."""
-
 
 @dataclass(frozen=True)
 class RecordedSensor:

@@ -64,7 +64,7 @@ def map_by_truth(drive: Path, every: int, configuration: Configuration) -> Occup
             grid = configuration.occupancy_grid
             evidence = gather_evidence(NO_POINTS, NO_FEATURES, T, scan, grid)
             yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-            history.append(evidence, (float(T[0, 3]), float(T[1, 3]), yaw))
+            history.extend([evidence], np.array([[T[0, 3], T[1, 3], yaw]]))
     return render(history.raster(), history.poses[:, :2], configuration.occupancy_grid)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,9 +15,6 @@ from segfloor_ros.errors import SettingsError
 from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.results_folder import OutputFolder
-
-if TYPE_CHECKING:
-    from segfloor_ros.cli.replay_session import ReplaySession
 
 
 def replay(
@@ -43,7 +40,13 @@ def replay(
     report: options.Report = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
-    session_class = _session_class()
+    try:
+        from segfloor_ros.cli.replay_session import ReplaySession
+    except ImportError as error:
+        raise SettingsError(
+            f'replay needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
+            "pip install 'segfloor_ros[ros]'"
+        ) from None
     if save_masks is SaveMasks.all:
         raise SettingsError(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
@@ -63,7 +66,7 @@ def replay(
         keep = partial(folder.add_picture, 'floor_masks')
         on_mask = keep if save_masks is SaveMasks.keyframes else None
         with output.progress_bar('replaying', source.frame_count) as progress:
-            session = session_class(configuration, params, rate, on_mask, progress, maps, loaded)
+            session = ReplaySession(configuration, params, rate, on_mask, progress, maps, loaded)
             result, found = session.execute()
         folder.write(result)
     for notice in found.notices:
@@ -75,14 +78,3 @@ def replay(
         highlight=False,
     )
     output.finish_run(input, out, report)
-
-
-def _session_class() -> type[ReplaySession]:
-    try:
-        from segfloor_ros.cli.replay_session import ReplaySession
-    except ImportError as error:
-        raise SettingsError(
-            f'replay needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
-            "pip install 'segfloor_ros[ros]'"
-        ) from None
-    return ReplaySession

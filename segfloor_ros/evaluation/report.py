@@ -130,7 +130,7 @@ def _strip(title: str, legend: str, pictures: list[tuple[str, bytes]]) -> str:
 
 def _v_disparity(data: ReportData) -> str:
     picture = v_disparity_picture(data)
-    caption = 'Pixels per image row and disparity; the line is the fitted floor'
+    caption = 'Pixels per image row and disparity, without obstacles; the line is the fitted floor'
     return _figure(picture, caption) if picture is not None else ''
 
 

@@ -16,9 +16,7 @@ from segfloor_ros.cloud.labels import FLOOR as FLOOR_POINT
 from segfloor_ros.cloud.labels import OBSTACLE, LabelledPoints
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, states
 from segfloor_ros.evaluation.report_data import MaskedFrame, ReportData
-from segfloor_ros.floor.histograms import obstacle_rows, u_disparity
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
-from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
@@ -69,26 +67,26 @@ def moving_pictures(data: ReportData) -> list[tuple[str, bytes]]:
 
 
 def v_disparity_picture(data: ReportData) -> bytes | None:
-    """Draw the v-disparity of a keyframe, all of it and without obstacles, with the floor's spline
-    through it; None where no keyframe was kept.
+    """Draw the v-disparity of a keyframe, without obstacles, with the profile that was fitted to
+    it; None where no keyframe was kept.
     """
     if not data.strip:
         return None
     frame = data.strip[len(data.strip) // 2].frame
     stage = FloorSegmentation(data.camera, data.floor_settings)
     floor = stage.process(frame.left, frame.right, data.mount)
-    matched = floor.disparity_px > 0
+    counted = floor.v_disparity
+    rows, bins = counted.counts.shape
+    extent = (0, bins / counted.bins_per_px, counted.first_row + rows, counted.first_row)
     figure = Figure(figsize=(10, 4.4), layout='constrained')
-    kept = matched & ~_upright(data, floor.disparity_px)
-    for axes, pixels, title in zip(
-        figure.subplots(1, 2, sharex=True, sharey=True),
-        (matched, kept),
-        ('all disparities', 'obstacles removed, with the floor spline'),
-        strict=True,
-    ):
-        _show_v_disparity(axes, data, floor.disparity_px, pixels)
-        axes.set_title(f'{title} (frame {frame.index})', fontsize=10)
+    axes = figure.subplots()
+    axes.imshow(
+        np.ma.masked_equal(counted.counts, 0), extent=extent, aspect='auto',
+        norm=LogNorm(1, max(2, counted.counts.max())), cmap='inferno', interpolation='nearest',
+    )  # fmt: skip
     axes.plot(floor.profile_px, np.arange(data.camera.height), color='#00e5ff', linewidth=0.7)
+    axes.set(xlabel='disparity [px]', ylabel='image row', title=f'frame {frame.index}')
+    axes.set_facecolor('black')
     return _png(figure)
 
 
@@ -106,38 +104,6 @@ def memory_picture(memory: dict[str, Any]) -> bytes | None:
     axes.set_ylabel('MB')
     axes.grid(alpha=0.3)
     return _png(figure)
-
-
-def _upright(data: ReportData, disparity_px: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the pixels of columns with many pixels at one disparity: something upright."""
-    camera = data.camera
-    bins = (disparity_px + 0.5).astype(np.intp)
-    number = int(bins.max()) + 1
-    rows_per_m = camera.fy / camera.disparity_times_depth
-    slope = FloorLine.of(camera, data.mount).slope
-    limit = obstacle_rows(
-        np.arange(number), data.floor_settings.obstacle_height_m, rows_per_m, 1 / slope
-    )
-    upright = u_disparity(bins, number) > limit[:, None]
-    return np.asarray(upright[bins, np.arange(camera.width)])
-
-
-def _show_v_disparity(
-    axes: Axes, data: ReportData, disparity_px: NDArray[np.float32], pixels: NDArray[np.bool_]
-) -> None:
-    height, width = disparity_px.shape
-    shear = FloorLine.of(data.camera, data.mount).shear * (np.arange(width) - data.camera.cx)
-    row = (np.arange(height)[:, None] + shear)[pixels]
-    top = float(np.ceil(disparity_px.max())) + 1
-    counts, _, _ = np.histogram2d(
-        row, disparity_px[pixels], bins=(height, int(4 * top)), range=((0, height), (0, top))
-    )
-    axes.imshow(
-        np.where(counts > 0, counts, np.nan), extent=(0, top, height, 0), aspect='auto',
-        norm=LogNorm(1, max(2.0, counts.max())), cmap='inferno', interpolation='nearest',
-    )  # fmt: skip
-    axes.set(xlabel='disparity [px]', ylabel='image row')
-    axes.set_facecolor('black')
 
 
 def _tinted(item: MaskedFrame, tints: dict[int, tuple[int, int, int]]) -> bytes:

@@ -23,45 +23,37 @@ class EvidenceHistory:
     What the latest keyframes overwrote is kept, so that they can be taken back one by one: moves
     after local bundle adjustment concern these. The raster depends on evidence and poses alone,
     not on how often and when it was asked for.
+
+    evidence: of the keyframes; poses: (K, 3) = x, y, yaw, where it now lies.
     """
 
     def __init__(self, folder: EvidenceFolder) -> None:
         self._folder = folder
-        self._evidence: list[KeyframeEvidence] = []
-        self._poses: NDArray[np.float64] = np.zeros((0, 3))
+        self.evidence: list[KeyframeEvidence] = []
+        self.poses: NDArray[np.float64] = np.zeros((0, 3))
         self._raster = LogOddsRaster()
         self._done = 0
         self._undo: deque[tuple[tuple[int, int], NDArray[np.uint8]]] = deque()
         self._undo_bytes = 0
 
     def __len__(self) -> int:
-        return len(self._evidence)
+        return len(self.evidence)
 
-    @property
-    def poses(self) -> NDArray[np.float64]:
-        """The poses (K, 3) = x, y, yaw the evidence now lies at."""
-        return self._poses
-
-    @property
-    def evidence(self) -> list[KeyframeEvidence]:
-        """The evidence of the keyframes, one for each pose."""
-        return self._evidence
-
-    def append(self, evidence: KeyframeEvidence, pose: Pose2d) -> None:
-        """Add the evidence of the next keyframe."""
-        self._evidence.append(evidence)
-        self._poses = np.concatenate([self._poses, [pose]])
+    def extend(self, evidence: list[KeyframeEvidence], poses: NDArray[np.float64]) -> None:
+        """Add the evidence of the next keyframes, at poses (K, 3) = x, y, yaw."""
+        self.evidence += evidence
+        self.poses = np.concatenate([self.poses, poses])
 
     def move(self, first: int, poses: NDArray[np.float64]) -> None:
         """Set the poses (K - first, 3) of keyframe `first` and all after it."""
-        self._poses[first:] = poses
+        self.poses[first:] = poses
         self._return_to(first)
 
     def remove(self, gone: NDArray[np.bool_]) -> None:
         """Forget the evidence of some keyframes (K,)."""
         self._return_to(int(np.argmax(gone)))
-        self._evidence = [e for e, g in zip(self._evidence, gone, strict=True) if not g]
-        self._poses = self._poses[~gone]
+        self.evidence = [e for e, g in zip(self.evidence, gone, strict=True) if not g]
+        self.poses = self.poses[~gone]
 
     def fold_anew(self, folder: EvidenceFolder) -> None:
         """Fold all evidence again by other rules."""
@@ -70,8 +62,8 @@ class EvidenceHistory:
 
     def raster(self) -> LogOddsRaster:
         """Return the raster of all keyframes."""
-        while self._done < len(self._evidence):
-            evidence = self._evidence[self._done]
+        while self._done < len(self.evidence):
+            evidence = self.evidence[self._done]
             pose, previous = self._pose(self._done), self._previous(self._done)
             placed = self._folder.place(evidence, pose, previous)
             cells = self._raster.patch(placed.low, placed.high)
@@ -81,13 +73,13 @@ class EvidenceHistory:
         return self._raster
 
     def _pose(self, index: int) -> Pose2d:
-        x, y, yaw = self._poses[index].tolist()
+        x, y, yaw = self.poses[index].tolist()
         return (x, y, yaw)
 
     def _previous(self, index: int) -> Pose2d | None:
         if index == 0:
             return None
-        stride = np.hypot(*(self._poses[index, :2] - self._poses[index - 1, :2]))
+        stride = np.hypot(*(self.poses[index, :2] - self.poses[index - 1, :2]))
         return self._pose(index - 1) if stride <= _MAX_STRIDE_M else None
 
     def _remember(self, low: tuple[int, int], cells: NDArray[np.uint8]) -> None:

@@ -76,7 +76,7 @@ def gather_evidence(
         positions_m=np.concatenate([rays, ends, starts, obstacles]).T.astype(np.float16),
         num_rays=len(rays),
         num_contacts=len(starts),
-        thickness_m=_thickness_m(starts, scan, settings),
+        thickness_m=_thickness_m(starts, scan),
         sure_range_m=_sure_range_m(scan, settings),
     )
 
@@ -171,9 +171,7 @@ def _contacts(scan: FloorScan, faces_m: Array) -> tuple[Array, Array]:
     return start, end
 
 
-def _thickness_m(
-    faces: Array, scan: FloorScan, settings: OccupancyGridSettings
-) -> NDArray[np.float16]:
+def _thickness_m(faces: Array, scan: FloorScan) -> NDArray[np.float16]:
     """Return how deep (C,) to mark behind faces (C, 2): two sigma of their distance, and no less
     than things that stand have.
     """

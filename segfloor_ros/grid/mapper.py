@@ -16,7 +16,7 @@ from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.map_file import Arrays
+from segfloor_ros.map_file import Arrays, check_lengths
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5
@@ -61,8 +61,7 @@ class OccupancyGridMapper:
         if at == len(path.stamp_ns) or path.stamp_ns[at] != stamp_ns:
             raise MapError(f'keyframe {stamp_ns} ns is not in its own path of keyframes')
         evidence = gather_evidence(points, features, path.T_map_base[at], scan, self._settings)
-        x, y, yaw = poses[at].tolist()
-        self._history.append(evidence, (x, y, yaw))
+        self._history.extend([evidence], poses[at : at + 1])
         self._stamp_ns = np.append(self._stamp_ns, np.int64(stamp_ns))
 
     def grid(self) -> OccupancyGrid:
@@ -76,10 +75,9 @@ class OccupancyGridMapper:
 
     def from_arrays(self, arrays: Arrays, stamp_ns: NDArray[np.int64]) -> None:
         """Go on with the evidence of a map, with its keyframes at stamps (K,), ascending."""
-        for evidence, (x, y, yaw) in zip(
-            evidence_from_arrays(arrays), arrays['pose'].tolist(), strict=True
-        ):
-            self._history.append(evidence, (x, y, yaw))
+        evidence = evidence_from_arrays(arrays)
+        check_lengths({'evidence': evidence, 'pose': arrays['pose'], 'stamp_ns': stamp_ns})
+        self._history.extend(evidence, arrays['pose'])
         self._stamp_ns = stamp_ns
 
     def _follow(self, stamp_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
@@ -112,8 +110,7 @@ class OccupancyGridMapper:
         (earlier, before), latest = self._aside, self._history
         self._history, self._aside = EvidenceHistory(EvidenceFolder(self._settings)), None
         for history in (before, latest):
-            for evidence, (x, y, yaw) in zip(history.evidence, history.poses.tolist(), strict=True):
-                self._history.append(evidence, (x, y, yaw))
+            self._history.extend(history.evidence, history.poses)
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
 
 

@@ -39,11 +39,6 @@ class PlacedEvidence:
     thickness: Array
     sure_range: float
 
-    @property
-    def base(self) -> Array:
-        """Where the base is, (2,)."""
-        return self.fan.centre
-
 
 def place(
     evidence: KeyframeEvidence,

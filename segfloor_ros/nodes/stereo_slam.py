@@ -186,7 +186,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
     def _process(self, stamp_ns: int, pair: Pair) -> None:
         start = time.perf_counter()
         try:
-            slam = self._slam or self._start(stamp_ns, pair)
+            slam = self._slam or self._start(pair)
             images = self._camera.images(pair)
             mask = self._masks.mask_for(stamp_ns, self._camera.rectifier)
             frame = StereoFrame(self._frame_count, stamp_ns, *images, mask)
@@ -213,7 +213,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         if not results:
             self._report_held(stamp_ns, slam)
 
-    def _start(self, stamp_ns: int, pair: Pair) -> StereoSlam:
+    def _start(self, pair: Pair) -> StereoSlam:
         """Build the stage, now that the calibration is known."""
         camera = self._camera.rectifier.camera
         self._calibration = self._camera.calibration
