@@ -73,8 +73,8 @@ def resolve(
         _merge(values, _with_one_robot(read_params_file(params_file), str(params_file)))
     assigned: dict[str, dict[str, Any]] = {}
     for assignment in assignments:
-        for stage, name, value in _parse_assignment(assignment):
-            assigned.setdefault(stage, {})[name] = value
+        stage, name, value = _parse_assignment(assignment)
+        assigned.setdefault(stage, {})[name] = value
     _merge(values, _with_one_robot(assigned, '--set'))
     _merge(values, stage_changes)
     stages: dict[str, Any] = {
@@ -129,8 +129,8 @@ def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, di
     return values
 
 
-def _parse_assignment(assignment: str) -> list[tuple[str, str, Any]]:
-    """Return stage, name and value; of the robot's parameters, which need no stage, for each."""
+def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
+    """Return stage, name and value; the robot's parameters need no stage."""
     key, separator, text = assignment.partition('=')
     stage, dot, name = key.strip().partition('.')
     if not separator or not (dot or stage in ROBOT_PARAMETERS):
@@ -140,10 +140,10 @@ def _parse_assignment(assignment: str) -> list[tuple[str, str, Any]]:
     except (yaml.YAMLError, ValueError):
         raise SettingsError(f'--set {assignment}: {text} is no value in YAML') from None
     if not dot:
-        return [(owner, stage, value) for owner in ROBOT_STAGES]
+        return ROBOT_STAGES[0], stage, value
     if stage not in STAGE_SETTINGS:
         raise SettingsError(f'unknown stage {stage}{suggestion(stage, list(STAGE_SETTINGS))}')
-    return [(stage, name, value)]
+    return stage, name, value
 
 
 def _with_one_robot(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:

@@ -50,21 +50,15 @@ class StereoRectifier:
         """
         for side, image in (('the left image', left), ('the right image', right)):
             self.calibration.check_size(image.shape[1], image.shape[0], side)
-        left = deblocked(left)
-        if is_disparity(right):
-            if self._maps is None:
-                return left, right
-            nearest = cv2.remap(
-                right, *self._maps[0], cv2.INTER_NEAREST, borderValue=(float('nan'),)
-            )
-            return cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR), nearest
-        right = deblocked(right)
+        left, right = (im if is_disparity(im) else deblocked(im) for im in (left, right))
         if self._maps is None:
             return left, right
-        return (
-            cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR),
-            cv2.remap(right, *self._maps[1], cv2.INTER_LINEAR),
-        )
+        left_maps, right_maps = self._maps
+        rectified = cv2.remap(left, *left_maps, cv2.INTER_LINEAR)
+        if is_disparity(right):
+            nan = (float('nan'),)
+            return rectified, cv2.remap(right, *left_maps, cv2.INTER_NEAREST, borderValue=nan)
+        return rectified, cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
 
     def rectify_mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return a mask (H, W) of the raw left image on the rectified one: 255 where it is more

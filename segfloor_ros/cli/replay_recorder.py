@@ -84,15 +84,17 @@ class ReplayRecorder(Node):
     @property
     def loops(self) -> int:
         """How many loops SLAM has closed."""
-        last = self.answers.get(max(self.answers, default=0))
-        return int(last.values.get('loops', 0)) if last is not None else 0
+        return int(self._last_value('loops') or 0)
 
     @property
     def remarks(self) -> list[str]:
         """What seems wrong with sensors, in words."""
-        last = self.answers.get(max(self.answers, default=0))
-        text = last.values.get('remarks', '') if last is not None else ''
+        text = self._last_value('remarks')
         return text.split(diagnostics.REMARKS_APART) if text else []
+
+    def _last_value(self, name: str) -> str:
+        """Return what SLAM's latest answer says, '' before the first one."""
+        return self.answers[max(self.answers)].values.get(name, '') if self.answers else ''
 
     def unanswered(self) -> set[int]:
         """Return the stamps of frames that SLAM has not answered."""

@@ -13,6 +13,7 @@ from segfloor_ros.geometry import Array
 SUBPIXEL_BITS = 4
 SAME_SURFACE_SHARE = 0.06
 """Neighbouring bearings whose ranges differ by more than this share end at different things."""
+TURN = 2 * np.pi
 _SLANT_STEPS = 3
 _MAX_SLANT = 4.0
 
@@ -92,7 +93,7 @@ class Fan:
 
     def _contains(self, x: Array, y: Array, left: Array, right: Array) -> NDArray[np.bool_]:
         """Tell which points (N,), (N,), relative to the centre, lie within their wedge."""
-        bearing = np.remainder(np.arctan2(y, x) - self.first_rad, 2 * np.pi)
+        bearing = np.remainder(np.arctan2(y, x) - self.first_rad, TURN)
         index = (bearing * (1 / self.step_rad)).astype(np.intp)
         within = index < left.shape[1]
         index *= within
@@ -138,3 +139,24 @@ def fixed_point(xy_cells: Array) -> NDArray[np.int32]:
     pixels = np.empty((xy_cells.shape[1], 2), np.int32)
     np.rint(scaled.T, out=pixels, casting='unsafe')
     return pixels
+
+
+def nearest_cells(
+    column: NDArray[np.integer], row: NDArray[np.integer], fan: Fan
+) -> NDArray[np.float64]:
+    """Return the distance (S,) in cells to the nearest of some cells along a fan's bearings.
+
+    column, row: (N,). A cell covers the bearings within half a cell of its centre; bearings that
+    no cell covers are infinite.
+    """
+    x, y = column + (0.5 - fan.centre[0]), row + (0.5 - fan.centre[1])
+    distance: Array = np.sqrt(x * x + y * y)
+    bearing = np.remainder(np.arctan2(y, x) - fan.first_rad, TURN) * (1 / fan.step_rad)
+    half_width = (0.5 / fan.step_rad) / np.maximum(distance, 0.5)
+    first = np.ceil(bearing - half_width).astype(np.intp)
+    count = np.floor(bearing + half_width).astype(np.intp) - first + 1
+    start = np.cumsum(count) - count
+    index = np.arange(count.sum()) + np.repeat(first - start, count)
+    nearest = np.full(int(np.ceil(TURN / fan.step_rad)), np.inf)
+    np.minimum.at(nearest, index % len(nearest), np.repeat(distance, count))
+    return nearest[: len(fan.lengths)]

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.grid.blocking import nearest_cells
-from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point
+from segfloor_ros.grid.fan import SUBPIXEL_BITS, Fan, fixed_point, nearest_cells
 from segfloor_ros.grid.hits import draw_bands, draw_hits, draw_rays
 from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 from segfloor_ros.grid.log_odds import (

@@ -185,5 +185,5 @@ def test_memory_of_a_keyframe_is_small() -> None:
     recording = Recording(1)
     mapper = OccupancyGridMapper(OccupancyGridSettings())
     recording.feed(mapper, 0, path_of(recording.poses))
-    evidence = mapper._history._evidence[0]
+    evidence = mapper._history.evidence[0]
     assert evidence.fan_m.nbytes + evidence.positions_m.nbytes < 3000

@@ -13,8 +13,8 @@ import numpy as np
 from segfloor_ros.camera import ros_messages
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
+from segfloor_ros.camera.sources.bag_topics import check_given
 from segfloor_ros.camera.sources.sensor_files import IMU, WHEEL_ODOMETRY, check_gravity, is_upright
-from segfloor_ros.errors import InputError
 from segfloor_ros.frames import FrameTree
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import Measurement, RecordedSensor, WheelPose
@@ -97,14 +97,10 @@ def _imu_topic(path: Path, bag: BagFile, given: str) -> str:
 
 
 def _topics(path: Path, bag: BagFile, kind: str, given: str, setting: str) -> list[str]:
-    found = [t for t, topic in bag.topics.items() if topic.msgtype == kind and topic.num_messages]
-    if given and given not in found:
-        listed = ', '.join(sorted(found)) or 'none'
-        raise InputError(
-            f'{path}: no messages of type {kind} on {given}; set stereo_camera.{setting} to one '
-            f'of these: {listed}'
-        )
-    return sorted(found)
+    found = (t for t, topic in bag.topics.items() if topic.msgtype == kind and topic.num_messages)
+    topics = sorted(found)
+    check_given(str(path), given, topics, f'messages of type {kind}', setting)
+    return topics
 
 
 def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:

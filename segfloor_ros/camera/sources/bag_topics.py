@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os.path import commonpath
 
@@ -52,6 +52,15 @@ class StereoTopics:
         return all('image_rect' in topic for topic in images)
 
 
+def check_given(name: str, topic: str, found: Sequence[str], what: str, setting: str) -> None:
+    """Raise InputError where a topic that a setting names is not among those found in a bag."""
+    if topic and topic not in found:
+        raise InputError(
+            f'{name}: no {what} on {topic}; set stereo_camera.{setting} to one of these: '
+            f'{", ".join(found) or "none"}'
+        )
+
+
 def find_topics(name: str, types: Mapping[str, str], left: str, right: str) -> StereoTopics:
     """Return the stereo topics among those of a bag that hold messages.
 
@@ -59,18 +68,14 @@ def find_topics(name: str, types: Mapping[str, str], left: str, right: str) -> S
     Raises InputError listing the image topics when there is no pair.
     """
     images = sorted(t for t, kind in types.items() if kind in (IMAGE, COMPRESSED))
-    listed = ', '.join(images) or 'none'
     for side, topic in (('left', left), ('right', right)):
-        if topic and topic not in images:
-            raise InputError(
-                f'{name}: no images on {topic}; set stereo_camera.{side}_image_topic to one of its '
-                f'image topics: {listed}'
-            )
+        check_given(name, topic, images, 'images', f'{side}_image_topic')
     if not (left and right):
         candidates = [pair for pair in side_pairs(images) if left in ('', pair[0])]
         candidates = [pair for pair in candidates if right in ('', pair[1])]
         pictures = [pair for pair in candidates if not any(w in pair[0] for w in NO_PICTURES)]
         if not pictures:
+            listed = ', '.join(images) or 'none'
             raise InputError(
                 f'{name}: no pair of left and right image topics (its image topics: {listed}); '
                 'set stereo_camera.left_image_topic and right_image_topic; one camera alone does '
@@ -98,14 +103,8 @@ def find_depth_topics(
     """
     images = sorted(t for t, kind in types.items() if kind in (IMAGE, COMPRESSED))
     depth = [t for t in images if types[t] == IMAGE and 'depth' in t.lower()]
-    if settings.depth_topic:
-        if settings.depth_topic not in depth:
-            listed = ', '.join(depth) or 'none'
-            raise InputError(
-                f'{name}: no depth images on {settings.depth_topic}; set '
-                f'stereo_camera.depth_topic to one of these: {listed}'
-            )
-        depth = [settings.depth_topic]
+    check_given(name, settings.depth_topic, depth, 'depth images', 'depth_topic')
+    depth = [settings.depth_topic] if settings.depth_topic else depth
     pictures = [t for t in images if not any(word in t.lower() for word in NO_PICTURES)]
     if not depth or not pictures:
         return None
