@@ -39,21 +39,20 @@ class CloudLabelling:
         cloud: SparseCloud,
         features: KeyframeFeatures,
         mask: NDArray[np.uint8],
-        T_map_base: Array | None = None,
+        T_map_base: Array,
     ) -> LabelledPoints:
         """Take in one keyframe and return the whole cloud with its labels.
 
         mask: (H, W) uint8, the keyframe's floor mask. T_map_base: (4, 4) pose of the keyframe's
-        base, where known: heights are then measured from the floor below that base, with an error
-        that grows with the distance the point was seen from; else from the plane z = 0 of the map,
-        moved to the floor points in view.
+        base: heights are measured from the floor below it, with an error that grows with the
+        distance the point was seen from.
         """
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
-        floor_z, distance_m = local_floor_m(xyz, looks < 0, T_map_base)
+        floor_z, distance_m = local_floor_m(xyz, T_map_base)
         table.look(row, looks, settings.max_mask_log_odds, floor_z, distance_m)
         z_m = cloud.xyz_map[:, 2]
         stale = table['judged_z_m'] != z_m

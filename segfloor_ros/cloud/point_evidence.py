@@ -9,8 +9,6 @@ from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
 
-_ENOUGH_FLOOR_POINTS = 12
-
 
 def mask_evidence(mask: NDArray[np.uint8], uv_px: NDArray[np.float32]) -> Array:
     """Return -1 for floor, +1 for not floor and 0 for neither at pixels (N, 2) of a mask (H, W).
@@ -31,21 +29,12 @@ def mask_evidence(mask: NDArray[np.uint8], uv_px: NDArray[np.float32]) -> Array:
     return np.where(floor & upright, 0.0, evidence)
 
 
-def local_floor_m(
-    xyz_map: Array, on_floor: NDArray[np.bool_], T_map_base: Array | None
-) -> tuple[Array, Array]:
-    """Return the height (N,) of the floor below points (N, 3) and their distances (N,) in metres.
-
-    The floor is the base's plane; without a pose the plane of the map, moved to the median of the
-    points that the mask calls floor, where there are enough of them.
+def local_floor_m(xyz_map: Array, T_map_base: Array) -> tuple[Array, Array]:
+    """Return the height (N,) of the floor, the base's plane, below points (N, 3), and the distances
+    (N,) of the points from the base in metres.
     """
-    if T_map_base is not None:
-        in_base = transform_points(invert(T_map_base), xyz_map)
-        return xyz_map[:, 2] - in_base[:, 2], np.hypot(in_base[:, 0], in_base[:, 1])
-    level = 0.0
-    if np.count_nonzero(on_floor) >= _ENOUGH_FLOOR_POINTS:
-        level = float(np.median(xyz_map[on_floor, 2]))
-    return np.full(len(xyz_map), level), np.zeros(len(xyz_map))
+    in_base = transform_points(invert(T_map_base), xyz_map)
+    return xyz_map[:, 2] - in_base[:, 2], np.hypot(in_base[:, 0], in_base[:, 1])
 
 
 def height_evidence(height_m: Array, sigma_m: Array, settings: CloudLabellingSettings) -> Array:

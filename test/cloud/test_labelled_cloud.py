@@ -12,6 +12,7 @@ from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, SparseCloud
 MASK = np.full((40, 60), 127, np.uint8)
 MASK[20:] = 255
 MASK[:10] = 0
+HERE = np.eye(4)
 ON_FLOOR, ON_OBSTACLE, NOWHERE = (30.0, 30.0), (30.0, 4.0), (30.0, 15.0)
 
 
@@ -35,7 +36,7 @@ def test_mask_and_height_give_the_label() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     points = {1: (1.0, 0.0, 0.0), 5: (2.0, 0.0, 0.4), 9: (1.0, 1.0, 0.02)}
     seen = features({1: ON_FLOOR, 5: ON_OBSTACLE, NO_POINT: ON_FLOOR})
-    labelled = labelling.update(cloud(points), seen, MASK)
+    labelled = labelling.update(cloud(points), seen, MASK, HERE)
     assert label_of(labelled) == {1: FLOOR, 5: OBSTACLE, 9: UNKNOWN}
     assert labelled.confidence[0] > 0.5
     assert labelled.confidence[1] > 0.5
@@ -49,13 +50,13 @@ def test_every_look_counts_and_one_wrong_mask_changes_nothing() -> None:
     labelling = CloudLabelling(settings)
     points = cloud({1: (1.0, 0.0, 0.0)})
     # One look, 0.6, is less than the 0.8 a label takes; two are enough.
-    assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK)) == {1: UNKNOWN}
-    labelled = labelling.update(points, features({1: ON_FLOOR}), MASK)
+    assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)) == {1: UNKNOWN}
+    labelled = labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
     assert label_of(labelled) == {1: FLOOR}
     assert labelled.confidence[0] == pytest.approx(np.tanh(0.6))
     # Contradicted, it keeps its label until the evidence for the other exceeds 0.8: 1.2 - 4 * 0.6.
     for expected in (FLOOR, FLOOR, FLOOR, OBSTACLE):
-        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK)
+        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK, HERE)
         assert label_of(labelled) == {1: expected}
 
 
@@ -64,9 +65,9 @@ def test_evidence_of_the_mask_is_bounded() -> None:
     labelling = CloudLabelling(settings)
     points = cloud({1: (1.0, 0.0, 0.0)})
     for _ in range(50):
-        labelling.update(points, features({1: ON_FLOOR}), MASK)
+        labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
     for _ in range(4):
-        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK)
+        labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK, HERE)
     assert label_of(labelled) == {1: OBSTACLE}
 
 
@@ -76,7 +77,9 @@ def test_borders_of_the_mask_say_nothing() -> None:
     mask[20:] = 255
     points = cloud({1: (1.0, 0.0, 0.0), 2: (1.0, 0.2, 0.0)})
     for _ in range(5):
-        labelled = labelling.update(points, features({1: (30.0, 20.0), 2: (30.0, 21.0)}), mask)
+        labelled = labelling.update(
+            points, features({1: (30.0, 20.0), 2: (30.0, 21.0)}), mask, np.eye(4)
+        )
     assert label_of(labelled) == {1: UNKNOWN, 2: FLOOR}
 
 
@@ -84,16 +87,20 @@ def test_points_above_the_robot_and_far_below_the_floor_are_neither() -> None:
     labelling = CloudLabelling(CloudLabellingSettings(robot_height_m=0.8))
     points = cloud({1: (1.0, 0.0, 0.9), 2: (1.0, 0.0, 0.7), 3: (1.0, 0.0, -0.5)})
     seen = features({1: ON_OBSTACLE, 2: ON_OBSTACLE, 3: ON_FLOOR})
-    assert label_of(labelling.update(points, seen, MASK)) == {1: UNKNOWN, 2: OBSTACLE, 3: UNKNOWN}
+    assert label_of(labelling.update(points, seen, MASK, HERE)) == {
+        1: UNKNOWN,
+        2: OBSTACLE,
+        3: UNKNOWN,
+    }
 
 
 def test_removed_points_disappear_moved_ones_move_ids_stay() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     start = {2: (1.0, 0.0, 0.0), 4: (2.0, 0.0, 0.5), 7: (3.0, 0.0, 0.3)}
     seen = features({2: ON_FLOOR, 4: ON_OBSTACLE, 7: ON_OBSTACLE})
-    labelling.update(cloud(start), seen, MASK)
+    labelling.update(cloud(start), seen, MASK, HERE)
     after = {1: (9.0, 0.0, 0.0), 4: (2.5, 0.1, 0.5), 7: (3.0, 0.0, 2.0)}
-    labelled = labelling.update(cloud(after), features({}), MASK)
+    labelled = labelling.update(cloud(after), features({}), MASK, HERE)
     # 7 was corrected to above the robot; 1 was never looked at; 2 is gone.
     assert label_of(labelled) == {1: UNKNOWN, 4: OBSTACLE, 7: UNKNOWN}
     np.testing.assert_allclose(labelled.xyz_map[1], [2.5, 0.1, 0.5])
@@ -108,21 +115,11 @@ def test_heights_are_those_above_the_floor_below_the_base() -> None:
     assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE}
 
 
-def test_without_a_pose_the_floor_in_view_is_the_level() -> None:
-    labelling = CloudLabelling(CloudLabellingSettings())
-    points = {i: (1.0, 0.1 * i, -0.2) for i in range(20)} | {30: (1.0, 0.0, 0.0)}
-    seen = features({**dict.fromkeys(range(20), ON_FLOOR), 30: NOWHERE})
-    labels = label_of(labelling.update(cloud(points), seen, MASK))
-    assert labels[3] == FLOOR
-    assert labels[30] == OBSTACLE
-
-
 def test_heights_of_far_points_count_less() -> None:
     far, near = CloudLabelling(CloudLabellingSettings()), CloudLabelling(CloudLabellingSettings())
-    at_base = np.eye(4)
     seen = features({1: NOWHERE})
-    close = near.update(cloud({1: (1.0, 0.0, 0.07)}), seen, MASK, at_base)
-    distant = far.update(cloud({1: (9.0, 0.0, 0.07)}), seen, MASK, at_base)
+    close = near.update(cloud({1: (1.0, 0.0, 0.07)}), seen, MASK, HERE)
+    distant = far.update(cloud({1: (9.0, 0.0, 0.07)}), seen, MASK, HERE)
     assert label_of(close) == {1: OBSTACLE}
     assert label_of(distant) == {1: UNKNOWN}
 
@@ -131,11 +128,13 @@ def test_heights_of_far_points_count_less() -> None:
 def test_heights_that_are_less_certain_count_less(sigma_m: float, expected: int) -> None:
     labelling = CloudLabelling(CloudLabellingSettings(height_sigma_m=sigma_m))
     points, seen = cloud({1: (1.0, 0.0, 0.07)}), features({1: NOWHERE})
-    assert label_of(labelling.update(points, seen, MASK, np.eye(4))) == {1: expected}
+    assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: expected}
 
 
 def test_empty_cloud() -> None:
-    labelled = CloudLabelling(CloudLabellingSettings()).update(cloud({}), features({}), MASK)
+    labelled = CloudLabelling(CloudLabellingSettings()).update(
+        cloud({}), features({}), MASK, np.eye(4)
+    )
     assert labelled.label.shape == (0,)
     assert labelled.xyz_map.shape == (0, 3)
 
@@ -154,11 +153,11 @@ def test_labels_do_not_depend_on_which_points_were_judged_anew() -> None:
             xyz[i] = (*xyz[i][:2], xyz[i][2] + rng.normal(scale=0.05))
         xyz |= {200 + 10 * step + i: (2.0, 0.0, rng.uniform(0, 1)) for i in range(10)}
         pixels = {int(i): tuple(rng.uniform(0, (59, 39))) for i in rng.choice(list(xyz), 60, False)}
-        one = sparing.update(cloud(xyz), features(pixels), MASK)
+        one = sparing.update(cloud(xyz), features(pixels), MASK, HERE)
         thorough.settings = dataclasses.replace(settings, max_mask_log_odds=10.0 + 0.1 * step)
-        thorough.update(cloud(xyz), features({}), MASK)
+        thorough.update(cloud(xyz), features({}), MASK, HERE)
         thorough.settings = settings
-        other = thorough.update(cloud(xyz), features(pixels), MASK)
+        other = thorough.update(cloud(xyz), features(pixels), MASK, HERE)
         np.testing.assert_array_equal(one.label, other.label)
         np.testing.assert_array_equal(one.confidence, other.confidence)
         unmoved += len(xyz) - len(pixels)
@@ -170,6 +169,6 @@ def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     seen = features({1: ON_OBSTACLE})
     points = cloud({1: (1.0, 0.0, 0.5)})
-    assert label_of(labelling.update(points, seen, MASK)) == {1: OBSTACLE}
+    assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: OBSTACLE}
     labelling.settings = dataclasses.replace(labelling.settings, robot_height_m=0.4)
-    assert label_of(labelling.update(points, features({}), MASK)) == {1: UNKNOWN}
+    assert label_of(labelling.update(points, features({}), MASK, HERE)) == {1: UNKNOWN}
