@@ -224,7 +224,7 @@ def map_of(seen: list[Seen], configuration: Configuration) -> OccupancyGrid:
 def score(grid: OccupancyGrid, drive: Path) -> MapScore:
     """Return the score of a map of a simulated drive."""
     truth = load_truth(drive)
-    return score_map(grid, truth, truth.start_pose or (0.0, 0.0, 0.0))
+    return score_map(grid, truth)
 
 
 def figures(score: MapScore) -> list[float]:

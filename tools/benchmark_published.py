@@ -86,7 +86,7 @@ def run_scene(
         map_recording, name, recording, configuration, threads, on_progress=report
     )
     truth = load_truth(recording)
-    pose = truth.start_pose or (0.0, 0.0, 0.0)
+    pose = truth.start
     save_map(grid, folder / 'map.yaml')
     save_overlay(compare(grid, truth, pose), folder / 'overlay.png')
     score = score_map(grid, truth, pose, RoadMapPlan(nodes=published.nodes))

@@ -86,7 +86,7 @@ def measure(scene: Scene, drive: Path, results: Path) -> Outcome:
     """Score what came of a drive."""
     path = score_trajectory(match_files(results, drive))
     estimate, truth = load_map(results / 'map.yaml'), load_truth(drive)
-    alignment = truth.start_pose or (0.0, 0.0, 0.0)
+    alignment = truth.start
     score, maps = score_map(estimate, truth, alignment), compare(estimate, truth, alignment)
     in_sight, long_ago = _seen_again(scene, truth, _stamped_poses(drive))
     of_seen = score_road_maps(

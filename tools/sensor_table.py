@@ -137,7 +137,7 @@ def measure(
             on_progress(done)
         grid = pipeline.finish() if pipeline else None
     truth = load_truth(recording)
-    score = score_map(grid, truth, truth.start_pose or (0.0, 0.0, 0.0)) if grid else None
+    score = score_map(grid, truth) if grid else None
     assert path is not None
     errors_m = _errors_m(results, path, recording)
     return Measured(

@@ -72,7 +72,7 @@ def fine_truth(scene: str, drive: Path) -> MapTruth:
     """Return the true map of a scene, in cells of 1 cm, and where the drive begins in it."""
     truth = load_truth(drive)
     made = dataclasses.replace(open_scene(scene), resolution_m=FINE_M)
-    start = np.array((truth.start_pose or (0.0, 0.0, 0.0))[:2])
+    start = np.array(truth.start[:2])
     grid = true_map(made, obstacles(made), floors(made), start)
     return dataclasses.replace(truth, grid=grid)
 
@@ -82,7 +82,7 @@ def depth_m(grid: OccupancyGrid, truth: MapTruth) -> NDArray[np.float64]:
     blocked = (states(truth.grid) != FREE).astype(np.uint8)
     far = cv2.distanceTransform(blocked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     free = cell_centres(grid)[states(grid).ravel() == FREE]
-    there: Array = from_frame(free, truth.start_pose or (0.0, 0.0, 0.0))
+    there: Array = from_frame(free, truth.start)
     there = (there - np.array(truth.grid.origin_xy_m)) / truth.grid.resolution_m
     column, row = np.floor(there).astype(np.intp).T
     height, width = far.shape
@@ -106,7 +106,7 @@ def main(
         for name in (NOTHING, *(only or ())):
             with {**GRID, **FLOOR}[name].left_out():
                 grid = map_by_truth(drive, every, configuration)
-            cells = score_cells(compare(grid, coarse, coarse.start_pose or (0.0, 0.0, 0.0)))
+            cells = score_cells(compare(grid, coarse))
             depth = depth_m(grid, fine)
             shares = (cells.free_precision, cells.free_recall, cells.occupied_recall)
             figures = [100 * share for share in (*shares, float((depth < FINE_M / 2).mean()))]

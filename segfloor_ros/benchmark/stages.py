@@ -27,9 +27,6 @@ JSON_VERSION = 1
 Progress = Callable[[int], None]
 """Told how many steps are done."""
 
-Announce = Callable[[str, int], Progress]
-"""Told the name of a workload and its number of steps; returns whom to tell how many are done."""
-
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkPlan:
@@ -55,10 +52,11 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 
 
 def run_benchmark(
-    plan: BenchmarkPlan, configuration: Configuration, announce: Announce
+    plan: BenchmarkPlan, configuration: Configuration, announce: Callable[[str, int], Progress]
 ) -> list[Workload]:
     """Measure all stages on images, then labelling and grid at every size, each in a process of
-    its own.
+    its own. announce: told the name of a workload and its number of steps; returns whom to tell how
+    many are done.
     """
     workloads = [
         run_apart(measure_images, plan, configuration, on_progress=announce('images', plan.frames))

@@ -52,15 +52,14 @@ def _print_scores(out: Path) -> None:
     from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 
     truth = load_truth(DRIVE)
-    pose = truth.start_pose or (0.0, 0.0, 0.0)
     grid = load_map(out / 'map.yaml')
-    console.print(map_table(score_map(grid, truth, pose)))
+    console.print(map_table(score_map(grid, truth)))
     path = score_trajectory(match_files(out, DRIVE))
     console.print(
         f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
         f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)',
         highlight=False,
     )
-    save_overlay(compare(grid, truth, pose), out / 'overlay.png')
+    save_overlay(compare(grid, truth), out / 'overlay.png')
     console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)

@@ -167,7 +167,7 @@ def evaluate_report(
 def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> Pose2d:
     """Return where the estimate's frame lies in the truth's, as `--align` says."""
     if align == 'none':
-        return truth.start_pose or (0.0, 0.0, 0.0)
+        return truth.start
     if align == 'found':
         return find_alignment(estimate, truth.grid, truth.start_pose)
     try:

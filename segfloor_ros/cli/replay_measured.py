@@ -19,10 +19,11 @@ from rich.table import Table
 from std_srvs.srv import SetBool
 
 from segfloor_ros.cli.output import value_table
-from segfloor_ros.cli.replay_nodes import NodeGraph, ProgressListener, running_nodes
+from segfloor_ros.cli.replay_nodes import NodeGraph, running_nodes
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.configuration import Configuration
+from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM

@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.errors import SegfloorError
+from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS
 
 # DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
@@ -43,9 +44,6 @@ SERVICE_S = 10.0
 SPIN_S = 0.1
 
 Recorder = TypeVar('Recorder', bound=ReplayRecorder)
-
-ProgressListener = Callable[[int, str], None]
-"""Told every now and then: how many frames are done, and the state in words."""
 
 
 def isolated_environment() -> dict[str, str]:

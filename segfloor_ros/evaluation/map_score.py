@@ -17,6 +17,7 @@ from segfloor_ros.grid.occupancy import OccupancyGrid
 
 DEFAULT_RANGE_M = 5.0
 DEFAULT_TOLERANCE_M = 0.1
+DEFAULT_PLAN = RoadMapPlan()
 
 Colour = tuple[int, int, int]
 
@@ -94,18 +95,19 @@ class Comparison:
 def compare(
     estimate: OccupancyGrid,
     truth: MapTruth,
-    alignment: Pose2d,
+    alignment: Pose2d | None = None,
     range_m: float = DEFAULT_RANGE_M,
 ) -> Comparison:
-    """Bring the estimate onto the truth's raster. Where the drive is known, only what it could
-    see within `range_m` counts for recall.
+    """Bring the estimate onto the truth's raster. alignment: where its frame lies in the truth's;
+    None: where the drive starts, as far as that is known. Where the drive is known, only what it
+    could see within `range_m` counts for recall.
     """
     true_states = states(truth.grid)
     floor, obstacles = true_states == FREE, true_states == OCCUPIED
     if truth.base_poses is not None:
         floor, obstacles = observable(truth.grid, truth.base_poses, truth.fov_rad, range_m)
     return Comparison(
-        resample(estimate, truth.grid, alignment),
+        resample(estimate, truth.grid, alignment or truth.start),
         true_states,
         floor,
         obstacles,
@@ -116,13 +118,12 @@ def compare(
 def score_map(
     estimate: OccupancyGrid,
     truth: MapTruth,
-    alignment: Pose2d = (0.0, 0.0, 0.0),
-    plan: RoadMapPlan | None = None,
+    alignment: Pose2d | None = None,
+    plan: RoadMapPlan = DEFAULT_PLAN,
     range_m: float = DEFAULT_RANGE_M,
     tolerance_m: float = DEFAULT_TOLERANCE_M,
 ) -> MapScore:
-    """Score an estimated map whose frame lies at `alignment` in the truth's frame."""
-    plan = plan or RoadMapPlan()
+    """Score an estimated map. alignment, range_m: as in `compare`."""
     maps = compare(estimate, truth, alignment, range_m)
     free = maps.estimate == FREE
     area_m2 = float(maps.wanted_floor.sum()) * maps.resolution_m**2
@@ -137,7 +138,7 @@ def score_map(
         plan.nodes_for(area_m2),
         area_m2,
         truth.base_poses is not None,
-        alignment,
+        alignment or truth.start,
     )
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.evaluation.prm import Mask
 from segfloor_ros.evaluation.truth import Pose2d
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.occupancy import OccupancyGrid
-
-Mask = NDArray[np.bool_]
 
 FREE_BELOW = 20
 OCCUPIED_FROM = 65

@@ -85,8 +85,7 @@ def _scores(data: ReportData) -> str:
     """Return the scores against the truth, where there is one."""
     if data.truth is None:
         return ''
-    pose = data.truth.start_pose or (0.0, 0.0, 0.0)
-    facts = _map_facts(score_map(data.grid, data.truth, pose))
+    facts = _map_facts(score_map(data.grid, data.truth))
     if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
         path = score_trajectory(match_files(data.folder, data.truth_folder))
         facts.append(
@@ -107,8 +106,7 @@ def _map_facts(score: MapScore) -> list[tuple[str, str]]:
 def _maps(data: ReportData) -> str:
     figures = [_figure(map_picture(data), 'Map with the path of the robot')]
     if data.truth is not None:
-        pose = data.truth.start_pose or (0.0, 0.0, 0.0)
-        overlay = draw_overlay(compare(data.grid, data.truth, pose))
+        overlay = draw_overlay(compare(data.grid, data.truth))
         png = bytes(cv2.imencode('.png', overlay)[1])
         figures.append(_figure(png, 'Map laid on the true one'))
     figures.append(_figure(cloud_picture(data), 'Labelled cloud from above: floor in green'))

@@ -32,6 +32,11 @@ class MapTruth:
     base_poses: Array | None = None
     fov_rad: float = float(DEFAULT_FOV_RAD)
 
+    @property
+    def start(self) -> Pose2d:
+        """Where the drive starts; the truth's own origin where nobody said."""
+        return self.start_pose or (0.0, 0.0, 0.0)
+
 
 def load_truth(path: Path) -> MapTruth:
     """Read a true map from a map YAML, or with poses from a scene folder (map.yaml, scene.yaml,

@@ -218,11 +218,6 @@ class Slack:
     relative: bool = False
 
 
-def judge(bounds: list[Bound], measured: Mapping[str, float]) -> list[Verdict]:
-    """Hold measured values against bounds."""
-    return [Verdict(bound, measured.get(bound.measure)) for bound in bounds]
-
-
 def bounds_of_baseline(baseline: Mapping[str, float], slacks: Mapping[str, Slack]) -> list[Bound]:
     """Return what must hold for values to be no worse than a baseline by more than a slack: the
     suite's, else the measure's own.

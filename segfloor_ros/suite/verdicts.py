@@ -10,7 +10,7 @@ from pathlib import Path
 from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
-from segfloor_ros.suite.measures import Verdict, bounds_of_baseline, judge
+from segfloor_ros.suite.measures import Verdict, bounds_of_baseline
 
 FORMAT = 1
 Baseline = Mapping[str, Mapping[str, float]]
@@ -61,7 +61,8 @@ def check(entry: Entry, outcome: Outcome, baseline: Baseline | None) -> Checked:
         bounds += bounds_of_baseline(baseline.get(entry.name, {}), entry.slacks)
     # The archive is in the suite's folder by now.
     known = {**vars(outcome), 'archive': b''}
-    return Checked(**known, verdicts=tuple(judge(bounds, outcome.measured)))
+    verdicts = tuple(Verdict(bound, outcome.measured.get(bound.measure)) for bound in bounds)
+    return Checked(**known, verdicts=verdicts)
 
 
 def write_baseline(result: SuiteResult, path: Path) -> None:

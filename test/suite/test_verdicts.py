@@ -14,9 +14,9 @@ from segfloor_ros.suite.job import Outcome
 from segfloor_ros.suite.measures import (
     Bound,
     Slack,
+    Verdict,
     agreement,
     bounds_of_baseline,
-    judge,
     measure_run,
 )
 from segfloor_ros.suite.page import write_junit, write_page
@@ -31,7 +31,7 @@ def test_measures_are_held_against_bounds():
         Bound('path_error_m', greatest=0.01),
         Bound('keyframes', 3, 9),
     ]
-    verdicts = judge(bounds, GOOD)
+    verdicts = [Verdict(bound, GOOD.get(bound.measure)) for bound in bounds]
     assert [verdict.holds for verdict in verdicts] == [True, False, False]
     assert str(verdicts[1]) == 'path_error_m: 0.012 m, wanted at most 0.01 m'
     assert str(verdicts[2]) == (
