@@ -70,6 +70,7 @@ SIDES = ('left', 'right')
 FRAME_PARTS = tuple(
     f'frame/{side}/{what}' for side in SIDES for what in ('image_rect', 'camera_info')
 )
+KEYFRAME_PARTS = tuple(f'key{part}' for part in FRAME_PARTS)
 
 
 def _images(side: str) -> list[Topic]:
@@ -87,19 +88,10 @@ def _images(side: str) -> list[Topic]:
     ]
 
 
-def _keyframe_images(side: str) -> list[Topic]:
-    return [
-        Topic(f'keyframe/{side}/image_rect', Image, qos.KEYFRAMES, SLAM, (FLOOR,)),
-        Topic(f'keyframe/{side}/camera_info', CameraInfo, qos.KEYFRAMES, SLAM, (FLOOR,)),
-    ]
-
-
-def _frame_images() -> list[Topic]:
-    kinds = {name: CameraInfo if name.endswith('camera_info') else Image for name in FRAME_PARTS}
-    return [
-        Topic(name, kind, qos.FRAMES, SLAM, is_optional=True, on_demand_by=(FLOOR,))
-        for name, kind in kinds.items()
-    ]
+def _rectified_pair(names: tuple[str, ...], profile: QoSProfile, **facts: Any) -> list[Topic]:
+    """Return the topics of rectified images and their calibrations."""
+    kinds = {name: CameraInfo if name.endswith('camera_info') else Image for name in names}
+    return [Topic(name, kind, profile, SLAM, **facts) for name, kind in kinds.items()]
 
 
 _ALL = [
@@ -132,8 +124,8 @@ _ALL = [
     Topic(
         MAP_PART, UInt8MultiArray, qos.KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)
     ),
-    *(topic for side in SIDES for topic in _keyframe_images(side)),
-    *_frame_images(),
+    *_rectified_pair(KEYFRAME_PARTS, qos.KEYFRAMES, subscribers=(FLOOR,)),
+    *_rectified_pair(FRAME_PARTS, qos.FRAMES, is_optional=True, on_demand_by=(FLOOR,)),
     Topic('keyframe/features', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD, GRID)),
     Topic('keyframe/path', Path, qos.KEYFRAMES, SLAM, (GRID,)),
     Topic('map_points', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD,)),

@@ -19,7 +19,7 @@ from segfloor_ros.messages.floor import disparity_message, free_scan_message, sc
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, image_message, right_image
 from segfloor_ros.messages.poses import pose_array, transform_array
-from segfloor_ros.messages.topics import FRAME_PARTS, MOVING_MASK
+from segfloor_ros.messages.topics import FRAME_PARTS, KEYFRAME_PARTS, MOVING_MASK
 from segfloor_ros.node_settings import FloorSegmentationNodeSettings
 from segfloor_ros.nodes.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.running import run_node
@@ -29,7 +29,6 @@ from segfloor_ros.nodes.when_idle import WhenIdle
 LOOK_FOR_LISTENERS_S = 0.5
 CAPACITY = 10
 
-KEYFRAME_PARTS = tuple(f'key{part}' for part in FRAME_PARTS)
 POSE = 'keyframe/odometry'
 
 
