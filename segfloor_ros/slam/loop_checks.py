@@ -26,8 +26,10 @@ FREE_DRIFT_RAD = 0.1
 
 FREE_WAY_M = 0.5
 SPEED_FACTOR = 2.0
-LEAST_SPEED_MPS = 0.5
-"""While it is lost, a robot drives at most so many times as fast as it ever did, this at least."""
+LEAST_SPEED_MPS = 0.75
+"""A robot that is lost moves at most so many times as fast as it ever did, this at least: it may be
+carried at a walking pace.
+"""
 
 MAX_STEP_UP_M = 0.1
 MAX_SLOPE = 0.15
@@ -96,7 +98,7 @@ class LoopChecks:
         return ''
 
     def is_within_reach(self, match: Match) -> bool:
-        """Whether the robot can have driven there while it was lost: from the last keyframe of the
+        """Whether the robot can have come there while it was lost: from the last keyframe of the
         known map to the first of its own.
         """
         first, known = self._map.keyframes[0], self._known.keyframes

@@ -78,9 +78,9 @@ def test_the_odometry_goes_on_where_the_camera_got_lost(joined):
 
 @pytest.mark.parametrize('waited_s, is_there', [(0, False), (10, True)])
 def test_a_part_joins_only_where_the_robot_can_have_driven(waited_s, is_there):
-    """What it sees 1.6 s after it got lost looks like a place 3 m away."""
+    """What it sees 1.6 s after it got lost looks like a place 4 m away."""
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    way = [planar_pose(-2.0 + 0.05 * k, 0.0, 0.0) for k in range(61)]
+    way = [planar_pose(-2.0 + 0.05 * k, 0.0, 0.0) for k in range(81)]
     drive(slam, way)
     for k in range(15):
         drive(slam, way[-1:], len(way) + k, StereoRoom(seed=77 + k % 4))
