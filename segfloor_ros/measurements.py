@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 
+MAX_LAG_S = 0.1
+"""So much later than those of the images the stamps of a sensor may be."""
+
 
 @dataclass(frozen=True)
 class WheelPose:

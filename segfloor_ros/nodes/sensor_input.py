@@ -5,8 +5,10 @@ and about where the robot is.
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -73,22 +75,25 @@ class SensorInput:
         self._on_message = on_message
         self._takes_best_effort = False
         self.reset()
-        for name, take in ((WHEELS, self._take_wheels), (IMU, self._take_imu)):
-            node.inputs.subscribe(name, take, self._choose_profile, is_rapid=True)
+        for name in (WHEELS, IMU):
+            receive = partial(self._receive, name)
+            node.inputs.subscribe(name, receive, self._choose_profile, is_rapid=True)
 
     def reset(self) -> None:
         """Know no camera and no measurement."""
         self._camera: tuple[str, Array] | None = None
         self._T_left_imu: Array | None = None
-        self._measured: deque[Measurement] = deque(maxlen=MAX_WAITING)
+        self._waiting: dict[str, deque[Odometry | Imu]] = {
+            name: deque(maxlen=MAX_WAITING) for name in (WHEELS, IMU)
+        }
         self._latest: dict[str, tuple[int, float]] = {}
         self._asked: tuple[int, float] = (0, 0.0)
         self._began_s = time.monotonic()
         self._has_tf_wheels = False
 
     def begin(self, left_frame: str, R_rectified_left: Array) -> None:
-        """Take measurements from now on. R_rectified_left: (3, 3) turns the frame of the left
-        images into the rectified one.
+        """Know the camera. R_rectified_left: (3, 3) turns the frame of the left images into the
+        rectified one.
         """
         self._camera = left_frame, R_rectified_left
 
@@ -102,11 +107,21 @@ class SensorInput:
         return qos.SENSORS if self._takes_best_effort else qos.SENSORS_RELIABLE
 
     def take(self, stamp_ns: int, lag_ns: int = 0) -> list[Measurement]:
-        """Return what has been measured since the last call, up to the time of an image."""
-        self._add_tf_wheels(stamp_ns + lag_ns)
-        measured = [*self._measured]
-        self._measured.clear()
-        return measured
+        """Return what has not been returned yet, up to the first measurement of each sensor at or
+        after the time of an image, so that poses can be interpolated there; lag_ns: by how much
+        later its stamps are. So does a recording that is run without nodes.
+        """
+        wheels = self._tf_wheels(stamp_ns + lag_ns)
+        measured = [self._measured(message) for message in self._due(stamp_ns + lag_ns)]
+        return [*wheels, *(one for one in measured if one is not None)]
+
+    def _due(self, stamp_ns: int) -> Iterator[Odometry | Imu]:
+        """Yield the messages of each sensor up to the first at or after a time."""
+        for name, waiting in self._waiting.items():
+            in_order = sorted(waiting, key=_stamp_ns)
+            count = bisect_left(in_order, stamp_ns, key=_stamp_ns) + 1
+            yield from in_order[:count]
+            self._waiting[name] = deque(in_order[count:], MAX_WAITING)
 
     def is_behind(self, stamp_ns: int, lag_ns: int = 0) -> bool:
         """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
@@ -132,30 +147,32 @@ class SensorInput:
         if until_ns != self._latest.get(TF_WHEELS, (0, 0.0))[0]:
             self._latest[TF_WHEELS] = until_ns, now_s
 
-    def _add_tf_wheels(self, stamp_ns: int) -> None:
+    def _tf_wheels(self, stamp_ns: int) -> list[WheelPose]:
         T_odom_base = self._transforms.fused_base(stamp_ns) if self._has_tf_wheels else None
-        if T_odom_base is not None:
-            self._measured.append(WheelPose(stamp_ns, T_odom_base))
+        return [] if T_odom_base is None else [WheelPose(stamp_ns, T_odom_base)]
 
-    def _take_wheels(self, message: Odometry) -> None:
-        if self._has_tf_wheels:
+    def _receive(self, name: str, message: Odometry | Imu) -> None:
+        if self._has_tf_wheels and name == WHEELS:
             return
-        if self._camera is not None:
-            self._measured.append(wheel_pose(message, WHEELS))
-        self._note(WHEELS, message)
+        self._waiting[name].append(message)
+        self._note(name, message)
 
-    def _take_imu(self, message: Imu) -> None:
-        if self._camera is not None and measures_motion(message):
-            T_left_imu = self._place(message)
-            if T_left_imu is None:
-                self._node.reporter.diagnose(
-                    IMU,
-                    f'no tf from {self._camera[0]} to {message.header.frame_id or "its frame"}: '
-                    f'{IMU} is not used; let another node publish where the IMU is',
-                )
-                return
-            self._measured.append(imu_sample(message, T_left_imu))
-        self._note(IMU, message)
+    def _measured(self, message: Odometry | Imu) -> Measurement | None:
+        """Return what a message tells; None where it is not used."""
+        if isinstance(message, Odometry):
+            return wheel_pose(message, WHEELS)
+        if not measures_motion(message):
+            return None
+        T_left_imu = self._place(message)
+        if T_left_imu is not None:
+            return imu_sample(message, T_left_imu)
+        assert self._camera is not None
+        self._node.reporter.diagnose(
+            IMU,
+            f'no tf from {self._camera[0]} to {message.header.frame_id or "its frame"}: '
+            f'{IMU} is not used; let another node publish where the IMU is',
+        )
+        return None
 
     def _place(self, message: Imu) -> Array | None:
         """Return where the IMU is in the rectified left optical frame (4, 4); tf may come late."""
@@ -170,9 +187,13 @@ class SensorInput:
         return self._T_left_imu
 
     def _note(self, name: str, message: Odometry | Imu) -> None:
-        latest_ns = max(to_ns(message.header.stamp), self._latest.get(name, (0, 0.0))[0])
+        latest_ns = max(_stamp_ns(message), self._latest.get(name, (0, 0.0))[0])
         self._latest[name] = latest_ns, time.monotonic()
         self._on_message()
+
+
+def _stamp_ns(message: Odometry | Imu) -> int:
+    return to_ns(message.header.stamp)
 
 
 class MaskInput:

@@ -19,7 +19,7 @@ from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.measurements import Measurement, MeasurementLog, WheelPose
+from segfloor_ros.measurements import MAX_LAG_S, Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
@@ -39,6 +39,10 @@ LOOK_AGAIN_S = 0.05
 """How often is looked for subscribers, and whether the chain has room: its answers say so too."""
 AFTER_THE_END_S = 1.0
 LOG_WAITING_S = 5.0
+
+
+AHEAD_NS = round(MAX_LAG_S * 1e9)
+"""What sensors measured is sent so far ahead of the images: their stamps may be late."""
 
 
 class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
@@ -183,7 +187,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         self._logged_waiting_s = time.monotonic()
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
-        for measurement in self._measurements.until(pair.stamp_ns):
+        for measurement in self._measurements.until(pair.stamp_ns + AHEAD_NS):
             self._send_measurement(measurement)
         mask = self._source.masks.read(pair.index) if self._source.masks is not None else None
         if mask is not None:

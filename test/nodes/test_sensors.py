@@ -160,25 +160,36 @@ def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
 
 def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
     sensors.begin('left', np.eye(3))
-    sensors._take_imu(imu(1, 'imu_link'))
+    sensors._receive('imu', imu(1, 'imu_link'))
     (sample,) = sensors.take(0)
     np.testing.assert_allclose(sample.accel_m_s2, [0, -9.81, 0])
     np.testing.assert_allclose(sample.place_m, [0.0, 0.1, -0.3])
     sensors.reset()
     sensors.begin('left', np.eye(3))
-    sensors._take_imu(imu(2, 'elsewhere'))
+    sensors._receive('imu', imu(2, 'elsewhere'))
     assert sensors.take(0) == []
-    sensors._take_imu(imu(3, '', (0.0, -9.81, 0.0)))
+    sensors._receive('imu', imu(3, '', (0.0, -9.81, 0.0)))
     assert [m.stamp_ns for m in sensors.take(0)] == [3]
+
+
+def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> None:
+    for k in (0, 2, 1, 3, 4, 5):
+        sensors._receive('imu', imu(k * 5 * MS, 'imu_link'))
+    sensors._receive('wheel_odometry', wheel_message(WheelPose(8 * MS, np.eye(4)), 'base_link'))
+    sensors.begin('left', np.eye(3))  # the first image is looked at
+    assert [m.stamp_ns // MS for m in sensors.take(6 * MS)] == [8, 0, 5, 10]
+    assert [m.stamp_ns // MS for m in sensors.take(13 * MS, lag_ns=4 * MS)] == [15, 20]
+    sensors._receive('imu', imu(12 * MS, 'imu_link'))  # late
+    assert [m.stamp_ns // MS for m in sensors.take(30 * MS)] == [12, 25]
 
 
 def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monkeypatch) -> None:
     now_s = [100.0]
     monkeypatch.setattr('segfloor_ros.nodes.sensor_input.time.monotonic', lambda: now_s[0])
     assert not sensors.is_behind(50 * MS)  # nothing was ever heard
-    sensors._take_imu(imu(40 * MS, ''))
+    sensors._receive('imu', imu(40 * MS, ''))
     assert sensors.is_behind(60 * MS)
-    sensors._take_imu(imu(60 * MS, ''))
+    sensors._receive('imu', imu(60 * MS, ''))
     assert not sensors.is_behind(60 * MS)
     assert not sensors.is_behind(60 * MS, lag_ns=2 * MS)  # what comes next would tell little more
     assert sensors.is_behind(70 * MS)
@@ -194,14 +205,14 @@ def test_messages_that_came_while_the_node_was_busy_are_taken_at_once(make_graph
     imus = graph.publisher('imu')
     graph.connected([imus])
     node._sensors.begin('left', np.eye(3))
-    measured = node._sensors._measured
+    waiting = node._sensors._waiting['imu']
     for k in range(60):
         imus.publish(imu(k * 5 * MS, 'left'))
     time.sleep(0.5)  # the middleware receives them meanwhile
     passes = set()
-    graph.until(lambda: passes.add(len(measured)) or len(measured) == 60, 'the samples')
+    graph.until(lambda: passes.add(len(waiting)) or len(waiting) == 60, 'the samples')
     assert len(passes) < 20
-    assert [m.stamp_ns for m in measured] == [k * 5 * MS for k in range(60)]
+    assert [to_ns(m.header.stamp) for m in waiting] == [k * 5 * MS for k in range(60)]
 
 
 @pytest.fixture
