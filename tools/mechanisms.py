@@ -81,7 +81,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions told apart': Mechanism(
-        {'slam.consensus._differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
+        {'slam.consensus.differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
     ),
     'motion so far': Mechanism({'slam.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
     'scene flow': Mechanism({'slam.scene_flow.SceneFlow._earlier': lambda *_: []}),

@@ -89,7 +89,7 @@ class Consensus:
             max_noise_factor = min(max_noise_factor, KNOWN_NOISE * known.noise_factor)
         of_most = refine_pose(self._camera, T_start, points, observations, max_noise_factor)
         problem = _Problem(self._camera, points, observations, of_most)
-        if known is not None and _differ(of_most, known):
+        if known is not None and differ(of_most, known):
             return problem.near(known.T_camera_world, max_noise_factor)
         proven = self.proven(sparse_map, ids, T_start)
         if proven.sum() < MIN_PROVEN or _fits(of_most, proven):
@@ -97,7 +97,7 @@ class Consensus:
         measured = observations.take(proven)
         of_proven = refine_pose(self._camera, T_start, points[proven], measured, max_noise_factor)
         found = None
-        if _differ(of_most, of_proven):
+        if differ(of_most, of_proven):
             found = problem.choose(of_proven.T_camera_world, of_proven.noise_factor, proven)
         return problem.of_everyone() if found is None else found
 
@@ -183,7 +183,7 @@ def _fits(estimate: PoseEstimate, proven: NDArray[np.bool_]) -> bool:
     return fitting and estimate.noise_factor < USUAL_NOISE
 
 
-def _differ(a: PoseEstimate, b: PoseEstimate) -> bool:
+def differ(a: PoseEstimate, b: PoseEstimate) -> bool:
     """Whether two poses differ by more than their joint uncertainty."""
     error = se3_log(a.T_camera_world @ invert(b.T_camera_world))
     covariance = a.covariance + b.covariance + LEAST_VARIANCE * np.eye(6)

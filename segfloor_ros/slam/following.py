@@ -96,7 +96,7 @@ class Follower:
         return Track(
             estimate,
             ids[estimate.inliers],
-            measured.uvd_px[estimate.inliers, :2],
+            measured.take(estimate.inliers),
             seen.ids,
         )
 

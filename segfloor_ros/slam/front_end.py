@@ -9,9 +9,9 @@ import numpy as np
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.geometry import Array
 from segfloor_ros.slam.body_motion import BodyMotion
-from segfloor_ros.slam.consensus import Consensus
+from segfloor_ros.slam.consensus import Consensus, differ
 from segfloor_ros.slam.excluded import Region, is_inside, join
 from segfloor_ros.slam.features import FeatureExtractor, Features
 from segfloor_ros.slam.firm_points import count_firm
@@ -21,9 +21,10 @@ from segfloor_ros.slam.image_rotation import ImageRotation
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.keyframe_record import KeyframeRecord
 from segfloor_ros.slam.local_map import LocalMap
-from segfloor_ros.slam.motion import MAX_BLIND_SIGMA_M, CameraMotion
+from segfloor_ros.slam.motion import MAX_BLIND_SIGMA_M, CameraMotion, sigma_m
 from segfloor_ros.slam.place_recognition import PlaceRecognition
-from segfloor_ros.slam.pose_information import pose_covariance
+from segfloor_ros.slam.pose import PoseEstimate
+from segfloor_ros.slam.pose_information import PoseInformation, no_surer
 from segfloor_ros.slam.relocalisation import Relocaliser, is_within
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -77,6 +78,7 @@ class FrontEnd:
         self.frames_since_keyframe = 0
         self._camera = camera
         self._map = sparse_map
+        self._prior: PoseEstimate | None = None
         self._relocaliser = Relocaliser(sparse_map, self.places)
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
@@ -139,6 +141,7 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features."""
         predictions = self._predict_poses(frame, images)
         self.is_poor, self.seen_sigma_m = False, 0.0
+        self._prior = self.motion.prior(frame.stamp_ns)
         track = self.follower.follow(
             images, self._map, self.local.point_ids, predictions[0], self.offset_px
         )
@@ -147,7 +150,8 @@ class FrontEnd:
         if track is None or not self.is_believable(track, images, frame.stamp_ns):
             self.follower.reset()
             return None
-        self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns)
+        T_seen, track = track.T_camera_world, self._weighed(track, images)
+        self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.local.move_to(track.point_ids, track.T_camera_world)
         if not self.is_fixed:
@@ -161,7 +165,7 @@ class FrontEnd:
         if motion.is_lost:
             return motion.may_face(pose, stamp_ns)
         few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
-        few = few if motion.is_held(stamp_ns) else few // 2 if motion.is_felt(stamp_ns) else 0
+        few = few if motion.prior(stamp_ns) else few // 2 if motion.is_felt(stamp_ns) else 0
         if few and count_firm(images.left, track.uv_px) < few:
             return False
         if len(track.point_ids) < PLENTY:
@@ -173,11 +177,27 @@ class FrontEnd:
 
     def _sigma_m(self, track: Track, images: Images) -> float:
         """Return how uncertain an image leaves the place along the axis on which it is most."""
-        pose = track.T_camera_world
-        points = transform_points(pose, self._map.xyz_world[track.point_ids])
-        covariance = pose_covariance(self._camera, images.left, track.uv_px, points)
-        variance = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-        return track.estimate.noise_factor * float(np.sqrt(variance))
+        return sigma_m(self._information(track, images).covariance(track.T_camera_world))
+
+    def _information(self, track: Track, images: Images) -> PoseInformation:
+        return PoseInformation(
+            self._camera,
+            images.left,
+            self._map.xyz_world[track.point_ids],
+            track.observations.without_offset(self.offset_px),
+            track.estimate.noise_factor,
+        )
+
+    def _weighed(self, track: Track, images: Images) -> Track:
+        """Return a track with the pose that images and sensors tell together; that of the images
+        where the sensors contradict it.
+        """
+        if self._prior is not None and differ(track.estimate, self._prior):
+            self._prior = None
+        if self._prior is None:
+            return track
+        fused = self._information(track, images).fused(track.estimate, self._prior)
+        return replace(track, estimate=fused)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -280,7 +300,8 @@ class FrontEnd:
         """
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
-            return track.observed.take(np.flatnonzero(~inside))
+            observed = track.observed.take(np.flatnonzero(~inside))
+            return self._no_surer(images, observed)
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None:
             if not self._map.keyframes:
@@ -299,9 +320,16 @@ class FrontEnd:
         )
         if matched is None:
             return None
-        self.motion.T_camera_world = matched.T_camera_world
+        assert matched.observed is not None
+        self.motion.T_camera_world = self._weighed(matched, images).T_camera_world
         self._map.note_tracking(matched.visible_ids, matched.point_ids)
-        return matched.observed
+        return self._no_surer(images, matched.observed)
+
+    def _no_surer(self, images: Images, observed: ObservedFeatures) -> ObservedFeatures:
+        """Return the features of a frame, weighed against wheels by what their patches tell."""
+        if self._prior is None:
+            return observed
+        return replace(observed, observations=no_surer(images.left, observed.observations))
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, rotation_angle
-from segfloor_ros.measurements import ImuSample
+from segfloor_ros.measurements import MAX_LAG_S, ImuSample
 from segfloor_ros.slam.stamp_lag import is_late, lag_in_words
 
 HISTORY = 8000
@@ -28,8 +28,11 @@ FIRST_BIAS_SIGMA = 0.02
 BIAS_DRIFT = 1e-4
 """Bias of a cheap gyroscope, rad/s, and its drift, rad/s per root second."""
 
-FIRST_LAG_SIGMA_S, LAG_DRIFT, MAX_LAG_S = 0.02, 1e-5, 0.1
+FIRST_LAG_SIGMA_S, LAG_DRIFT = 0.02, 1e-5
 """By how much the stamps of an IMU are late: clocks of drivers differ by hundredths of a second."""
+
+STEADY_RAD_S = 0.02
+"""Noise alone shows smaller changes of the rate: they tell nothing of a lag."""
 
 SIGMA_SEEN_RAD = 1e-3
 """Error of a turn as the images tell it."""
@@ -179,7 +182,9 @@ class Gyroscope:
         excess = Rotation.from_matrix(seen.T @ path.turns[-1]).as_rotvec()
         noise = SIGMA_SEEN_RAD + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
         # What is told is late by what is left of the lag: by its rate of the turn at either end.
-        H = np.column_stack([seconds * np.eye(3), -path.speeding_up])
+        speeding_up = path.speeding_up
+        speeding_up = speeding_up * (np.linalg.norm(speeding_up) > STEADY_RAD_S)
+        H = np.column_stack([seconds * np.eye(3), -speeding_up])
         self._covariance += np.diag([BIAS_DRIFT**2] * 3 + [LAG_DRIFT**2]) * seconds
         S = H @ self._covariance @ H.T + noise**2 * np.eye(3)
         if (np.abs(excess) > OUTLIER_SIGMAS * np.sqrt(np.diag(S))).any():

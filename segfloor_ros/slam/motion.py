@@ -65,6 +65,7 @@ class CameraMotion:
         self._last_stamp_ns = 0
         self._heading_sigma_rad: float | None = None
         self._since_keyframe: RelativeMotion | None = None
+        self._at_keyframe: tuple[Array, Array] = self.T_camera_world, self.covariance
         self._latest: tuple[tuple[int, int], RelativeMotion | None] | None = None
 
     @property
@@ -77,10 +78,16 @@ class CameraMotion:
         """Whether the last pose was not seen in the images."""
         return bool(self.carried_by)
 
-    def is_held(self, stamp_ns: int) -> bool:
-        """Whether wheels tell where the camera is, too, and did so since the last keyframe."""
+    def prior(self, stamp_ns: int) -> PoseEstimate | None:
+        """Return where wheels have the camera by its motion since the last keyframe; None where
+        they did not tell all of it. What frames since tell by the same points errs together: it
+        counts once.
+        """
         measured, since = self._measured(stamp_ns), self._since_keyframe
-        return all(motion is not None and motion.by_wheels for motion in (measured, since))
+        if measured is None or since is None or not (measured.by_wheels and since.by_wheels):
+            return None
+        T, covariance = _moved(self._at_keyframe, since.then(measured))
+        return PoseEstimate(T, np.zeros(0, bool), covariance, 1.0)
 
     def is_felt(self, stamp_ns: int) -> bool:
         """Whether an IMU tells where the camera is, for some seconds."""
@@ -90,7 +97,7 @@ class CameraMotion:
     @property
     def sigma_m(self) -> float:
         """The standard deviation of the position, along the axis on which it is largest."""
-        return _sigma_m(self.covariance)
+        return sigma_m(self.covariance)
 
     def predict(self, stamp_ns: int) -> Array:
         """Return where the camera will be, T_camera_world (4, 4)."""
@@ -144,9 +151,16 @@ class CameraMotion:
         off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
         return off_rad < MAX_LOST_TURN_RAD + 3 * (self._heading_sigma_rad + turned[1])
 
-    def take(self, T_camera_world: Array, covariance: Array, stamp_ns: int) -> None:
-        """Go on from the pose of a frame, found in its images. After a blind stretch `odom` goes on
-        where the sensors had the camera: the error of the stretch is a correction of `odom`.
+    def take(
+        self,
+        T_camera_world: Array,
+        covariance: Array,
+        stamp_ns: int,
+        T_seen: Array | None = None,
+    ) -> None:
+        """Go on from the pose of a frame, found in its images. T_seen: (4, 4), as the images alone
+        have it: the sensors learn from that. After a blind stretch `odom` goes on where the sensors
+        had the camera: the error of the stretch is a correction of `odom`.
         """
         measured = self._measured(stamp_ns)
         predicted = self._predicted(measured)
@@ -160,7 +174,9 @@ class CameraMotion:
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = stamp_ns
         self.is_lost, self.lost_here, self.carried_by = False, False, ''
-        self._body.learn(stamp_ns, self.T_odom_camera, self.T_world_odom[:3, :3])
+        T_seen = T_camera_world if T_seen is None else T_seen
+        T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
+        self._body.learn(stamp_ns, T_odom_seen, self.T_world_odom[:3, :3])
 
     def bridge(self, stamp_ns: int) -> bool:
         """Go on without the images to where the sensors have the camera. Returns whether they tell
@@ -170,7 +186,7 @@ class CameraMotion:
         predicted = self._predicted(measured)
         if measured is None or predicted is None:
             return False
-        if not measured.by_wheels and _sigma_m(predicted[1]) > MAX_BLIND_SIGMA_M:
+        if not measured.by_wheels and sigma_m(predicted[1]) > MAX_BLIND_SIGMA_M:
             return False
         self._note(measured)
         self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]
@@ -203,6 +219,7 @@ class CameraMotion:
     def start_keyframe(self) -> RelativeMotion | None:
         """Return the motion since the last keyframe as the wheels tell it; the next begins."""
         since, self._since_keyframe = self._since_keyframe, RelativeMotion.none()
+        self._at_keyframe = self.T_camera_world, self.covariance
         return since if since is not None and since.by_wheels else None
 
     def move_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
@@ -210,6 +227,9 @@ class CameraMotion:
         `odom` stays where the camera sees it.
         """
         T_odom_camera = self.T_odom_camera
+        T_at_keyframe, covariance = self._at_keyframe
+        T_at_keyframe = T_at_keyframe @ invert(T_reference_before) @ T_reference_after
+        self._at_keyframe = _without_drift(T_at_keyframe), covariance
         T_camera_reference = self.T_camera_world @ invert(T_reference_before)
         self.T_camera_world = _without_drift(T_camera_reference @ T_reference_after)
         self.T_world_odom = _without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
@@ -238,9 +258,7 @@ class CameraMotion:
         """Return where the sensors have the camera after a motion (4, 4), and the covariance."""
         if measured is None or self.is_lost:
             return None
-        A = adjoint(measured.T_now_before)
-        covariance = A @ self.covariance @ A.T + measured.covariance
-        return measured.T_now_before @ self.T_camera_world, covariance
+        return _moved((self.T_camera_world, self.covariance), measured)
 
     def _note(self, measured: RelativeMotion | None) -> None:
         """Add the motion of a frame to that since the last keyframe."""
@@ -251,7 +269,14 @@ class CameraMotion:
         return max((stamp_ns - self._last_stamp_ns) * 1e-9, MIN_STEP_S)
 
 
-def _sigma_m(covariance: Array) -> float:
+def _moved(before: tuple[Array, Array], motion: RelativeMotion) -> tuple[Array, Array]:
+    """Return a pose (4, 4) and its covariance (6, 6) after a motion."""
+    A = adjoint(motion.T_now_before)
+    return motion.T_now_before @ before[0], A @ before[1] @ A.T + motion.covariance
+
+
+def sigma_m(covariance: Array) -> float:
+    """Return the standard deviation of the place of a pose with a covariance (6, 6)."""
     return float(np.sqrt(np.diag(covariance)[:3].max()))
 
 

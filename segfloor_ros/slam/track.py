@@ -37,13 +37,14 @@ class ObservedFeatures:
 class Track:
     """A frame with a pose.
 
-    point_ids, uv_px: (N,), (N, 2) the map points that were found and agree. visible_ids: those that
-    were looked for. observed: set when the pose was found by features.
+    point_ids: (N,) the map points that were found and agree, and observations (N) of them as
+    measured. visible_ids: those that were looked for. observed: set when the pose was found by
+    features.
     """
 
     estimate: PoseEstimate
     point_ids: NDArray[np.int32]
-    uv_px: Array
+    observations: Observations
     visible_ids: NDArray[np.int32]
     observed: ObservedFeatures | None = None
 
@@ -51,6 +52,11 @@ class Track:
     def T_camera_world(self) -> Array:
         """The pose (4, 4)."""
         return self.estimate.T_camera_world
+
+    @property
+    def uv_px(self) -> Array:
+        """Where the points are in the image, (N, 2)."""
+        return self.observations.uvd_px[:, :2]
 
     @property
     def covariance(self) -> Array:

@@ -132,7 +132,7 @@ class Tracker:
         return Track(
             estimate,
             ids,
-            observations.uvd_px[rows, :2],
+            observations.take(rows),
             seen.ids,
             ObservedFeatures(
                 features, observations.with_noise_factor(estimate.noise_factor), point_id

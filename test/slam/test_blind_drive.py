@@ -14,6 +14,7 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.slam.images import Images
 from segfloor_ros.slam.pose import PoseEstimate
+from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.track import Track
@@ -167,7 +168,8 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
     for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
         ids = np.arange(150, dtype=np.int32)
-        track = Track(estimate, ids, uv_px, ids)
+        told = Observations(np.column_stack([uv_px, np.full(150, np.nan)]), np.ones((150, 3)))
+        track = Track(estimate, ids, told, ids)
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)

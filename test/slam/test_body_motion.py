@@ -132,6 +132,16 @@ def test_stamps_of_an_imu_that_are_late_are_found_out():
     assert '30 ms later' in gyro.remarks()['imu lag']
 
 
+def test_a_straight_way_tells_nothing_of_the_lag_of_an_imu():
+    rng, gyro = np.random.default_rng(1), Gyroscope()
+    for t in range(0, 10_000, 5):
+        gyro.add(ImuSample(t * MS, rng.normal(0, 2e-3, 3), np.zeros(3)))
+    for t in range(0, 9_800, 200):
+        seen = Rotation.from_rotvec(rng.normal(0, 1e-3, 3)).as_matrix()
+        gyro.learn(seen, t * MS, (t + 200) * MS)
+    assert gyro.lag_s == 0.0
+
+
 def test_stamps_of_wheels_that_are_late_are_found_out():
     def base(t):
         """A drive that speeds up, brakes and turns."""

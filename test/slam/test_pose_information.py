@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.slam.pose_information import pose_covariance
+from segfloor_ros.slam.pose import PoseEstimate
+from segfloor_ros.slam.pose_information import PoseInformation, no_surer
+from segfloor_ros.slam.residuals import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -19,10 +21,17 @@ def noisy(image):
     return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
 
-def sigmas_m(image, uv_px, depth_m=2.0):
-    """Return the standard deviations of the place along x, y and z, of points in one plane."""
+def information(image, uv_px, depth_m=2.0):
+    """Return what points in one plane tell, seen where they are from the origin."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
-    return np.sqrt(np.diag(pose_covariance(CAMERA, image, uv_px, points)))[:3]
+    disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
+    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
+    return PoseInformation(CAMERA, image, points, sure)
+
+
+def sigmas_m(image, uv_px):
+    """Return the standard deviations of the place along x, y and z."""
+    return np.sqrt(np.diag(information(image, uv_px).covariance(np.eye(4))))[:3]
 
 
 def anywhere(count):
@@ -35,8 +44,7 @@ def test_points_on_an_edge_tell_nothing_along_it(contrast, slope):
     image = noisy(np.where(U - MIDDLE[0] > slope * (V - MIDDLE[1]), 100 + contrast, 100.0))
     rows = np.arange(30, CAMERA.height - 30, 2)
     on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
-    points = CAMERA.back_project(on_edge, np.full(len(rows), 2.0))
-    covariance = pose_covariance(CAMERA, image, on_edge, points)[:3, :3]
+    covariance = information(image, on_edge).covariance(np.eye(4))[:3, :3]
     along = np.array([slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
     assert np.sqrt(along @ covariance @ along) > 0.03
 
@@ -66,6 +74,29 @@ def test_no_point_tells_nothing():
     assert sigmas_m(noisy(np.full(U.shape, 90.0)), np.zeros((0, 2))).min() == pytest.approx(1.0)
 
 
+def test_what_edges_do_not_tell_the_prior_does():
+    image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
+    rows = np.arange(30.0, CAMERA.height - 30, 12)
+    on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
+    told = information(image, on_edge)
+    off = np.eye(4)
+    off[:3, 3] = 0.01, 0.01, 0.0
+    prior = PoseEstimate(off, np.zeros(0, bool), np.diag([0.005] * 3 + [1e-4] * 3) ** 2, 1.0)
+    seen = PoseEstimate(np.eye(4), np.ones(len(rows), bool), 1e-8 * np.eye(6), 1.0)
+    fused = told.fused(seen, prior)
+    across_m, along_m = fused.T_camera_world[:2, 3]
+    assert abs(across_m) < 0.001 and along_m == pytest.approx(0.01, abs=0.002)
+    sigma_m = np.sqrt(np.diag(fused.covariance))
+    assert sigma_m[0] < 0.001 and sigma_m[1] > 0.004
+
+
+def test_a_pixel_on_an_edge_is_sure_across_it_alone():
+    image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
+    uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
+    sigma_px = no_surer(image, Observations(uvd_px, np.full((1, 3), 0.5))).sigma_px[0]
+    assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
+
+
 def test_a_pose_that_the_images_hardly_tell_is_said_to_be_uncertain(monkeypatch):
     room = StereoRoom()
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
@@ -74,7 +105,7 @@ def test_a_pose_that_the_images_hardly_tell_is_said_to_be_uncertain(monkeypatch)
     monkeypatch.setattr('segfloor_ros.slam.front_end.PLENTY', 10_000)
     seen += [result.state for result in slam.process(frames[2])]
     covariance = np.eye(6) * 0.02**2
-    monkeypatch.setattr('segfloor_ros.slam.front_end.pose_covariance', lambda *_: covariance)
+    monkeypatch.setattr(PoseInformation, 'covariance', lambda *_: covariance)
     seen += [result.state for result in slam.process(frames[3])]
     assert seen[:3] == ['tracking'] * 3
     assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
