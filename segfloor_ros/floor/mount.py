@@ -96,15 +96,19 @@ class MountEstimator:
         forward_m: float = 0.0,
         left_m: float = 0.0,
     ) -> None:
-        known = self._known = np.array([pitch_rad, roll_rad, height_m])
+        self._known = np.array([pitch_rad, roll_rad, height_m])
         self._offset = (forward_m, left_m)
         self._viewer = MountViewer(camera)
+        self.start_over()
+
+    def start_over(self) -> None:
+        """Forget all frames: the next ones are of another world."""
         self._views: list[MirrorView] = []
         self._feet: list[Samples] = []
         self._rotations: list[Array] = []
         self._positions: list[Array] = []
         self._mirror_rng = np.random.default_rng(1)
-        self._on_surfaces, self._on_feet = PlaneSearch(known), PlaneSearch(known)
+        self._on_surfaces, self._on_feet = PlaneSearch(self._known), PlaneSearch(self._known)
         self._fits: list[PlaneFit] = []
         self._feet_fits: list[PlaneFit] = []
         self._fair: list[PlaneFit] = []

@@ -107,7 +107,11 @@ class BackEnd:
         """
         known = map_to_arrays(self._map) | self.places.to_arrays()
         self._known = KnownMap(self._camera, self._tracker, self._map, known, of_drive)
-        self._map.reset(int(known['num_ever'][0]))
+        self.begin_again()
+
+    def begin_again(self) -> None:
+        """Go on with an empty map; no id is given twice."""
+        self._map.reset(self._map.num_ever)
         self._forget_places()
 
     def sees_known(self, images: Images, features: Features) -> bool:

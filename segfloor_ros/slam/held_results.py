@@ -33,8 +33,8 @@ class HeldResults:
         self._thin_out()
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
-        """Change all results that are held."""
-        self._held = [change(result) for result in self._held]
+        """Change the results that are held of a part of the map."""
+        self._held = [change(result) if result.apart else result for result in self._held]
 
     def release(self, mount: Mount | None) -> list[FrameResult]:
         """Return the results in ROS frames, oldest first; none while the mount is unknown."""

@@ -26,6 +26,9 @@ class MountMeter(Protocol):
         frame, and where an accelerometer has up in that frame.
         """
 
+    def start_over(self) -> None:
+        """Forget all keyframes: where the next ones are relative to them is not known."""
+
     @property
     def mount(self) -> Mount | None:
         """The mount at the first frame, once it is known."""

@@ -34,6 +34,10 @@ START_NS, RESUMING_NS, LOST_NS = 1_000_000_000, 5_000_000_000, 1_500_000_000
 one that goes on after a pause, and of one that got lost. After that it maps on its own.
 """
 
+HARDLY_BEGUN = 5
+"""A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
+ORB-SLAM2, 2017, does the same)."""
+
 UNKNOWN_COVARIANCE = 1e6
 NOTHING_SEEN = 'too few known points in view'
 MAPPED_APART = ', mapped before the map was recognised'
@@ -214,7 +218,7 @@ class StereoSlam:
         before and is lost again, look for it in the known map.
         """
         front_end = self._front_end
-        if fault or not front_end.is_searching or self.mount is None:
+        if fault or not front_end.is_searching:
             self._lost_ns = None
             return
         self._lost_ns = frame.stamp_ns if self._lost_ns is None else self._lost_ns
@@ -228,11 +232,16 @@ class StereoSlam:
 
     def _map_apart(self) -> None:
         """Begin another part of the map: where the camera seems to be, or at the origin, where this
-        is all there is of the drive.
+        is all there is of the drive. A map that had hardly begun is not worth waiting for.
         """
         self._lost_ns = None
         self._take_adjustment(wait=True)
-        self._back_end.map_apart(self._is_shown)
+        if self._is_shown and len(self.map.keyframes) <= HARDLY_BEGUN:
+            self._back_end.begin_again()
+        else:
+            self._back_end.map_apart(self._is_shown)
+        if self._mount_meter is not None:
+            self._mount_meter.start_over()
         if not self._is_shown:
             self._front_end.motion.reset()
             self._body.reset_world()

@@ -132,6 +132,26 @@ def test_poses_come_before_the_mount_is_known():
     assert positions[-1] == pytest.approx([0.1 * (settled - 1), 0.0, 0.0], abs=0.02)
 
 
+def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
+    """It faces a wall and turns away from it: nothing of what it saw first is seen again."""
+    mount = Mount(0.35, np.radians(8.0))
+    faced = Scene([wall(1.0, contrast=45.0, seed=9)], mount=mount, noise_grey=1.0)
+    room = blank_floored(mount, *box(1.6, 0.5, 0.4, 0.3))
+    slam = make_slam(SMALL_CAMERA, StereoSlamSettings(keyframe_max_frames=1))
+    results = []
+    for i in range(20):
+        here = replace(mount, forward_m=0.1 * max(0, i - 8))
+        scene = replace(faced if i < 3 else room, mount=here, camera=SMALL_CAMERA)
+        left, right, _, _ = scene.render()
+        results += slam.process(StereoFrame(i, i * 4 * 10**8, left, right))
+    assert [r.index for r in results] == list(range(20))
+    assert [r.index for r in results if not r.tracked] == [3, 4, 5, 6]
+    assert slam.mount is not None
+    assert slam.mount.height_m == pytest.approx(0.35, rel=0.04)
+    path = next(r.keyframe.path for r in reversed(results) if r.keyframe)
+    assert path.stamp_ns[0] == results[7].stamp_ns
+
+
 def test_after_a_while_the_best_plane_will_do():
     """A rug is all that has texture: its height is known to two per cent, never better."""
     rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=20.0, seed=5)

@@ -105,6 +105,26 @@ def test_a_part_that_is_never_recognised_is_no_part_of_the_map():
     )
 
 
+def test_a_map_that_had_hardly_begun_is_given_up():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    first, poses = len(KNOWN[:5]), KNOWN[:5] + BEHIND + TURN
+    batches = drive(slam, poses)
+    assert [len(batch) for batch in batches] == [1] * len(poses)
+    results = [r for batch in batches for r in batch]
+    again = next(r.index for r in results if r.index >= first and r.tracked)
+    assert first + 10 < again < first + 20
+    rest = results[again:]
+    assert all(r.tracked and r.state == 'tracking' for r in rest)
+    path = next(r.keyframe.path for r in reversed(rest) if r.keyframe)
+    assert path.stamp_ns[0] == rest[0].stamp_ns
+    # It goes on where it got lost; the way since is not known.
+    T_true = invert(poses[again]) @ poses[-1]
+    T_told = invert(rest[0].T_odom_base) @ rest[-1].T_odom_base
+    np.testing.assert_allclose(T_told, T_true, atol=0.04)
+    given_up = [r.keyframe.cloud.point_id.max() for r in results[:first] if r.keyframe]
+    assert rest[0].keyframe.cloud.point_id.min() > max(given_up)
+
+
 def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)
