@@ -135,6 +135,7 @@ def measure(
                 path = result.keyframe.path if result.keyframe is not None else path
                 results.append(dataclasses.replace(result, keyframe=None))
             on_progress(done)
+        results += [dataclasses.replace(result, keyframe=None) for result in slam.finish()]
         grid = pipeline.finish() if pipeline else None
     truth = load_truth(recording)
     score = score_map(grid, truth) if grid else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -140,7 +141,14 @@ def test_eyes_that_are_not_triggered_together_are_named(make_graph, frames) -> N
     driver.connect()
     stamps = itertools.count(0, FRAME_NS)
 
+    next_s = 0.0
+
     def go_on() -> None:
+        # At the rate of the stamps: a node that cannot keep up loses messages, and says that.
+        nonlocal next_s
+        if time.monotonic() < next_s:
+            return
+        next_s = time.monotonic() + FRAME_NS * 1e-9
         stamp_ns = next(stamps)
         driver.send('left', stamp_ns, frames[0].left)
         driver.send('right', stamp_ns + 40_000_000, frames[0].right)
