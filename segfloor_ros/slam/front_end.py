@@ -79,6 +79,7 @@ class FrontEnd:
         self._camera = camera
         self._map = sparse_map
         self._prior: PoseEstimate | None = None
+        self._tells_less = False
         self._relocaliser = Relocaliser(sparse_map, self.places)
         self._frozen = FrozenCheck()
         self._rotation = ImageRotation(camera)
@@ -192,12 +193,14 @@ class FrontEnd:
         """Return a track with the pose that images and sensors tell together; that of the images
         where the sensors contradict it.
         """
+        self._tells_less = False
         if self._prior is not None and differ(track.estimate, self._prior):
             self._prior = None
         if self._prior is None:
             return track
-        fused = self._information(track, images).fused(track.estimate, self._prior)
-        return replace(track, estimate=fused)
+        information = self._information(track, images)
+        self._tells_less = information.tells_less(track.T_camera_world, self._prior)
+        return replace(track, estimate=information.fused(track.estimate, self._prior))
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -326,8 +329,10 @@ class FrontEnd:
         return self._no_surer(images, matched.observed)
 
     def _no_surer(self, images: Images, observed: ObservedFeatures) -> ObservedFeatures:
-        """Return the features of a frame, weighed against wheels by what their patches tell."""
-        if self._prior is None:
+        """Return the features of a frame; where wheels know some direction better than they do, no
+        surer than their patches.
+        """
+        if not self._tells_less:
             return observed
         return replace(observed, observations=no_surer(images.left, observed.observations))
 

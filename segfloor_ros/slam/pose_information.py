@@ -70,6 +70,11 @@ class PoseInformation:
         information, _ = self._normal_equations(T_camera_world)
         return np.asarray(np.linalg.inv(information + np.diag(FIRST_INFORMATION)))
 
+    def tells_less(self, T_camera_world: Array, prior: PoseEstimate) -> bool:
+        """Whether a prior knows some direction of a pose (4, 4) better than the points do."""
+        covariance, known = self.covariance(T_camera_world), np.linalg.inv(prior.covariance)
+        return bool(np.linalg.eigvals(covariance @ known).real.max() > 1)
+
     def fused(self, seen: PoseEstimate, prior: PoseEstimate) -> PoseEstimate:
         """Return the likeliest pose with a prior, near the one that the points alone tell: what
         edges do not tell, the prior does.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.pose import PoseEstimate
 from segfloor_ros.slam.pose_information import PoseInformation, no_surer
 from segfloor_ros.slam.residuals import Observations
@@ -88,6 +89,38 @@ def test_what_edges_do_not_tell_the_prior_does():
     assert abs(across_m) < 0.001 and along_m == pytest.approx(0.01, abs=0.002)
     sigma_m = np.sqrt(np.diag(fused.covariance))
     assert sigma_m[0] < 0.001 and sigma_m[1] > 0.004
+
+
+def test_a_prior_is_outdone_where_points_tell_every_direction_better():
+    rows = np.arange(30.0, CAMERA.height - 30, 12)
+    on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
+    edge = information(noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge)
+    texture = information(noisy(RNG.uniform(60, 160, U.shape)), anywhere(300))
+    none, wide = np.zeros(0, bool), np.diag([0.02] * 6) ** 2
+    sure_of_turns = np.diag([0.02] * 3 + [1e-5] * 3) ** 2
+    of_wheels, of_gyroscope = (PoseEstimate(np.eye(4), none, P, 1.0) for P in (wide, sure_of_turns))
+    assert edge.tells_less(np.eye(4), of_wheels)
+    assert not texture.tells_less(np.eye(4), of_wheels)
+    assert texture.tells_less(np.eye(4), of_gyroscope)
+
+
+def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_tell_more():
+    room = StereoRoom()
+    frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(8)]
+
+    def median_sigma_px(told):
+        slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+        for pose in told:
+            slam.add(pose)
+        for frame in frames:
+            slam.process(frame)
+        assert len(slam.map.keyframes) > 1
+        assert (slam.map.keyframes[-1].motion is not None) is bool(told)
+        return np.median(slam.map.keyframes[-1].observations.sigma_px[:, :2])
+
+    period_ns = frames[1].stamp_ns // 2
+    wheels = [WheelPose(k * period_ns, planar_pose(0.02 * k, 0, 0)) for k in range(20)]
+    assert median_sigma_px(wheels) < 1.1 * median_sigma_px([])
 
 
 def test_a_pixel_on_an_edge_is_sure_across_it_alone():
