@@ -15,9 +15,11 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration
+from segfloor_ros.measurements import MeasurementLog, RecordedSensor
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult
+from segfloor_ros.slam.stereo_slam import StereoSlam
 
 
 class Stages(Protocol):
@@ -45,6 +47,17 @@ def drive(
         results = stages.process(frame)
         yield Step(frame, results, time.thread_time() - start_s)
         on_progress(done)
+
+
+def after_sensors(
+    slam: StereoSlam, sensors: Sequence[RecordedSensor], frames: Iterable[StereoFrame]
+) -> Iterator[StereoFrame]:
+    """Yield frames, each once SLAM has what sensors measured up to it."""
+    log = MeasurementLog(sensors)
+    for frame in frames:
+        for measurement in log.until(frame.stamp_ns + slam.sensors.lag_ns):
+            slam.add(measurement)
+        yield frame
 
 
 def noisy(frames: Iterable[StereoFrame], seed: int) -> Iterator[StereoFrame]:

@@ -84,6 +84,10 @@ SLAM: dict[str, Mechanism] = {
         {'slam.consensus.differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
     ),
     'motion so far': Mechanism({'slam.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
+    'images weighed against wheels': Mechanism(
+        {'slam.front_end.FrontEnd._weighed': lambda self, track, images: track}
+    ),
+    'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'slam.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'slam.sparse_map.GONE_AFTER': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),

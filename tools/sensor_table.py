@@ -22,14 +22,13 @@ from segfloor_ros.cli.output import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.stages import make_slam
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
-from tools.driving import open_recording
+from tools.driving import after_sensors, open_recording
 
 SENSORS = ('sensors.wheel_odometry.rate_hz=50', 'sensors.imu.rate_hz=200')
 LOOP = (
@@ -126,11 +125,9 @@ def measure(
     slam = pipeline.slam if pipeline else make_slam(source.camera, configuration.stereo_slam)
     results: list[FrameResult] = []
     path: KeyframePath | None = None
-    log = MeasurementLog(source.sensors)
     with contextlib.closing(pipeline or slam):
-        for done, frame in enumerate(source.frames(), start=1):
-            for measurement in log.until(frame.stamp_ns + slam.sensors.lag_ns):
-                slam.add(measurement)
+        frames = after_sensors(slam, source.sensors, source.frames())
+        for done, frame in enumerate(frames, start=1):
             for result in (pipeline or slam).process(frame):
                 path = result.keyframe.path if result.keyframe is not None else path
                 results.append(dataclasses.replace(result, keyframe=None))

@@ -18,7 +18,7 @@ from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
-from tools.driving import drive, noisy, open_recording
+from tools.driving import after_sensors, drive, noisy, open_recording
 
 DRIVES = ('corridor1', 'corridor2', 'ramp', 'rolling', 'exposure_difference')
 """Shipped scenes: weak texture, a narrow corridor, a slope, a shaking and an uneven camera."""
@@ -66,8 +66,8 @@ def track(
     noise: int = 0,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> TrackedDrive:
-    """Track a recording, every frame carried along by its keyframe's final pose. noise: seed of
-    noise added to the images. on_progress is told the number of frames done.
+    """Track a recording with its sensors, every frame carried along by its keyframe's final pose.
+    noise: seed of noise added to the images. on_progress is told the number of frames done.
 
     Raises MapError when fewer than two keyframes came.
     """
@@ -77,7 +77,8 @@ def track(
     path: KeyframePath | None = None
     total = 0
     with contextlib.closing(slam):
-        for step in drive(slam, noisy(source.frames(), noise), on_progress):
+        frames = after_sensors(slam, source.sensors, noisy(source.frames(), noise))
+        for step in drive(slam, frames, on_progress):
             total += 1
             for result in step.results:
                 if result.tracked:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti
-from stereo_room import MOUNT
+from stereo_room import CAMERA, MOUNT
 from typer.testing import CliRunner
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.configuration import resolve
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert
+from segfloor_ros.measurements import RecordedSensor, WheelPose
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
 from tools.ablation import app, drawn
-from tools.driving import noisy
+from tools.driving import after_sensors, noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
 from tools.mechanisms import GRID, RECORDED, SLAM
 
@@ -48,6 +51,18 @@ def test_noise_follows_its_seed() -> None:
     np.testing.assert_array_equal(first.left, again.left)
     assert (first.left != other.left).mean() > 0.3
     assert first.right.astype(float).std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_slam_has_what_sensors_measured_up_to_a_frame_before_it():
+    told = [WheelPose(k * 40_000_000, np.eye(4)) for k in range(20)]
+    sensors = [RecordedSensor('wheel_odometry', 'here', len(told), True, lambda: told)]
+    slam = StereoSlam(CAMERA, StereoSlamSettings(), MOUNT)
+    frames, _ = room_drive(3)
+    had = [
+        (frame.index, slam.sensors.messages['wheel_odometry'])
+        for frame in after_sensors(slam, sensors, frames)
+    ]
+    assert had == [(0, 1), (1, 4), (2, 6)]
 
 
 def test_the_error_of_a_path_without_a_mechanism_is_printed(tmp_path) -> None:
