@@ -39,6 +39,7 @@ _TEXTURED = 0.5
 _ALIKE = 0.6
 """Normalized correlation of a patch with its mirror image."""
 _PATCH = np.stack(np.meshgrid(np.arange(-6.0, 7.0), np.arange(-3.0, 4.0)), -1).reshape(-1, 2)
+_QUICK_PATCH = _PATCH[::4]
 _OUTLINE = np.array([[0, 0], [-6, -3], [6, -3], [-6, 3], [6, 3]], np.float64)
 """Middle and corners of a patch: where these are, all of it is."""
 _SMOOTH_PX = 1.0
@@ -94,16 +95,19 @@ def mirror_candidates(
     guesses = guesses[possible]
     order = np.argsort(-on_sum[possible] * preference(guesses, travel), kind='stable')
     guesses = guesses[order[:_QUICK]]
-    share = np.array([mirrored_share(views[-2:], guess, 60) for guess in guesses])
+    share = np.array([mirrored_share(views[-2:], guess, 60, _QUICK_PATCH) for guess in guesses])
     best = np.argsort(-share, kind='stable')[:_BEST]
     return guesses[best[share[best] > _QUICK_SHARE]]
 
 
-def mirrored_share(views: list[MirrorView], angles_height: Array, count: int = 200) -> float:
+def mirrored_share(
+    views: list[MirrorView], angles_height: Array, count: int = 200, patch_px: Array = _PATCH
+) -> float:
     """Return which share of what is seen below the plane (pitch, roll, height) is seen above it,
-    mirrored. 0 where too little of it can be told; count: so many samples of each view are tested.
+    mirrored. 0 where too little of it can be told; count: so many samples of each view are tested,
+    by these pixels (P, 2) around them.
     """
-    results = [_tested_and_found(view, angles_height, count) for view in views]
+    results = [_tested_and_found(view, angles_height, count, patch_px) for view in views]
     tested, found = np.sum(results, axis=0)
     return float(found / tested) if tested >= _MIN_TESTED else 0.0
 
@@ -120,7 +124,9 @@ def _in_lower_half(view: MirrorView) -> Samples:
     )
 
 
-def _tested_and_found(view: MirrorView, angles_height: Array, count: int) -> tuple[int, int]:
+def _tested_and_found(
+    view: MirrorView, angles_height: Array, count: int, patch_px: Array
+) -> tuple[int, int]:
     camera, samples = view.camera, view.samples
     plane = plane_of(angles_height)
     below = on_and_below(samples, plane[None])[1]
@@ -143,9 +149,9 @@ def _tested_and_found(view: MirrorView, angles_height: Array, count: int) -> tup
     fits = tested & (seen > expected - play)
     if fits.sum() <= _QUICK_SHARE * tested.sum():
         return int(tested.sum()), 0
-    mirrored, patch_px = _mirrored(view, chosen[inside][fits], _PATCH, angles_height)
-    to_px = camera.project(mirrored.reshape(-1, 3))[:, :2].reshape(patch_px.shape)
-    found = _alike(view.grey, patch_px, to_px) > _ALIKE
+    mirrored, from_px = _mirrored(view, chosen[inside][fits], patch_px, angles_height)
+    to_px = camera.project(mirrored.reshape(-1, 3))[:, :2].reshape(from_px.shape)
+    found = _alike(view.grey, from_px, to_px) > _ALIKE
     return int(tested.sum()), int(found.sum())
 
 

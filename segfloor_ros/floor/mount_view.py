@@ -11,22 +11,19 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.floor.disparity import (
-    COARSE_BLOCK_PX,
-    SPECKLE_PX,
-    STEP,
-    DisparityMatcher,
+    TwoScaleMatcher,
     disparity_range,
-    halved_disparity,
     stereo_view,
 )
 from segfloor_ros.floor.feet import COLUMN_STEP_PX, find_feet
 from segfloor_ros.floor.mirror import MirrorView
 from segfloor_ros.floor.plane import Samples
+from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 
 _SAMPLES = 4000
 _LEAST_HALVED_PX = 480
-"""Images less wide than this are never matched at half the resolution."""
+"""Images less wide than this are never matched at half the resolution alone."""
 _TEXTURE_GREY = 1.2
 """Horizontal grey gradient per pixel below which a disparity is mostly invented."""
 
@@ -42,25 +39,23 @@ class MountView:
 
 
 class MountViewer:
-    """Looks at the rectified pairs of one camera; only the first is matched in full."""
+    """Looks at the rectified pairs of one camera; only the first in full resolution."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
-        searched = disparity_range(camera, None)
-        self._matcher = DisparityMatcher(searched)
-        self._halved: DisparityMatcher | None = None
-        if camera.width >= _LEAST_HALVED_PX:
-            halved = -(-searched // (2 * STEP)) * STEP
-            self._halved = DisparityMatcher(halved, COARSE_BLOCK_PX, SPECKLE_PX // 4)
-        self._is_first = True
+        self._matcher = TwoScaleMatcher(disparity_range(camera, None), FloorSegmentationSettings())
+        self._fine_rows = camera.height
 
     def view(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
     ) -> MountView:
         """Return what a grey pair (H, W) from a pose (4, 4) shows."""
         right, measured = stereo_view(left, right)
-        disparity = self._disparity(left, right) if measured is None else measured
-        self._is_first = False
+        disparity = measured
+        if disparity is None:
+            disparity = self._matcher.compute(left, right, self._fine_rows)
+            if self._camera.width >= _LEAST_HALVED_PX:
+                self._fine_rows = 0
         smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
         gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
         texture = cv2.blur(gradient, (9, 9))
@@ -79,11 +74,6 @@ class MountViewer:
         weight = np.full(len(foot_rows), float(COLUMN_STEP_PX))
         feet = self._placed(foot_rows, foot_columns, foot_px, weight, T_world_left)
         return MountView(surfaces, feet)
-
-    def _disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        if self._is_first or self._halved is None:
-            return self._matcher.compute(left, right)
-        return halved_disparity(self._halved, left, right)
 
     def _placed(
         self,

@@ -27,7 +27,8 @@ _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SIGMA_PX = 0.5
-_SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+"""Of the biweight with which a plane is refined, one per step."""
 _LEVEL, _LEVEL_SIGMA_RAD = np.zeros(2), np.radians([20.0, 6.0])
 _CLIMB = 0.03
 _SWAY_M = 0.03
@@ -212,7 +213,7 @@ def refine(
     known: Array,
     travel: Array,
     prior_sigma: Array | None = None,
-    scales_px: tuple[float, ...] = _SCALES_PX,
+    scales_px: tuple[float, ...] = SCALES_PX,
     prior_mean: Array | None = None,
 ) -> PlaneFit:
     """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
@@ -276,13 +277,11 @@ def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tupl
 
 def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
     """Add that the camera travels parallel to the floor: all displacements count as one."""
-    for displacement in travel:
-        normal_by_state = _jacobian(np.array([*state[:2], 1.0]))[:, :2]
-        normal = plane_of(np.array([*state[:2], 1.0]))
-        sigma_m = float(_climb_sigma_m(displacement[None])[0]) * math.sqrt(len(travel))
-        row = displacement @ normal_by_state
-        information[:2, :2] += np.outer(row, row) / sigma_m**2
-        gradient[:2] -= row * float(displacement @ normal) / sigma_m**2
+    unit = np.array([*state[:2], 1.0])
+    scaled = travel / (_climb_sigma_m(travel) * math.sqrt(max(1, len(travel))))[:, None]
+    rows = scaled @ _jacobian(unit)[:, :2]
+    information[:2, :2] += rows.T @ rows
+    gradient[:2] -= rows.T @ (scaled @ plane_of(unit))
 
 
 def shares(frames: list[Samples], state: Array) -> tuple[float, float]:

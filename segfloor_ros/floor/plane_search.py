@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from segfloor_ros.floor.plane import (
+    SCALES_PX,
     PlaneFit,
     Samples,
     angles_height_of,
@@ -26,6 +27,8 @@ _SCORED, _REFINED = 6000, 60000
 """So many samples of all frames together tell which guess is best, and refine it: neighbours err
 together.
 """
+_FINE_STEPS = 4
+"""So many steps of the refinement take them all; before, what scores will do."""
 _LEVEL_SIGMA = np.array([np.inf, math.radians(2.0), np.inf])
 """Cameras are mounted level, more or less: with little floor in view, roll is least certain."""
 _FLOOR_SLOPE = math.radians(1.5)
@@ -73,8 +76,12 @@ class PlaneSearch:
     def refined(self, frames: list[Samples], start: Array, travel: Array) -> PlaneFit:
         """Return the plane near `start`, (3,), that fits all samples best."""
         mean, sigma = self._prior(len(frames))
+        roughly, finely = SCALES_PX[:-_FINE_STEPS], SCALES_PX[-_FINE_STEPS:]
+        rough = refine(
+            _thinned(frames, _SCORED), start, self._known, travel, sigma, roughly, mean
+        ).angles_height
         some = _thinned(frames, _REFINED)
-        return refine(some, start, self._known, travel, prior_sigma=sigma, prior_mean=mean)
+        return refine(some, rough, self._known, travel, sigma, finely, mean)
 
     def _preference(self, guesses: Array, travel: Array) -> Array:
         if self._up is None:
