@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.floor.disparity import (
+    DisparityMatcher,
     TwoScaleMatcher,
     disparity_range,
     stereo_view,
@@ -39,23 +40,22 @@ class MountView:
 
 
 class MountViewer:
-    """Looks at the rectified pairs of one camera; only the first in full resolution."""
+    """Looks at the rectified pairs of one camera; only the first is matched in full."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
-        self._matcher = TwoScaleMatcher(disparity_range(camera, None), FloorSegmentationSettings())
-        self._fine_rows = camera.height
+        searched = disparity_range(camera, None)
+        self._first: DisparityMatcher | None = DisparityMatcher(searched)
+        self._matcher = TwoScaleMatcher(searched, FloorSegmentationSettings())
+        self._fine_rows = 0 if camera.width >= _LEAST_HALVED_PX else camera.height
 
     def view(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_world_left: Array
     ) -> MountView:
         """Return what a grey pair (H, W) from a pose (4, 4) shows."""
         right, measured = stereo_view(left, right)
-        disparity = measured
-        if disparity is None:
-            disparity = self._matcher.compute(left, right, self._fine_rows)
-            if self._camera.width >= _LEAST_HALVED_PX:
-                self._fine_rows = 0
+        disparity = self._disparity(left, right) if measured is None else measured
+        self._first = None
         smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
         gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
         texture = cv2.blur(gradient, (9, 9))
@@ -74,6 +74,11 @@ class MountViewer:
         weight = np.full(len(foot_rows), float(COLUMN_STEP_PX))
         feet = self._placed(foot_rows, foot_columns, foot_px, weight, T_world_left)
         return MountView(surfaces, feet)
+
+    def _disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        if self._first is not None:
+            return self._first.compute(left, right)
+        return self._matcher.compute(left, right, self._fine_rows)
 
     def _placed(
         self,
