@@ -21,6 +21,8 @@ _SAMPLES = 4000
 _SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 _FAITH = 2.0
 """So much more must speak for the second expectation than for the first."""
+_NOISE_SHARE = 0.01
+"""What so little of all that is seen speaks for is noise: the camera is as it is mounted."""
 _SWING_RAD = math.radians(3.0)
 """So far robots swing on their wheels; what the map says beyond that is drift."""
 _MAX_SLOPE_RAD = math.radians(18.0)
@@ -84,15 +86,22 @@ def plane_of_frame(
     )
     likelihood = scores(samples, expected)
     slope_start = _slope_ahead(samples, likelihood.max(), expected[0])
-    swing = np.hypot(*(expected - expected[0])[:, :2].T)
-    likelihood = likelihood * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
-    likelihood[0] *= _FAITH
-    start = expected[int(np.argmax(likelihood))]
+    start = expected[likeliest(likelihood / samples.weight.sum(), expected)]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     if slope_start is not None:
         start, sigma = slope_start, _SLOPE_SIGMA
     unknown, no_travel = np.full(3, np.nan), np.zeros((0, 3))
     return refine([samples], start, unknown, no_travel, sigma, _SCALES_PX)
+
+
+def likeliest(share: Array, expected: Array) -> int:
+    """Return which expectation, of pitch, roll and height (P, 3), to start from, by the share (P,)
+    of all that is seen that speaks for each, less what speaks against it.
+    """
+    swing = np.hypot(*(expected - expected[0])[:, :2].T)
+    likelihood = share * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
+    likelihood[0] = max(_FAITH * share[0], _NOISE_SHARE)
+    return int(np.argmax(likelihood))
 
 
 def _slope_ahead(samples: Samples, known_score: float, mounted: Array) -> Array | None:
