@@ -75,6 +75,7 @@ SLAM: dict[str, Mechanism] = {
     'bad adjustments left out': Mechanism({'slam.mapping.MIN_KEPT_RATIO': 0.0}),
     'known views': Mechanism({'slam.places.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.retire_redundant': _none}),
+    'keyframes where few points are found': Mechanism({'slam.keyframe_policy.FEW_FOUND': 0.0}),
     'loops': Mechanism({'slam.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
         {'slam.relocalisation.FRAMES_IN_A_ROW': 1, 'slam.relocalisation.MIN_AGREEMENT': 0.0}

@@ -18,8 +18,10 @@ TRACKED_RATIO = 0.25
 MIN_TRACKED = 15
 """Condition B as published: with fewer points the pose is too poor to make points from."""
 
-MUCH_NEW = 2.5
-"""Novelty at which condition A2 does not count frames any more."""
+MUCH_NEW, FEW_FOUND = 2.5, 0.5
+"""Novelty, and share of the points that are found again, at which condition A2 does not count
+frames any more: the next frame finds fewer still.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class View:
     frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
     points that several keyframes see, of the keyframe that shares most with this view. novelty: how
     far the view is from known ones, in units of what makes it new. mapper_idle: whether the mapper
-    could take a keyframe at once.
+    could take a keyframe at once. found_share: of the points that were looked for.
     """
 
     frames_since: int
@@ -37,6 +39,7 @@ class View:
     num_reliable: int
     novelty: float
     mapper_idle: bool = True
+    found_share: float = 1.0
 
 
 def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
@@ -44,7 +47,8 @@ def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
     robot that stands still adds nothing.
     """
     new_view = view.novelty > 1
-    due = view.frames_since >= settings.keyframe_min_frames or view.novelty > MUCH_NEW
+    due = view.frames_since >= settings.keyframe_min_frames
+    due |= view.novelty > MUCH_NEW or view.found_share < FEW_FOUND
     a1 = view.frames_since >= settings.keyframe_max_frames and new_view
     a2 = view.mapper_idle and due and new_view
     a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable

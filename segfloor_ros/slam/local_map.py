@@ -62,7 +62,9 @@ class LocalMap:
             self._camera, self._settings, self._map, track.point_ids, track.T_camera_world, depth_m
         )
         num_reliable = min(len(reliable), self._settings.tracked_points)
-        view = View(frames_since, len(track.point_ids), num_reliable, novelty, mapper_idle)
+        found = len(track.point_ids)
+        share = found / max(1, len(track.visible_ids))
+        view = View(frames_since, found, num_reliable, novelty, mapper_idle, share)
         return is_keyframe(view, self._settings)
 
     def is_new_view(self, T_camera_world: Array) -> bool:

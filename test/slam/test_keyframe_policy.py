@@ -35,6 +35,9 @@ def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
         (View(10, 200, 300, 0.9), False),
         (View(2, 200, 300, 1.5), False),  # too soon
         (View(1, 200, 300, 4.0), True),  # so new that it waits for no frames
+        (View(1, 200, 300, 1.5, found_share=0.4), True),  # the next frame finds fewer still
+        (View(1, 200, 300, 0.9, found_share=0.4), False),  # as many are found from a known view
+        (View(1, 200, 300, 1.5, mapper_idle=False, found_share=0.4), False),
         (View(10, 200, 300, 1.5, mapper_idle=False), False),  # mapper busy
         (View(30, 200, 300, 1.5, mapper_idle=False), True),  # A1: too many frames
         (View(500, 200, 300, 0.0), False),  # standing still adds nothing
