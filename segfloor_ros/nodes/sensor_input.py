@@ -83,6 +83,7 @@ class SensorInput:
         """Know no camera and no measurement."""
         self._camera: tuple[str, Array] | None = None
         self._T_left_imu: Array | None = None
+        self._uses_imu = True
         self._waiting: dict[str, deque[Odometry | Imu]] = {
             name: deque(maxlen=MAX_WAITING) for name in (WHEELS, IMU)
         }
@@ -155,7 +156,8 @@ class SensorInput:
         if self._has_tf_wheels and name == WHEELS:
             return
         self._waiting[name].append(message)
-        self._note(name, message)
+        if name == WHEELS or self._uses_imu:
+            self._note(name, message)
 
     def _measured(self, message: Odometry | Imu) -> Measurement | None:
         """Return what a message tells; None where it is not used."""
@@ -164,8 +166,11 @@ class SensorInput:
         if not measures_motion(message):
             return None
         T_left_imu = self._place(message)
+        self._uses_imu = T_left_imu is not None
         if T_left_imu is not None:
             return imu_sample(message, T_left_imu)
+        # No image waits for what is not used.
+        self._latest.pop(IMU, None)
         assert self._camera is not None
         self._node.reporter.diagnose(
             IMU,

@@ -168,8 +168,11 @@ def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
     sensors.begin('left', np.eye(3))
     sensors._receive('imu', imu(2, 'elsewhere'))
     assert sensors.take(0) == []
-    sensors._receive('imu', imu(3, '', (0.0, -9.81, 0.0)))
-    assert [m.stamp_ns for m in sensors.take(0)] == [3]
+    sensors._receive('imu', imu(3, 'elsewhere'))
+    assert not sensors.is_behind(100 * MS)  # no image waits for it
+    assert sensors.take(0) == []
+    sensors._receive('imu', imu(4, '', (0.0, -9.81, 0.0)))
+    assert [m.stamp_ns for m in sensors.take(0)] == [4]
 
 
 def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> None:
