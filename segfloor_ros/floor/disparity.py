@@ -166,7 +166,9 @@ class TwoScaleMatcher:
             halved = -(-num_disparities // (2 * STEP)) * STEP
             self._coarse = DisparityMatcher(halved, COARSE_BLOCK_PX, SPECKLE_PX // 4)
             self.num_disparities = 2 * self._coarse.num_disparities
-        self._fine = DisparityMatcher(min(fine, num_disparities))
+        else:
+            fine = num_disparities
+        self._fine = DisparityMatcher(fine)
 
     def compute(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], fine_rows: int

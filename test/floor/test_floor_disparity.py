@@ -79,10 +79,12 @@ def test_two_scales_find_what_one_finds():
     assert np.mean(np.abs(disparity[26:44, 240:320] - 80) < 1.0) > 0.9
 
 
-def test_a_short_range_takes_one_scale():
-    left, right = shifted_pair(20)
+@pytest.mark.parametrize('shift_px', [20, 40])
+def test_a_short_range_takes_one_scale(shift_px):
+    left, right = shifted_pair(shift_px)
     settings = FloorSegmentationSettings()
     matcher = TwoScaleMatcher(48, settings)
     assert matcher.num_disparities == 48
     whole = DisparityMatcher(48).compute(left, right)
+    assert np.median(whole[:, 60:]) == pytest.approx(shift_px, abs=0.1)
     assert np.array_equal(matcher.compute(left, right, fine_rows=10), whole)
