@@ -86,7 +86,7 @@ def plane_of_frame(
     )
     likelihood = scores(samples, expected)
     slope_start = _slope_ahead(samples, likelihood.max(), expected[0])
-    start = expected[likeliest(likelihood / samples.weight.sum(), expected)]
+    start = expected[likeliest(likelihood / max(samples.weight.sum(), 1e-9), expected)]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     if slope_start is not None:
         start, sigma = slope_start, _SLOPE_SIGMA

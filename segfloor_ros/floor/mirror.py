@@ -40,6 +40,7 @@ _ALIKE = 0.6
 """Normalized correlation of a patch with its mirror image."""
 _PATCH = np.stack(np.meshgrid(np.arange(-6.0, 7.0), np.arange(-3.0, 4.0)), -1).reshape(-1, 2)
 _QUICK_PATCH = _PATCH[::4]
+"""By these pixels the first guesses are compared."""
 _OUTLINE = np.array([[0, 0], [-6, -3], [6, -3], [-6, 3], [6, 3]], np.float64)
 """Middle and corners of a patch: where these are, all of it is."""
 _SMOOTH_PX = 1.0

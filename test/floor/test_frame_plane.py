@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from floor_scenes import MOUNT
+from floor_scenes import MOUNT, SMALL_CAMERA
 
-from segfloor_ros.floor.frame_plane import expectations, likeliest
+from segfloor_ros.floor.frame_plane import expectations, likeliest, plane_of_frame
 
 
 def pitched(pitch_deg: float):
@@ -30,3 +30,11 @@ def test_the_floor_is_where_the_map_has_it_only_if_that_is_what_is_seen(share, p
     known = expectations(MOUNT, pitched(pitch_deg))
     assert np.degrees(known[1, 0] - known[0, 0]) == pytest.approx(pitch_deg)
     assert likeliest(np.array(share), known) == expected
+
+
+@pytest.mark.filterwarnings('error')
+def test_where_nothing_is_matched_the_camera_is_as_it_is_mounted():
+    nothing = np.zeros((SMALL_CAMERA.height, SMALL_CAMERA.width), np.float32)
+    expected = expectations(MOUNT, pitched(4.0))
+    found = plane_of_frame(SMALL_CAMERA, 0, nothing, nothing, 1.0, expected).angles_height
+    np.testing.assert_allclose(found, expected[0], atol=1e-6)
