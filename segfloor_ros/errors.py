@@ -4,12 +4,28 @@ stop.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_CREDENTIALS = re.compile(r"""(?<=://)[^/\s]*@|[^\s/:@'"]+:[^\s/@]+@""")
+_SIGNED = re.compile(r"""(://[^\s?]*)\?[^\s'",)]*=(?:[^\s'",):]|:(?=\S))*""")
+
+
+def without_credentials(text: str) -> str:
+    """Return a text without `user:password@` of its addresses and the queries of its URLs, which
+    may sign them.
+    """
+    return _SIGNED.sub(r'\1', _CREDENTIALS.sub('', text))
+
 
 class SegfloorError(Exception):
-    """Root of every error whose message is meant for the user: what, where, what to do."""
+    """Root of every error whose message is meant for the user: what, where, what to do. An address
+    is shown without its credentials.
+    """
+
+    def __init__(self, message: str = '') -> None:
+        super().__init__(without_credentials(message))
 
 
 class InputError(SegfloorError):

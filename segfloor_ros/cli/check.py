@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Iterator
+import signal
+import sys
+from collections.abc import Generator
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +18,10 @@ from segfloor_ros.cli.output import console, figure_table, print_error
 from segfloor_ros.errors import SettingsError, os_errors
 from segfloor_ros.suite import verdicts
 from segfloor_ros.suite.description import Suite, read_suite
-from segfloor_ros.suite.job import Job, Outcome, outcomes, package_digest
+from segfloor_ros.suite.job import Job, Outcome, package_digest
 from segfloor_ros.suite.measures import number
 from segfloor_ros.suite.result_files import MEASURED, pack, unpack
+from segfloor_ros.suite.workers import outcomes
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
 HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
@@ -62,10 +66,13 @@ def check_suite(
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, verdicts.Checked] = {}
-    for job, outcome in _all_outcomes(todo, out, resume, jobs, scheduler):
-        checked = verdicts.check(job.entry, outcome, known)
-        found[checked.name] = checked
-        _print_progress(checked, len(found), len(todo))
+    # As an interrupt does, a signal to end lets the workers end first.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    with contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results:
+        for job, outcome in results:
+            checked = verdicts.check(job.entry, outcome, known)
+            found[checked.name] = checked
+            _print_progress(checked, len(found), len(todo))
     result = verdicts.SuiteResult(
         described.name, [found[entry.name] for entry in described.entries]
     )
@@ -89,30 +96,34 @@ def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:
 
 def _all_outcomes(
     todo: list[Job], out: Path, resume: bool, processes: int, scheduler: str
-) -> Iterator[tuple[Job, Outcome]]:
+) -> Generator[tuple[Job, Outcome]]:
     """Yield jobs with what came of them; what is in `out` already comes first."""
     by_name = {job.entry.name: job for job in todo}
     read = (_read_outcome(job, out) for job in todo if resume)
     kept = {outcome.name: outcome for outcome in read if outcome is not None}
     yield from ((by_name[name], outcome) for name, outcome in kept.items())
     left = [job for job in todo if job.entry.name not in kept]
-    for outcome in outcomes(left, kept, processes, scheduler):
-        if outcome.package not in ('', package_digest()):
-            raise SettingsError(
-                f'worker {outcome.worker} has another version of segfloor_ros than this machine; '
-                'install the same on all'
-            )
-        job = by_name[outcome.name]
-        unpack(outcome.archive, out / outcome.name)
-        if not outcome.problem:
-            record = {
-                'job': job.digest(),
-                'seconds': outcome.seconds,
-                'start_pose': outcome.start_pose,
-                'measured': outcome.measured,
-            }
-            (out / outcome.name / MEASURED).write_text(json.dumps(record, indent=2) + '\n')
-        yield job, outcome
+    with contextlib.closing(outcomes(left, kept, processes, scheduler)) as results:
+        for outcome in results:
+            _write(by_name[outcome.name], outcome, out)
+            yield by_name[outcome.name], outcome
+
+
+def _write(job: Job, outcome: Outcome, out: Path) -> None:
+    if outcome.package not in ('', package_digest()):
+        raise SettingsError(
+            f'worker {outcome.worker} has another version of segfloor_ros than this machine; '
+            'install the same on all'
+        )
+    unpack(outcome.archive, out / outcome.name)
+    if not outcome.problem:
+        record = {
+            'job': job.digest(),
+            'seconds': outcome.seconds,
+            'start_pose': outcome.start_pose,
+            'measured': outcome.measured,
+        }
+        (out / outcome.name / MEASURED).write_text(json.dumps(record, indent=2) + '\n')
 
 
 def _read_outcome(job: Job, out: Path) -> Outcome | None:

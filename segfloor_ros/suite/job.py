@@ -1,12 +1,9 @@
 """One recording of a suite: mapped in a process of its own, measured, and packed for the suite's
-folder. A job runs where its worker is and needs nothing but the recording; it is done by this
-process, by processes of this machine, or by a Dask cluster.
+folder. A job runs where its worker is and needs nothing but the recording; workers.py has those.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import dataclasses
 import fcntl
 import functools
@@ -18,29 +15,26 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from segfloor_ros import __version__
-from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.errors import SegfloorError, without_credentials
 from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.evaluation.truth import Pose2d
+from segfloor_ros.processes import end_with_parent
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import measure_run, start_pose_of
 from segfloor_ros.suite.result_files import Cache, digest_of, local_copy, pack, unpack
 
 STOP_S = 15.0
 """For a program to end that was told to; a replay ends its nodes first."""
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
 
 LOG = 'log.txt'
 
 SAVED_MAP = 'saved.map'
 """In the results folder of a recording that another one continues."""
-
-CONNECT_S = 10
 
 
 class ProgramError(SegfloorError):
@@ -56,7 +50,7 @@ def run_segfloor(words: list[str], log: Path, timeout_s: float) -> None:
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=_end_with_worker if sys.platform == 'linux' else None,
+            preexec_fn=functools.partial(end_with_parent, os.getpid()),
         )
     try:
         status = process.wait(timeout_s)
@@ -81,11 +75,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             continue
-
-
-def _end_with_worker() -> None:
-    """Have the kernel end this program when its worker dies (prctl(2)): its result is lost."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class JobError(SegfloorError):
@@ -150,7 +139,8 @@ def do_job(job: Job, origin: Outcome | None = None) -> Outcome:
         outcome = Outcome(job.entry.name, {}, str(error))
     except Exception as error:
         # Whatever it is, the other recordings go on.
-        outcome = Outcome(job.entry.name, {}, f'{type(error).__name__}: {error}')
+        problem = without_credentials(f'{type(error).__name__}: {error}')
+        outcome = Outcome(job.entry.name, {}, problem)
     return dataclasses.replace(
         outcome,
         seconds=time.monotonic() - start_s,
@@ -257,72 +247,3 @@ def _run(job: Job, recording: Path, loaded: Path | None, temporary: Path) -> Pat
 
 def _digest_of_text(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def outcomes(
-    jobs: list[Job], kept: Mapping[str, Outcome], processes: int = 1, scheduler: str = ''
-) -> Iterator[Outcome]:
-    """Yield what comes of the jobs, as they finish. A job that continues a map comes after the one
-    that makes it. kept: outcomes by name of jobs that were done before. scheduler: address of a
-    Dask scheduler, whose workers do the jobs; else so many processes of this machine. Raises
-    SettingsError.
-    """
-    if scheduler or processes > 1:
-        with _client(processes, scheduler) as client:
-            yield from _distributed(client, jobs, kept)
-        return
-    done = dict(kept)
-    for job in jobs:
-        done[job.entry.name] = do_job(job, done.get(job.entry.continue_from))
-        yield done[job.entry.name]
-
-
-def _distributed(client: Any, jobs: list[Job], kept: Mapping[str, Outcome]) -> Iterator[Outcome]:
-    """A worker that dies has its job done again by another one (Dask sees to that, a few times)."""
-    from distributed import as_completed
-
-    futures: dict[str, Any] = {}
-    for job in jobs:
-        origin = job.entry.continue_from
-        futures[job.entry.name] = client.submit(
-            do_job, job, futures.get(origin, kept.get(origin)), pure=False
-        )
-    names = {future.key: name for name, future in futures.items()}
-    finished = as_completed(list(futures.values()))
-    futures.clear()
-    for future in finished:
-        if future.status == 'finished':
-            outcome = future.result()
-        else:
-            outcome = Outcome(names[future.key], {}, problem=f'{future.exception()}')
-        # The cluster need not keep what is here now, unless a job that waits needs it.
-        future.release()
-        yield outcome
-
-
-@contextlib.contextmanager
-def _client(processes: int, scheduler: str) -> Iterator[Any]:
-    # Read when Dask is imported, here and in the workers: what matters is in the outcomes.
-    os.environ.setdefault('DASK_LOGGING__DISTRIBUTED', 'critical')
-    try:
-        import distributed
-    except ImportError:
-        raise SettingsError(
-            "--jobs and --scheduler need Dask: pip install 'segfloor_ros[cluster]'"
-        ) from None
-    with contextlib.ExitStack() as stack:
-        address: Any = scheduler
-        if not scheduler:
-            address = stack.enter_context(
-                distributed.LocalCluster(
-                    n_workers=processes,
-                    threads_per_worker=1,
-                    memory_limit=0,
-                    dashboard_address='127.0.0.1:0',
-                )
-            )
-        try:
-            client = distributed.Client(address, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:
-            raise SettingsError(f'--scheduler {scheduler}: cannot be reached ({error})') from None
-        yield stack.enter_context(client)

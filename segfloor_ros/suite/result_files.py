@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, without_credentials
 
 MEASURED = 'measured.json'
 ARCHIVE = 'results.tar'
@@ -85,7 +85,7 @@ def find_recordings(pattern: str) -> dict[str, str]:
     """Return paths or URLs by short name: the one given, or all that a pattern matches. Raises
     InputError where there is none.
     """
-    if not any(c in pattern for c in WILDCARDS):
+    if not any(c in without_credentials(pattern) for c in WILDCARDS):
         if not is_url(pattern) and not Path(pattern).exists():
             raise InputError(f'{pattern}: no such recording')
         return {_stem(pattern): pattern}
@@ -110,7 +110,7 @@ def local_copy(path_or_url: str, folder: Path) -> Path:
         # Size, time and tag tell whether what the URL names has changed.
         facts = repr(sorted((k, str(v)) for k, v in system.info(path).items()))
         target = folder / hashlib.sha256((path_or_url + facts).encode()).hexdigest()[:16]
-        copy = target / path.rstrip('/').rpartition('/')[2]
+        copy = target / _name(path)
         if not target.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
             staging = Path(tempfile.mkdtemp(dir=folder, prefix='.copy-'))
@@ -146,8 +146,8 @@ def _open_system(url: str) -> tuple[Any, str]:
         ) from None
     try:
         return url_to_fs(url)
-    except (ImportError, ValueError) as error:
-        raise InputError(f'{url}: {error}') from None
+    except (ImportError, OSError, ValueError) as error:
+        raise InputError(f'{url}: cannot be read ({error})') from None
 
 
 def _move(staging: Path, target: Path) -> None:
@@ -160,5 +160,10 @@ def _move(staging: Path, target: Path) -> None:
             raise
 
 
+def _name(path_or_url: str) -> str:
+    """Return the last part, without the query of a URL: it may hold what signs it."""
+    return without_credentials(path_or_url).rstrip('/').rpartition('/')[2]
+
+
 def _stem(path: str) -> str:
-    return Path(path.rstrip('/').rpartition('/')[2]).stem
+    return Path(_name(path)).stem

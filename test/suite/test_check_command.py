@@ -107,6 +107,18 @@ def test_a_bad_suite_ends_with_status_2(room, tmp_path):
     assert not (tmp_path / 'out').exists()
 
 
+def test_credentials_of_a_recording_are_nowhere(tmp_path):
+    url = 'ftp://me:s3cret@localhost:1/night.mcap?sig=s3cret'
+    path, out = tmp_path / 'suite.yaml', tmp_path / 'out'
+    path.write_text(f'recordings: [{{input: "{url}"}}]')
+    done = check(path, '--out', out, '--cache', tmp_path / 'cache')
+    assert done.returncode == 1
+    assert 'night: ftp://localhost:1/night.mcap: cannot be read' in done.stderr
+    texts = [file.read_text() for file in (out, tmp_path / 'cache') for file in file.rglob('*.*')]
+    assert len(texts) >= 2
+    assert not [text for text in (done.stdout, done.stderr, *texts) if 's3cret' in text]
+
+
 def job_of(room, tmp_path, **changes) -> Job:
     entry = Entry('room', str(room), assignments=('stereo_slam.num_features=700',), **changes)
     return Job(entry, '', str(tmp_path / 'cache'), reuse=False)

@@ -1,7 +1,9 @@
-"""A suite on worker processes of Dask."""
+"""A suite on worker processes, of this machine and of Dask."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -23,12 +25,20 @@ SUITE = 'recordings:\n' + ''.join(
 )
 
 
-def start_check(room: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+def start_check(
+    room: Path, folder: Path, *options: str, **environment: str
+) -> subprocess.Popen[str]:
     suite = folder / 'suite.yaml'
     suite.write_text(SUITE.format(room=room))
     command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'check', str(suite), '--no-cache',
                '--cache', str(folder / 'cache'), *options]  # fmt: skip
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    )
 
 
 def mapping(process: psutil.Process) -> bool:
@@ -44,9 +54,10 @@ def alone(room, tmp_path_factory) -> Path:
     return folder
 
 
-def finish(check: subprocess.Popen[str]) -> None:
+def finish(check: subprocess.Popen[str]) -> str:
     _, errors = check.communicate(timeout=240)
     assert check.returncode == 0, errors
+    return errors
 
 
 def assert_same_maps(one: Path, other: Path) -> None:
@@ -59,6 +70,64 @@ def assert_same_maps(one: Path, other: Path) -> None:
 def test_two_processes_make_the_maps_of_one(room, alone, tmp_path):
     finish(start_check(room, tmp_path, '--out', str(tmp_path / 'two'), '--jobs', '2'))
     assert_same_maps(alone, tmp_path / 'two')
+
+
+def mapping_together(check: subprocess.Popen[str], programs: int) -> list[psutil.Process]:
+    """Return all processes of a check as soon as so many programs map."""
+    process = psutil.Process(check.pid)
+    while check.poll() is None:
+        found = process.children(recursive=True)
+        if sum(' run ' in ' '.join(p.cmdline()) for p in found if p.is_running()) == programs:
+            return [process, *found]
+        time.sleep(0.02)
+    raise AssertionError(check.communicate())
+
+
+def test_nothing_of_a_check_listens(room, tmp_path):
+    check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--jobs', '2')
+    processes = mapping_together(check, 2)
+    try:
+        listening = [
+            c
+            for p in processes
+            for c in p.net_connections('all')
+            if c.status == psutil.CONN_LISTEN or (c.family.name == 'AF_UNIX' and c.laddr)
+        ]
+        # The check, its two workers and the two programs, at least.
+        assert len(processes) >= 5
+        assert listening == []
+    finally:
+        check.terminate()
+        check.communicate(timeout=60)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize('jobs', ['1', '2'])
+def test_a_killed_check_leaves_nothing(room, tmp_path, number, jobs):
+    (temporary := tmp_path / 'temporary').mkdir()
+    check = start_check(
+        room, tmp_path, '--out', str(tmp_path / 'out'), '--jobs', jobs, TMPDIR=str(temporary)
+    )
+    processes = mapping_together(check, int(jobs))
+    assert list(temporary.iterdir())
+    check.send_signal(number)
+    check.communicate(timeout=60)
+    assert check.returncode == (-number if number == signal.SIGKILL else 128 + number)
+    _, left = psutil.wait_procs(processes, timeout=30)
+    assert left == []
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_worker_that_dies_fails_its_recording_alone(room, tmp_path):
+    check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--jobs', '3')
+    processes = mapping_together(check, 3)
+    (program, *_) = [p for p in processes if ' run ' in ' '.join(p.cmdline())]
+    program.parent().kill()
+    _, errors = check.communicate(timeout=240)
+    assert check.returncode == 1
+    assert errors.count('its worker ended (signal SIGKILL)') == 1
+    assert sum((tmp_path / 'out' / name / 'map.pgm').exists() for name in NAMES) == 2
+    program.wait(30)
 
 
 @pytest.mark.slow
@@ -84,7 +153,10 @@ def test_a_killed_worker_changes_nothing(room, alone, tmp_path):
                 time.sleep(0.05)
             assert checked.poll() is None
             workers[0].kill()
-            finish(checked)
+            warning = finish(checked)
+            # One line of its own, nothing of the address.
+            assert warning.startswith('segfloor: --scheduler without tls://')
+            assert warning.count('\n') == 1
         finally:
             for process in workers:
                 process.kill()
@@ -98,3 +170,12 @@ def test_a_scheduler_that_is_not_there_is_one_line(room, tmp_path):
     assert check.returncode == 2
     assert errors.startswith('segfloor: --scheduler nowhere: cannot be reached')
     assert errors.count('\n') == 1
+
+
+@pytest.mark.parametrize('address', ['tcp://me:s3cret@localhost:1', 'me:s3cret@localhost:1'])
+def test_credentials_of_a_scheduler_are_not_echoed(room, tmp_path, address):
+    check = start_check(room, tmp_path, '--out', str(tmp_path / 'out'), '--scheduler', address)
+    _, errors = check.communicate(timeout=120)
+    assert check.returncode == 2
+    assert 'localhost:1: cannot be reached' in errors
+    assert 's3cret' not in errors

@@ -43,6 +43,28 @@ def test_a_url_that_leads_nowhere_is_named(tmp_path, url):
         local_copy(url, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ('text', 'shown'),
+    [
+        ('https://me:s3cret@host/night.mcap: gone', 'https://host/night.mcap: gone'),
+        ('https://host/b.mcap?a=b:c: gone', 'https://host/b.mcap: gone'),
+        ('https://t0ken@host/a/b.mcap', 'https://host/a/b.mcap'),
+        ("s3://k:a@b@bucket/night-*, 'x'", "s3://bucket/night-*, 'x'"),
+        ('(https://host/b.mcap?X-Sig=a.b/c&d=e)', '(https://host/b.mcap)'),
+        ('gs://bucket/night-?.mcap', 'gs://bucket/night-?.mcap'),
+        ("invalid address 'me:s3cret@host:1'", "invalid address 'host:1'"),
+        ('mail me@example.org: line 3', 'mail me@example.org: line 3'),
+    ],
+)
+def test_errors_show_addresses_without_credentials(text, shown):
+    assert str(InputError(text)) == shown
+
+
+def test_a_signed_url_gives_no_name():
+    signed = 'https://me:s3cret@host/night.mcap?sig=a.b/c'
+    assert find_recordings(signed) == {'night': signed}
+
+
 def test_a_digest_follows_names_and_content_and_not_the_place(tmp_path):
     def folder(name, **files):
         for file, text in files.items():
