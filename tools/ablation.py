@@ -21,18 +21,17 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.evaluation.floor import count_pixels
+from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.evaluation.map_score import MapScore, score_map
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
+from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.mapper import OccupancyGridMapper
@@ -105,31 +104,18 @@ def true_masks(
     if (drive / 'poses.txt').is_file():
         T_first_left = read_trajectory(drive / 'poses.txt')[1]
         poses = mount.T_base_left @ T_first_left @ invert(mount.T_base_left)
-    known = yaml.safe_load(outlines.read_text())['frames'] if outlines else {}
+    known = read_outlines(outlines) if outlines else {}
     found = []
     for frame in noisy(source.frames(), noise):
-        # The files of the outlines are numbered from 1.
-        outline, file = known.get(frame.index + 1), drive / 'floor' / f'{frame.index:06d}.png'
+        outline, file = known.get(frame.index), drive / 'floor' / f'{frame.index:06d}.png'
         if outline is not None:
-            mask = drawn(outline, frame.left.shape)
+            mask = draw_outline(outline, frame.left.shape)
         elif file.is_file():
             mask = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
         else:
             continue
         found.append(TrueMask(frame, mask, None if poses is None else poses[frame.index]))
     return camera, found
-
-
-def drawn(outline: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return the mask (H, W) of polygons of floor; what is unsure, and its border, says nothing."""
-    mask = np.full(shape, NOT_FLOOR, np.uint8)
-    for polygon in outline['floor']:
-        corners = np.array(polygon, np.int32).reshape(-1, 2)
-        cv2.fillPoly(mask, [corners], FLOOR)
-        cv2.polylines(mask, [corners], True, NO_EVIDENCE, 5)
-    for polygon in outline.get('unsure', []):
-        cv2.fillPoly(mask, [np.array(polygon, np.int32).reshape(-1, 2)], NO_EVIDENCE)
-    return mask
 
 
 @app.command('masks')

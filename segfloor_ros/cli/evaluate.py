@@ -135,7 +135,10 @@ def evaluate_floor(
         Path, typer.Argument(metavar='EST_DIR', help='Folder of masks, or a run folder.')
     ],
     truth: Annotated[
-        Path, typer.Argument(metavar='TRUTH_DIR', help='Folder of masks, or a scene folder.')
+        Path,
+        typer.Argument(
+            metavar='TRUTH', help='Folder of masks, a scene folder, or a file of outlines (.yaml).'
+        ),
     ],
     as_json: JsonOption = False,
 ) -> None:
@@ -144,8 +147,8 @@ def evaluate_floor(
     if as_json:
         _print_json(score.as_dict())
         return
-    shares = ('precision', 'recall', 'iou', 'coverage')
-    rows = [(name, f'{100 * getattr(score, name):.2f} %') for name in shares]
+    shares = ('precision', 'recall', 'false_floor_share', 'iou', 'coverage')
+    rows = [(name.replace('_', ' '), f'{100 * getattr(score, name):.2f} %') for name in shares]
     rows.append(('masks scored', str(score.masks)))
     rows.append(('true masks without an estimate', str(score.missing)))
     console.print(value_table('measure', rows))

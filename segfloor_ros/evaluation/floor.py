@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+
+UNSURE_PX = 2
+"""How far the outlines of floor that are drawn by hand may be off."""
 
 
 @dataclass(frozen=True)
@@ -43,30 +48,80 @@ class FloorScore:
         return _ratio(self.true_floor, self.true_floor + self.false_floor + self.missed_floor)
 
     @property
+    def false_floor_share(self) -> float:
+        """Share of what is not floor that is called floor."""
+        return _ratio(self.false_floor, self.pixels - self.true_floor - self.missed_floor)
+
+    @property
     def coverage(self) -> float:
         """Share of the pixels for which the estimate has evidence either way."""
         return _ratio(self.with_evidence, self.pixels)
 
     def as_dict(self) -> dict[str, float]:
         """Return counts and shares as plain numbers."""
-        shares = {name: getattr(self, name) for name in ('precision', 'recall', 'iou', 'coverage')}
+        names = ('precision', 'recall', 'false_floor_share', 'iou', 'coverage')
+        shares = {name: getattr(self, name) for name in names}
         return {**shares, 'masks': self.masks, 'missing': self.missing, 'pixels': self.pixels}
 
 
 def score_floor_folders(estimate: Path, truth: Path) -> FloorScore:
     """Score the masks of one folder against those of the same name in another.
 
-    Folders of a run (with floor_masks/) and of a scene (with floor/) will do. Masks of the truth
-    that the estimate lacks are counted as missing and not scored. Raises InputError when no name
-    is in both folders, or when sizes differ.
+    Folders of a run (with floor_masks/) and of a scene (with floor/) will do, and for the truth a
+    file of outlines (see `read_outlines`). Masks of the truth that the estimate lacks are counted
+    as missing and not scored. Raises InputError when no name is in both, or when sizes differ.
     """
     estimates = _mask_files(estimate, 'floor_masks')
-    truths = _mask_files(truth, 'floor')
-    common = sorted(estimates.keys() & truths.keys())
+    outlines = read_outlines(truth) if truth.suffix == '.yaml' else {}
+    drawn = {f'{index:06d}.png': outline for index, outline in outlines.items()}
+    files = {} if drawn else _mask_files(truth, 'floor')
+    truths = drawn.keys() | files.keys()
+    common = sorted(estimates.keys() & truths)
     if not common:
         raise InputError(f'{estimate} and {truth} have no mask of the same name (%06d.png)')
-    counts = np.sum([_count(estimates[name], truths[name]) for name in common], axis=0)
+    counts = np.zeros(5, np.int64)
+    for name in common:
+        mask = _read_mask(estimates[name])
+        true = draw_outline(drawn[name], mask.shape) if drawn else _read_mask(files[name])
+        if mask.shape != true.shape:
+            raise InputError(
+                f'{estimates[name]}: is {mask.shape[1]}x{mask.shape[0]}, '
+                f'the true mask {true.shape[1]}x{true.shape[0]}'
+            )
+        counts += count_pixels(mask, true)
     return FloorScore(len(common), len(truths) - len(common), *(int(value) for value in counts))
+
+
+def read_outlines(path: Path) -> dict[int, dict[str, Any]]:
+    """Return, by frame, the polygons [u, v, u, v, …] that a YAML file has under `frames`: `floor`,
+    `obstacle`, `unsure`. Raises InputError where it has none.
+    """
+    try:
+        frames = yaml.safe_load(path.read_text())['frames']
+        return {int(index): dict(outline) for index, outline in frames.items()}
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f'{path}: no outlines of floor by frame ({error})') from error
+
+
+def draw_outline(outline: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return the mask (H, W) of polygons drawn by hand. Where obstacles are drawn, only what is
+    drawn counts; else all that is not floor. Borders do not count, nor what is unsure.
+    """
+    mask = np.full(shape, NO_EVIDENCE if 'obstacle' in outline else NOT_FLOOR, np.uint8)
+    for kind, value, border_px in (('floor', FLOOR, UNSURE_PX), ('obstacle', NOT_FLOOR, 1)):
+        drawn = _filled(outline.get(kind, []), shape)
+        around = np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8)
+        mask[cv2.dilate(drawn, around) > 0] = NO_EVIDENCE
+        mask[cv2.erode(drawn, around) > 0] = value
+    mask[_filled(outline.get('unsure', []), shape) > 0] = NO_EVIDENCE
+    return mask
+
+
+def _filled(polygons: list[list[int]], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    picture = np.zeros(shape, np.uint8)
+    for polygon in polygons:
+        cv2.fillPoly(picture, [np.array(polygon, np.int32).reshape(-1, 2)], 1)
+    return picture
 
 
 def count_pixels(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -83,16 +138,6 @@ def count_pixels(estimate: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArr
         ],
         np.int64,
     )
-
-
-def _count(estimate_file: Path, truth_file: Path) -> NDArray[np.int64]:
-    estimate, truth = _read_mask(estimate_file), _read_mask(truth_file)
-    if estimate.shape != truth.shape:
-        raise InputError(
-            f'{estimate_file}: is {estimate.shape[1]}x{estimate.shape[0]}, '
-            f'the true mask {truth.shape[1]}x{truth.shape[0]}'
-        )
-    return count_pixels(estimate, truth)
 
 
 def _mask_files(folder: Path, inner: str) -> dict[str, Path]:

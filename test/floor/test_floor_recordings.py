@@ -10,6 +10,7 @@ from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
 from segfloor_ros.camera.deblocking import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
@@ -17,7 +18,6 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 OUTLINES = Path(__file__).with_name('library_floor_outlines.yaml')
 LIBRARY_MOUNT = Mount(1.27, np.radians(5.9), np.radians(0.4))
-UNSURE_PX = 3
 
 
 def test_corridor(shared_data):
@@ -79,26 +79,14 @@ def rectified_reader(folder: Path):
     return camera, read
 
 
-def drawn(polygons, shape):
-    picture = np.zeros(shape, np.uint8)
-    for polygon in polygons:
-        cv2.fillPoly(picture, [np.array(polygon, np.int32).reshape(-1, 2)], 1)
-    return picture
-
-
 def test_library(shared_data):
     camera, read = rectified_reader(shared_data / 'library')
     stage = FloorSegmentation(camera, FloorSegmentationSettings())
-    hit = false = missed = 0
-    kernel = np.ones((2 * UNSURE_PX + 1, 2 * UNSURE_PX + 1), np.uint8)
-    for i, outline in yaml.safe_load(OUTLINES.read_text())['frames'].items():
-        floor = drawn(outline['floor'], (240, 320))
-        counted = drawn(outline.get('unsure', []), (240, 320)) == 0
-        counted &= (cv2.dilate(floor, kernel) == 0) | (cv2.erode(floor, kernel) > 0)
-        called = stage.process(*read(i), LIBRARY_MOUNT).mask == FLOOR
-        hit += (called & (floor > 0) & counted).sum()
-        false += (called & (floor == 0) & counted).sum()
-        missed += (~called & (floor > 0) & counted).sum()
+    counts = np.zeros(5, np.int64)
+    for i, outline in read_outlines(OUTLINES).items():
+        mask = stage.process(*read(i + 1), LIBRARY_MOUNT).mask
+        counts += count_pixels(mask, draw_outline(outline, mask.shape))
+    hit, false, missed, *_ = counts
     assert hit / (hit + false) > 0.93
     assert hit / (hit + missed) > 0.75
 

@@ -10,12 +10,11 @@ from typer.testing import CliRunner
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.configuration import resolve
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import RecordedSensor, WheelPose
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from tools.ablation import app, drawn
+from tools.ablation import app
 from tools.driving import after_sensors, noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
 from tools.mechanisms import GRID, RECORDED, SLAM
@@ -30,17 +29,6 @@ def test_what_is_left_out_is_part_of_the_package(name) -> None:
     for setting, value in ALL[name].settings.items():
         assert getattr(changed.stereo_slam, setting) == value
     assert bool(ALL[name].patches or ALL[name].settings) is (name != 'nothing')
-
-
-def test_outlines_become_masks_with_unsure_borders() -> None:
-    outline = {'floor': [[[10, 10], [50, 10], [50, 40], [10, 40]]], 'unsure': [[[0, 50], [9, 50]]]}
-    mask = drawn(outline, (60, 80))
-    assert (mask[25, 30], mask[25, 70], mask[10, 30], mask[50, 5]) == (
-        FLOOR,
-        NOT_FLOOR,
-        NO_EVIDENCE,
-        NO_EVIDENCE,
-    )
 
 
 def test_noise_follows_its_seed() -> None:
