@@ -46,7 +46,7 @@ setup(
         f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*', 'furniture.yaml', 'world.xml'],
         f'{PACKAGE}.evaluation': ['report.css'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
-        f'{PACKAGE}.slam': ['vocabulary.npy'],
+        f'{PACKAGE}.slam.places': ['vocabulary.npy'],
     },
     data_files=data_files,
     python_requires='>=3.10',

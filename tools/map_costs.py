@@ -21,19 +21,19 @@ from rich.table import Table
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, se3_exp
 from segfloor_ros.map_file import Arrays
-from segfloor_ros.slam.consensus import Consensus
-from segfloor_ros.slam.disparity_offset import NO_OFFSET
-from segfloor_ros.slam.features import Features
-from segfloor_ros.slam.global_adjustment import apply_global, copy_map, solve_global
-from segfloor_ros.slam.keyframe_record import Match
-from segfloor_ros.slam.loop_closing import move_keyframes, plan_closing, solve_closing
-from segfloor_ros.slam.loops import path_lengths
-from segfloor_ros.slam.map_arrays import fill_map
-from segfloor_ros.slam.patch_alignment import SIDE_PX
-from segfloor_ros.slam.place_recognition import PlaceRecognition
-from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking import Tracker
-from segfloor_ros.slam.vocabulary import NUM_WORDS, Vocabulary
+from segfloor_ros.slam.map.keyframe_record import Match
+from segfloor_ros.slam.map.map_arrays import fill_map
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.disparity_offset import NO_OFFSET
+from segfloor_ros.slam.mapping.global_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.slam.places.loop_closing import move_keyframes, plan_closing, solve_closing
+from segfloor_ros.slam.places.loops import path_lengths
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition
+from segfloor_ros.slam.places.vocabulary import NUM_WORDS, Vocabulary
+from segfloor_ros.slam.tracking.consensus import Consensus
+from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.map_tracking import Tracker
+from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 STEP_M, SEEN_BY, POINTS = 0.1, 6, 50

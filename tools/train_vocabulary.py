@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
-from segfloor_ros.slam import vocabulary
-from segfloor_ros.slam.features import FeatureExtractor
+from segfloor_ros.slam.places import vocabulary
+from segfloor_ros.slam.places.vocabulary import BRANCHES, LEVELS
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.vocabulary import BRANCHES, LEVELS
+from segfloor_ros.slam.tracking.features import FeatureExtractor
 
 FRAMES_PER_RECORDING = 80
 STEPS = 12

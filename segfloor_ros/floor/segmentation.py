@@ -54,7 +54,7 @@ from segfloor_ros.floor.texture import (
 )
 from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.excluded import join
+from segfloor_ros.slam.tracking.images import join
 from segfloor_ros.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'

@@ -1,1 +1,6 @@
-"""Feature-based stereo SLAM: features, tracking, keyframes, sparse map, bundle adjustment."""
+"""Feature-based stereo SLAM after ORB-SLAM2 (Mur-Artal and Tardos, 2017) and OpenVSLAM.
+
+In: rectified stereo frames, and where present depth, wheel odometry and an IMU.
+Out: a pose per frame, a keyframe with its features per new view, and the sparse map (`results.py`).
+The way in is `stereo_slam.StereoSlam`; the rooms are tracking, mapping, map, places, sensors, moving.
+"""

@@ -1,32 +1,34 @@
-"""Stereo SLAM: from stereo frames to poses, keyframes and a sparse map."""
+"""Stereo SLAM: from stereo frames to poses, keyframes and a sparse map.
+
+What SLAM asks of whoever measures the camera's mount.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.map_file import Arrays
-from segfloor_ros.measurements import Measurement
-from segfloor_ros.slam.back_end import BackEnd
-from segfloor_ros.slam.body_motion import BodyMotion
-from segfloor_ros.slam.front_end import FrontEnd
-from segfloor_ros.slam.held_results import HeldResults
-from segfloor_ros.slam.images import Images
-from segfloor_ros.slam.keyframe_record import KeyframeRecord
-from segfloor_ros.slam.loops import Candidate
-from segfloor_ros.slam.motion_search import MotionSearch, Searched
-from segfloor_ros.slam.mount_meter import MountMeter
-from segfloor_ros.slam.patch_alignment import sample_patches
-from segfloor_ros.slam.results import FrameResult, Keyframe
+from segfloor_ros.measurements import Measurement, Up
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.snapshot import HeldResults, in_joined_map, take_snapshot
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.back_end import BackEnd
+from segfloor_ros.slam.moving.motion_search import MotionSearch, Searched
+from segfloor_ros.slam.places.loops import Candidate
+from segfloor_ros.slam.results import FrameResult, Keyframe, Track
+from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.snapshot import in_joined_map, take_snapshot
-from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.track import Track
+from segfloor_ros.slam.tracking.front_end import FrontEnd
+from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes
 
 START_NS, RESUMING_NS, LOST_NS = 1_000_000_000, 5_000_000_000, 1_500_000_000
@@ -370,3 +372,29 @@ def _lost(result: FrameResult) -> FrameResult:
         moving=None,
         blind=False,
     )
+
+
+class MountMeter(Protocol):
+    """Measures the camera's mount from the floor it sees."""
+
+    def add(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
+        T_world_left: Array,
+        up_world: Up | None,
+    ) -> None:
+        """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
+        frame, and where an accelerometer has up in that frame.
+        """
+
+    def start_over(self) -> None:
+        """Forget all keyframes: where the next ones are relative to them is not known."""
+
+    @property
+    def mount(self) -> Mount | None:
+        """The mount at the first frame, once it is known."""
+
+    @property
+    def provisional(self) -> Mount:
+        """The mount as it seems so far, whatever little is known."""

@@ -17,7 +17,7 @@ from segfloor_ros.messages.poses import transform_message
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.sensor_input import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.excluded import is_inside
+from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
 ARGUMENTS = (

@@ -10,15 +10,15 @@ from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_po
 from test_places import row_of_views
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.consensus import Consensus
-from segfloor_ros.slam.features import FeatureExtractor
-from segfloor_ros.slam.fusion import find_duplicates
-from segfloor_ros.slam.images import Images
-from segfloor_ros.slam.local_map import LocalMap
+from segfloor_ros.slam.mapping.fusion import find_duplicates
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking import Tracker
+from segfloor_ros.slam.tracking.consensus import Consensus
+from segfloor_ros.slam.tracking.features import FeatureExtractor
+from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.local_map import LocalMap
+from segfloor_ros.slam.tracking.map_tracking import Tracker
 
 SETTINGS = StereoSlamSettings(num_features=600)
 

@@ -184,8 +184,8 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
 
 
 def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.front_end.RECOVERY_RATIO', 1.0)
-    monkeypatch.setattr('segfloor_ros.slam.place_recognition.MIN_FOUND_SHARE', 1.0)
+    monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.RECOVERY_RATIO', 1.0)
+    monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.MIN_FOUND_SHARE', 1.0)
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     black = np.zeros_like(frames[0].left)
     tracked = []
@@ -242,7 +242,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.held_results.MAX_HELD_KEYFRAMES', 3)
+    monkeypatch.setattr('segfloor_ros.slam.map.snapshot.MAX_HELD_KEYFRAMES', 3)
     slam = StereoSlam(CAMERA, SETTINGS)
     for frame in frames[:-1]:
         assert slam.process(frame) == []

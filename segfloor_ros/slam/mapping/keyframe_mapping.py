@@ -1,0 +1,320 @@
+"""Mapping: what happens when a frame becomes a keyframe.
+
+A first guess of the disparity everywhere, to two pixels: block matching of shrunken images
+(Konolige, Small Vision Systems, ISRR 1997, as in OpenCV).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.measurements import Up
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
+from segfloor_ros.slam.mapping.disparity_offset import DisparityOffset
+from segfloor_ros.slam.mapping.fusion import fuse_duplicates, retire_redundant
+from segfloor_ros.slam.mapping.level_ground import LevelGround
+from segfloor_ros.slam.mapping.triangulation import triangulate_between
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.sensors.motion_links import factors_of
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.point_measurement import measure_disparity
+
+DISPARITY_REACH_PX = 4
+MIN_DISPARITY_PX = 1.0
+CONTRADICTED_SHARE = 0.1
+"""A feature whose disparity differs by more than this share from that of the point it was matched
+with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
+"""
+
+MIN_SHARED_POINTS = 15
+MIN_LINK_SHARE = 0.1
+"""Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
+
+SETTLING_KEYFRAMES = 2
+MIN_FOUND_RATIO = 0.25
+MIN_KEPT_RATIO = 0.5
+"""Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
+
+LOCAL_KEYFRAMES = 10
+FIXED_KEYFRAMES = 10
+"""Keyframes that move in a local adjustment, and those that hold them: what is solved well within
+the time between two keyframes."""
+
+BUNDLE_STEPS = 5
+"""Steps of a local adjustment; it mostly converges in three."""
+
+WIDTH_PX = 320
+"""Images are shrunk to about this width."""
+
+MAX_DISPARITY_SHARE = 0.5
+"""Largest disparity, as a share of the image's width."""
+
+BLOCK_PX = 11
+MIN_TEXTURE = 5
+STEP = 16
+"""OpenCV's disparities are in 1/16 px, and their number is a multiple of 16."""
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A local bundle adjustment and where its unknowns belong.
+
+    newest: index of the keyframe that caused it. free: (K,) indices of the keyframes that move.
+    ids: (P,) of the points. edge_keyframe, edge_row: (N,) of the observations. carried_ids,
+    carried_by: (C,) points that one keyframe alone sees, which tell nothing about poses and move
+    along with it.
+    """
+
+    newest: int
+    problem: BundleProblem
+    free: NDArray[np.intp]
+    ids: NDArray[np.int32]
+    edge_keyframe: NDArray[np.int32]
+    edge_row: NDArray[np.int32]
+    carried_ids: NDArray[np.int32]
+    carried_by: NDArray[np.int32]
+
+
+class LocalMapper:
+    """Adds keyframes and their points to the map and adjusts the neighbourhood."""
+
+    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
+        self._camera = camera
+        self.ground: LevelGround | None = None
+        self.offset = DisparityOffset(settings.disparity_offset_sigma_px, 1.0 / LOCAL_KEYFRAMES)
+
+    def measure_stereo(
+        self, frame: StereoFrame, images: Images, observations: Observations
+    ) -> None:
+        """Add a disparity, in place, to every feature that has none yet and is found in the
+        right image.
+        """
+        missing = np.flatnonzero(np.isnan(observations.uvd_px[:, 2]))
+        uv_px = observations.uvd_px[missing, :2]
+        guess: Array = np.zeros(len(missing))
+        if not images.depth_scale:
+            guess = guess_disparity(frame.left, frame.right, uv_px)
+        found = np.isfinite(guess)
+        measure_disparity(
+            images,
+            observations,
+            missing[found],
+            guess[found],
+            DISPARITY_REACH_PX,
+        )
+
+    def insert(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
+    ) -> None:
+        """Add a keyframe, new points from its stereo features, and from the parallax to others
+        where the right image shows none; points that turn out to be known are fused with the older
+        ones.
+        """
+        keyframe.point_id[self._contradicted(sparse_map, keyframe)] = NO_POINT
+        rows, points = self._new_points(keyframe)
+        sparse_map.add_keyframe(keyframe, patches, rows, points)
+        for other in self._partners(sparse_map, keyframe):
+            new = triangulate_between(self._camera, keyframe, other, self.offset.value_px)
+            sparse_map.add_points_between(
+                keyframe, new.rows, other, new.other_rows, new.xyz_world, patches
+            )
+        fuse_duplicates(self._camera, sparse_map, keyframe)
+        keyframe.links = self._links(sparse_map, keyframe)
+
+    def _links(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> tuple[int, ...]:
+        """Return the earlier keyframes that share most points with a new one; the one before it
+        where none does.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        enough = max(MIN_SHARED_POINTS, MIN_LINK_SHARE * len(own))
+        near = order[(shared >= enough) & (order != keyframe.index)]
+        before = [keyframe.index - 1] if keyframe.index > 0 else []
+        return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
+
+    def _contradicted(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+        """Return the features (N,) that were matched with a point at another depth: their pixels
+        fit it, but their disparity does not.
+        """
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        points = sparse_map.xyz_world[keyframe.point_id[rows]]
+        depth = np.maximum(transform_points(keyframe.T_camera_world, points)[:, 2], MIN_DEPTH_M)
+        expected = self._camera.disparity_times_depth / depth
+        measured = keyframe.observations.uvd_px[rows, 2] - self.offset.value_px
+        limit = np.maximum(DISPARITY_REACH_PX, CONTRADICTED_SHARE * expected)
+        return rows[np.abs(measured - expected) > limit]
+
+    def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
+        """Return the covisible keyframes with which rays cross best: the farthest away of them, and
+        one in the middle.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        views = [sparse_map.keyframes[k] for k in near[:LOCAL_KEYFRAMES]]
+        centre = keyframe.T_world_camera[:3, 3]
+        views.sort(key=lambda k: float(np.linalg.norm(k.T_world_camera[:3, 3] - centre)))
+        return [views[-1], views[len(views) // 2]][: len(views)] if views else []
+
+    def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
+        """Return features (N,) that are measured but belong to no point yet, and where they are."""
+        uvd = keyframe.observations.uvd_px
+        with np.errstate(invalid='ignore'):
+            measured = uvd[:, 2] - self.offset.value_px >= MIN_DISPARITY_PX
+        rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
+        depth = self._camera.disparity_times_depth / (uvd[rows, 2] - self.offset.value_px)
+        points = self._camera.back_project(uvd[rows, :2], depth)
+        return rows, transform_points(keyframe.T_world_camera, points)
+
+    def plan_adjustment(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord, up_world: Up | None = None
+    ) -> Adjustment | None:
+        """Copy the neighbourhood of a keyframe, not the first one, out of the map; None where no
+        two keyframes share a point. up_world: where up is, if that is known.
+        """
+        free, fixed = self._choose_keyframes(sparse_map, keyframe)
+        ids = sparse_map.points_of(free)
+        edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
+        chosen = np.concatenate([free, fixed])
+        slot = np.full(len(sparse_map.keyframes), -1)
+        slot[chosen] = np.arange(len(chosen))
+        taking_part = slot[edge_keyframe] >= 0
+        seen_by = np.bincount(edge_point[taking_part], minlength=len(sparse_map.alive))
+        ids = ids[seen_by[ids] > 1]
+        alone = taking_part & (seen_by[edge_point] == 1)
+        carried = edge_point[alone], edge_keyframe[alone]
+        taking_part &= ~alone
+        edge_point, edge_keyframe, edge_row = (
+            edges[taking_part] for edges in (edge_point, edge_keyframe, edge_row)
+        )
+        if len(ids) == 0:
+            return None
+        problem = BundleProblem(
+            np.stack([sparse_map.keyframes[k].T_camera_world for k in chosen]),
+            len(free),
+            sparse_map.xyz_world[ids],
+            slot[edge_keyframe],
+            np.searchsorted(ids, edge_point),
+            _gather(sparse_map, edge_keyframe, edge_row),
+            self.offset.estimate,
+            factors_of(sparse_map.keyframes, slot, up_world),
+            self.ground,
+        )
+        return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
+
+    def solve(self, adjustment: Adjustment) -> BundleResult:
+        """Adjust the copy; safe on another thread, since it shares nothing with the map."""
+        return adjust(self._camera, adjustment.problem, BUNDLE_STEPS)
+
+    def apply(self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult) -> None:
+        """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
+        points. One that loses what the newest keyframe saw has followed something that moves, or a
+        wrong match, and is left out.
+        """
+        kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
+        if len(kept) and kept.mean() < MIN_KEPT_RATIO:
+            return
+        self.offset.learn(result.offset)
+        self._write_back(sparse_map, adjustment, result)
+        self._drop_outliers(
+            sparse_map, adjustment.edge_keyframe, adjustment.edge_row, result.inliers
+        )
+        settled = adjustment.newest - SETTLING_KEYFRAMES
+        sparse_map.remove_points(sparse_map.poor_points(settled, MIN_FOUND_RATIO))
+        retire_redundant(sparse_map, adjustment.free)
+        sparse_map.follow()
+
+    def _choose_keyframes(
+        self, sparse_map: SparseMap, keyframe: KeyframeRecord
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the covisible keyframes that move and those that hold them; the first one
+        never moves.
+        """
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        order, shared = sparse_map.covisible(own)
+        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        near = np.concatenate([near, np.setdiff1d(_linked(sparse_map, keyframe), near)[::-1]])
+        free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
+        free = free[free != 0]
+        around, _ = sparse_map.covisible(sparse_map.points_of(free))
+        if keyframe.motion is not None:
+            # What wheels tie to the oldest that moves holds it.
+            around = np.append(around, max(int(free.min()) - 1, 0))
+        fixed = around[~np.isin(around, free)][:FIXED_KEYFRAMES]
+        if len(fixed) == 0:
+            fixed, free = free[-1:], free[:-1]
+        return free, fixed
+
+    def _write_back(
+        self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult
+    ) -> None:
+        sparse_map.xyz_world[adjustment.ids] = result.points_world
+        for slot, k in enumerate(adjustment.free):
+            keyframe, T_camera_world = sparse_map.keyframes[k], result.T_camera_world[slot]
+            carried = adjustment.carried_ids[adjustment.carried_by == k]
+            sparse_map.xyz_world[carried] = transform_points(
+                invert(T_camera_world) @ keyframe.T_camera_world, sparse_map.xyz_world[carried]
+            )
+            keyframe.T_camera_world = T_camera_world
+
+    def _drop_outliers(
+        self,
+        sparse_map: SparseMap,
+        edge_keyframe: NDArray[np.int32],
+        edge_row: NDArray[np.int32],
+        inliers: NDArray[np.bool_],
+    ) -> None:
+        for k in np.unique(edge_keyframe[~inliers]):
+            rows = edge_row[~inliers & (edge_keyframe == k)]
+            sparse_map.unlink(sparse_map.keyframes[k], rows)
+
+
+def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+    """Return the keyframes before one that wheels tie to it without a gap, the oldest first."""
+    linked: list[int] = []
+    while keyframe.motion is not None and len(linked) < LOCAL_KEYFRAMES - 1:
+        keyframe = sparse_map.keyframes[keyframe.index - 1]
+        if keyframe.retired is None:
+            linked.append(keyframe.index)
+    return np.array(linked[::-1], np.intp)
+
+
+def _gather(
+    sparse_map: SparseMap, edge_keyframe: NDArray[np.int32], edge_row: NDArray[np.int32]
+) -> Observations:
+    uvd: Array = np.empty((len(edge_row), 3))
+    sigma: Array = np.empty((len(edge_row), 3))
+    for k in np.unique(edge_keyframe):
+        mine = edge_keyframe == k
+        taken = sparse_map.keyframes[k].observations.take(edge_row[mine])
+        uvd[mine], sigma[mine] = taken.uvd_px, taken.sigma_px
+    return Observations(uvd, sigma)
+
+
+def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Array) -> Array:
+    """Return about the disparity (N,) px at pixels (N, 2) of the left image; NaN where none is
+    found. left, right: rectified grey images (H, W).
+    """
+    factor = max(1, round(left.shape[1] / WIDTH_PX))
+    size = (left.shape[1] // factor, left.shape[0] // factor)
+    count = -(-round(MAX_DISPARITY_SHARE * size[0]) // STEP) * STEP
+    matcher = cv2.StereoBM_create(count, BLOCK_PX)
+    matcher.setTextureThreshold(MIN_TEXTURE)
+    matcher.setUniquenessRatio(0)
+    # Without a margin the matcher leaves the leftmost columns empty.
+    small = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
+    wide = (cv2.copyMakeBorder(i, 0, 0, count, 0, cv2.BORDER_REPLICATE) for i in small)
+    disparity = matcher.compute(*wide)[:, count:]
+    column, row = ((uv_px.T + 0.5) / factor).astype(np.intp)
+    at = disparity[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
+    return np.where(at > 0, at * (factor / STEP), np.nan)

@@ -1,0 +1,294 @@
+"""The normal equations of a bundle adjustment, and their solution by the Schur complement on the
+cameras (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section 6.1).
+
+The last axis of the arrays here is the observation or the point: NumPy works on long rows many
+times faster than on many small matrices.
+
+The normal equations of a bundle adjustment of many keyframes, most of which share no point.
+
+As in `normal_equations`, but the complement is a sparse matrix (Konolige, Sparse Sparse Bundle
+Adjustment, BMVC 2010).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array
+from segfloor_ros.slam.map.residuals import weighted_jacobian, with_moment
+
+SMALLEST_PIVOT = 1e-12
+
+DENSE_KEYFRAMES = 60
+"""More of them, most of which share no point, are solved as a sparse system."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A solution: twists (K, 6) of the cameras, shifts (P, 3) of the points, the change of the
+    disparity offset and how well it is known after.
+    """
+
+    twists: Array
+    shifts: Array
+    offset_px: float
+    offset_information: float
+
+
+@dataclass(frozen=True)
+class System:
+    """The normal equations by blocks: cameras U (K, 6, 6), points V (3, 3, P), and W (6, 3, M) of
+    each pair (keyframe, point[m]) that an observation ties together, those of camera k from
+    starts[k] to starts[k + 1]; right-hand sides. The disparity offset is one more unknown: its
+    products with cameras (K, 6), points (3, P), itself. between: two cameras and the block (6, 6)
+    that ties them without points.
+    """
+
+    U: Array
+    V: Array
+    W: Array
+    starts: NDArray[np.intp]
+    point: NDArray[np.intp]
+    camera_rhs: Array
+    point_rhs: Array
+    offset_camera: Array
+    offset_point: Array
+    offset_offset: float
+    offset_rhs: float
+    between: tuple[tuple[int, int, Array], ...] = ()
+
+    def with_prior(self, information: float, offset_error_px: float) -> System:
+        """Return the system with what was known before of the offset."""
+        return replace(
+            self,
+            offset_offset=self.offset_offset + information,
+            offset_rhs=self.offset_rhs - information * offset_error_px,
+        )
+
+    def solve(self, damping: float) -> Step:
+        """Solve the damped system by the Schur complement on the cameras.
+
+        With V = L L^T by blocks and Y = W L^-T, the complement is U - Y Y^T: one dense matrix,
+        which is multiplied with itself.
+        """
+        diagonal = np.einsum('aap->ap', self.V)
+        V = self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9)
+        L_inverse = inverse_cholesky(V)
+        if len(self.U) > DENSE_KEYFRAMES:
+            return self._solve_sparse(damping, L_inverse)
+        Y = self._reduced(L_inverse)
+        y_offset = _times_lower(L_inverse, self.offset_point).ravel()
+        y_rhs = _times_lower(L_inverse, self.point_rhs).ravel()
+        size = len(Y)
+        S = np.empty((size + 1, size + 1))
+        S[:-1, :-1] = -(Y @ Y.T)
+        for k, U in enumerate(self.U):
+            own = slice(6 * k, 6 * k + 6)
+            S[own, own] += U + np.diag(damping * np.diag(U) + 1e-9)
+        for j, k, block in self.between:
+            S[6 * j : 6 * j + 6, 6 * k : 6 * k + 6] += block
+            S[6 * k : 6 * k + 6, 6 * j : 6 * j + 6] += block.T
+        S[-1, :-1] = S[:-1, -1] = self.offset_camera.ravel() - Y @ y_offset
+        S[-1, -1] = self.offset_offset - y_offset @ y_offset
+        rhs = np.append(self.camera_rhs.ravel() - Y @ y_rhs, self.offset_rhs - y_offset @ y_rhs)
+        unit = np.append(np.zeros(size), 1.0)
+        solution, variances = np.linalg.solve(S, np.stack([rhs, unit], axis=1)).T
+        back = (y_rhs - solution[:-1] @ Y - y_offset * solution[-1]).reshape(3, -1)
+        shifts = np.einsum('bap,bp->pa', L_inverse, back)
+        twists = solution[:-1].reshape(-1, 6)
+        return Step(twists, shifts, float(solution[-1]), 1.0 / float(variances[-1]))
+
+    def _solve_sparse(self, damping: float, L_inverse: Array) -> Step:
+        diagonal = np.einsum('kaa->ka', self.U)
+        U = self.U + np.eye(6) * (damping * diagonal + 1e-9)[:, None]
+        y = [_times_lower(L_inverse, of_point) for of_point in (self.point_rhs, self.offset_point)]
+        x, rhs, back = solve_complement(
+            U,
+            np.ascontiguousarray(self._blocks(L_inverse).transpose(2, 0, 1)),
+            self.starts,
+            self.point,
+            np.stack(y, axis=-1).swapaxes(0, 1),
+            np.stack([self.camera_rhs, self.offset_camera], axis=-1),
+            self.between,
+        )
+        information = self.offset_offset - float((y[1] ** 2).sum() + rhs[:, 1] @ x[:, 1])
+        offset = self.offset_rhs - float((y[0] * y[1]).sum() + rhs[:, 1] @ x[:, 0])
+        offset /= information
+        only = np.array([1.0, -offset])
+        shifts = np.einsum('bap,pb->pa', L_inverse, back @ only)
+        return Step((x @ only).reshape(-1, 6), shifts, offset, information)
+
+    def _blocks(self, L_inverse: Array) -> Array:
+        """Return the blocks (6, 3, M) of Y."""
+        of_observation = L_inverse[:, :, self.point]
+        blocks = _times_lower(of_observation[:, :, None], np.swapaxes(self.W, 0, 1))
+        return np.swapaxes(blocks, 0, 1)
+
+    def _reduced(self, L_inverse: Array) -> Array:
+        """Return Y (6 K, 3 P), zero where a camera does not see a point."""
+        Y = np.zeros((len(self.U), 6, 3, self.V.shape[2]))
+        blocks = self._blocks(L_inverse)
+        for k, rows in enumerate(Y):
+            mine = slice(self.starts[k], self.starts[k + 1])
+            rows[:, :, self.point[mine]] = blocks[:, :, mine]
+        return Y.reshape(6 * len(self.U), -1)
+
+    def predicted_decrease(self, step: Step, damping: float) -> float:
+        """Return how much the cost falls by the quadratic model."""
+        diagonal_U = np.einsum('kaa->ka', self.U)
+        diagonal_V = np.einsum('aap->pa', self.V)
+        return float(
+            (step.twists * (damping * diagonal_U * step.twists + self.camera_rhs)).sum()
+            + (step.shifts * (damping * diagonal_V * step.shifts + self.point_rhs.T)).sum()
+            + step.offset_px * self.offset_rhs
+        )
+
+
+def inverse_cholesky(A: Array) -> Array:
+    """Return the inverses (3, 3, N) of the lower Cholesky factors of symmetric positive matrices
+    (3, 3, N).
+    """
+    inverse = np.zeros_like(A)
+    a = 1.0 / np.sqrt(np.maximum(A[0, 0], SMALLEST_PIVOT))
+    l10, l20 = A[1, 0] * a, A[2, 0] * a
+    b = 1.0 / np.sqrt(np.maximum(A[1, 1] - l10**2, SMALLEST_PIVOT))
+    l21 = (A[2, 1] - l20 * l10) * b
+    c = 1.0 / np.sqrt(np.maximum(A[2, 2] - l20**2 - l21**2, SMALLEST_PIVOT))
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = a, b, c
+    inverse[1, 0] = -l10 * a * b
+    inverse[2, 1] = -l21 * b * c
+    inverse[2, 0] = (l21 * l10 * b - l20) * a * c
+    return inverse
+
+
+def _times_lower(L: Array, v: Array) -> Array:
+    """Return the products (3, ...) of lower triangular matrices (3, 3, ...) and v (3, ...)."""
+    return np.stack(
+        [
+            L[0, 0] * v[0],
+            L[1, 0] * v[0] + L[1, 1] * v[1],
+            L[2, 0] * v[0] + L[2, 1] * v[1] + L[2, 2] * v[2],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Where the cost is made quadratic. T_camera_world: (K, 4, 4), the first `num_free` move.
+    keyframe, point: (N,) of each observation, the keyframes ascending. points_camera, residual,
+    weight: (N, 3).
+    """
+
+    T_camera_world: Array
+    num_free: int
+    num_points: int
+    keyframe: NDArray[np.intp]
+    point: NDArray[np.intp]
+    points_camera: Array
+    residual: Array
+    weight: Array
+
+
+def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
+    """Return the undamped system.
+
+    In camera axes an observation adds M = J^T W J and g = J^T W r with the sparse J = d(u, v, d) /
+    d(point); everything else is these, turned into world axes by A = M R, and moved to the camera's
+    twist by (I, p x) (Barfoot 2017, eq. 7.183).
+    """
+    J, M, vectors = _in_camera_axes(camera, at)
+    starts = np.searchsorted(at.keyframe, np.arange(len(at.T_camera_world) + 1))
+    A, V, in_world = np.empty_like(M), np.empty_like(M), np.empty_like(vectors)
+    for k, T in enumerate(at.T_camera_world):
+        mine, R = slice(starts[k], starts[k + 1]), T[:3, :3]
+        A[:, :, mine] = R.T @ M[:, :, mine]
+        V[:, :, mine] = R.T @ np.swapaxes(A[:, :, mine], 0, 1)
+        in_world[:, :, mine] = R.T @ vectors[:, :, mine]
+    edges, free = starts[: at.num_free + 1], slice(0, starts[at.num_free])
+    p = at.points_camera[free].T
+    J = with_moment(p, J[:, :, free])
+    U = [J[..., a:b].reshape(6, -1) for a, b in pairwise(edges)]
+    of_camera = _sum_runs(with_moment(p, np.swapaxes(vectors[:, :, free], 0, 1)), edges)
+    of_point = _sum_by(at.point, in_world, at.num_points)
+    return System(
+        np.stack([J_k @ J_k.T for J_k in U]),
+        _sum_by(at.point, V, at.num_points),
+        with_moment(p, A[:, :, free]),
+        edges,
+        at.point[free],
+        -of_camera[:, :, 0],
+        -of_point[0],
+        of_camera[:, :, 1],
+        of_point[1],
+        float(at.weight[:, 2].sum()),
+        -float(at.weight[:, 2] @ at.residual[:, 2]),
+    )
+
+
+def _in_camera_axes(camera: StereoCamera, at: Linearisation) -> tuple[Array, Array, Array]:
+    """Return with J = d(u, v, d) / d(point): J^T W^0.5 (3, 3, N), J^T W J (3, 3, N), and both J^T W
+    r and J^T W of the disparity alone (2, 3, N).
+    """
+    root = np.sqrt(at.weight.T)
+    J = weighted_jacobian(camera, at.points_camera, root)
+    M = np.zeros_like(J)
+    M[0, 0], M[1, 1] = J[0, 0] ** 2, J[1, 1] ** 2
+    M[0, 2] = M[2, 0] = J[0, 0] * J[2, 0]
+    M[1, 2] = M[2, 1] = J[1, 1] * J[2, 1]
+    M[2, 2] = J[2, 0] ** 2 + J[2, 1] ** 2 + J[2, 2] ** 2
+    ru, rv, rd = at.residual.T * root
+    vectors = np.zeros_like(J[:2])
+    vectors[0] = J[0, 0] * ru, J[1, 1] * rv, J[2, 0] * ru + J[2, 1] * rv + J[2, 2] * rd
+    vectors[1, 2] = root[2] * J[2, 2]
+    return J, M, vectors
+
+
+def _sum_runs(values: Array, edges: NDArray[np.intp]) -> Array:
+    """Return the sums (K, ...) over the last axis between each edge and the next (K + 1,)."""
+    return np.stack([values[..., a:b].sum(axis=-1) for a, b in pairwise(edges)])
+
+
+def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:
+    """Sum values (..., N) into `size` groups (..., size)."""
+    flat = values.reshape(-1, len(index))
+    sums = np.stack([np.bincount(index, row, size) for row in flat])
+    return np.asarray(sums.reshape(*values.shape[:-1], size), np.float64)
+
+
+def solve_complement(
+    U: Array,
+    Y: Array,
+    starts: NDArray[np.intp],
+    point: NDArray[np.intp],
+    y: Array,
+    rhs: Array,
+    between: tuple[tuple[int, int, Array], ...],
+) -> tuple[Array, Array, Array]:
+    """Solve (U - Y Y^T) x = rhs - Y y for several right-hand sides (..., R).
+
+    U: (K, 6, 6), Y: (M, 6, 3) by blocks, those of camera k from starts[k] to starts[k + 1], point:
+    (M,) their columns. y: (P, 3, R), rhs: (K, 6, R). between: further blocks off the diagonal.
+    Returns x (6 K, R), the right-hand side (6 K, R) and y - Y^T x (P, 3, R).
+    """
+    count, size = len(U), y.shape[0]
+    blocks = sparse.bsr_array((Y, point, starts), shape=(6 * count, 3 * size))
+    S = sparse.bsr_array((U, np.arange(count), np.arange(count + 1)), shape=(6 * count,) * 2)
+    S = S - blocks @ blocks.T
+    if between:
+        j, k = (np.array([link[side] for link in between]) for side in (0, 1))
+        tied = np.stack([link[2] for link in between])
+        rows = (6 * j[:, None, None] + np.arange(6)[:, None] + np.zeros(6, int)).ravel()
+        columns = (6 * k[:, None, None] + np.zeros((6, 1), int) + np.arange(6)).ravel()
+        off = sparse.coo_array((tied.ravel(), (rows, columns)), shape=S.shape)
+        S = S + off + off.T
+    flat = y.reshape(3 * size, -1)
+    reduced = rhs.reshape(6 * count, -1) - blocks @ flat
+    x = splu(S.tocsc()).solve(reduced)
+    return x, reduced, (flat - blocks.T @ x).reshape(y.shape)

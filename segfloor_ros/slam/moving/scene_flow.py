@@ -1,0 +1,260 @@
+"""Scene flow: which corners of an image moved since an earlier one, whatever was seen before there.
+
+A corner is followed back by optical flow. If it stands still, it was where its depth and the
+camera's own motion say, up to the error of the depth (Vedula et al., Three-Dimensional Scene Flow,
+ICCV 1999). Corners are judged together with their neighbours at the same depth.
+
+The camera of the shrunk images in which what moves is searched.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
+from segfloor_ros.slam.tracking.features import spread
+
+AGES_NS = (300_000_000, 900_000_000)
+"""How long ago an image was that corners are followed back to: in the first someone who walks has
+moved by a hand, in the second someone who walks just ahead of the camera stands out."""
+
+CORNERS, CELL_PX = 300, 10
+"""Corners are spread over the image by cells: cloth in front has the strongest, and a plain wall or
+floor, which tells that it stands still, needs its own."""
+
+APART_PX = 3
+MIN_CORNER, SURE_CORNER = 3e-4, 1e-3
+"""Smaller eigenvalue of a corner, as OpenCV scales it. Between the two a corner may say that it
+stands still, which it hardly does by chance, but not that it moves."""
+
+WINDOW, LEVELS = (9, 9), 3
+MAX_RETURN_PX = 0.5
+"""Distance up to which a corner that is followed back and forth comes to where it was."""
+
+MAX_ZOOM, MAX_SHIFT_PX = 1.3, 20.0
+"""What stands still and changes its size by more, or its place in the image, is not compared."""
+
+FLOW_TOLERANCE_PX = 1.0
+NEIGHBOUR_PX = 15.0
+MIN_MOVING = 3
+"""Fewest corners of a thing that moves."""
+
+MAX_MOVING_SHARE = 0.8
+"""Where more of all corners seem to move the pose is in doubt: what moved before still does."""
+
+DISC_PX = 3
+
+WIDTH_PX = 160
+"""Images are shrunk to about this width: a person 4 m away is still eight pixels wide."""
+
+TOLERANCE_PX = 0.6
+"""Disparities of the shrunk images that differ by more do not show the same thing."""
+
+Disparity = NDArray[np.float32]
+"""Disparities (h, w) in px of the shrunk image, 0 where none was found."""
+
+
+@dataclass(frozen=True)
+class FlowView:
+    """An earlier image. left: shrunk (h, w). disparity: (h, w). T_odom_camera: (4, 4). moving: what
+    was found to move in it, (h, w), 255; None before the search.
+    """
+
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    disparity: Disparity
+    T_odom_camera: Array
+    moving: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
+class FlowVotes:
+    """Where (h, w) corners moved, and where they stood still: 1, else 0."""
+
+    moving: NDArray[np.uint8]
+    still: NDArray[np.uint8]
+
+
+class SceneFlow:
+    """Follows corners back to earlier images."""
+
+    def __init__(self, camera: SmallCamera) -> None:
+        self._camera = camera
+        self._views: deque[FlowView] = deque()
+
+    def remember(self, view: FlowView) -> None:
+        """Compare later images with this one, of which is known what moves in it."""
+        self._views.append(view)
+
+    def votes(self, view: FlowView) -> FlowVotes:
+        """Return what moved in an image."""
+        earlier = self._earlier(view.stamp_ns)
+        uv, sure = self._corners(view)
+        moved, still, moved_before = (np.zeros(len(uv), bool) for _ in range(3))
+        for then in earlier if len(uv) else []:
+            found, differs, moved_then = self._compare(view, then, uv)
+            moved |= found & differs & sure
+            still |= found & ~differs
+            moved_before = moved_then
+        still &= ~moved
+        if moved.sum() > MAX_MOVING_SHARE * (moved | still).sum():
+            moved, still = moved_before, still & ~moved_before
+        disparity = self._camera.at(view.disparity, uv)
+        moved = _outvoting(uv, disparity, moved, still)
+        return FlowVotes(
+            _discs(view.disparity, uv[moved], disparity[moved]),
+            _discs(view.disparity, uv[still], disparity[still]),
+        )
+
+    def _earlier(self, now_ns: int) -> list[FlowView]:
+        """Return the images of about the ages wanted; older ones are dropped."""
+        while self._views and now_ns - self._views[0].stamp_ns > 1.5 * AGES_NS[-1]:
+            self._views.popleft()
+        chosen = {
+            min(range(len(self._views)), key=lambda i: abs(now_ns - age - self._views[i].stamp_ns))
+            for age in AGES_NS
+            if self._views
+        }
+        return [self._views[i] for i in sorted(chosen)]
+
+    def _corners(self, view: FlowView) -> tuple[Array, NDArray[np.bool_]]:
+        """Return corners (N, 2) px at which the disparity is known and has no edge, and which of
+        them are sure to be found again.
+        """
+        strength = cv2.cornerMinEigenVal(view.left, 3)
+        strongest = cv2.dilate(strength, np.ones((2 * APART_PX - 1, 2 * APART_PX - 1), np.uint8))
+        v, u = np.nonzero((strength == strongest) & (strength > MIN_CORNER))
+        if len(u) == 0:
+            return np.zeros((0, 2)), np.zeros(0, bool)
+        uv = np.column_stack([u, v]).astype(np.float64)
+        uv = uv[spread(uv.astype(np.float32), strength[v, u], CELL_PX, CORNERS)]
+        around = np.ones((5, 5), np.uint8)
+        nearest = self._camera.at(cv2.dilate(view.disparity, around), uv)
+        farthest = self._camera.at(cv2.erode(view.disparity, around), uv)
+        uv = uv[(farthest > 0) & (nearest - farthest < 2 * TOLERANCE_PX)]
+        return uv, self._camera.at(strength, uv) > SURE_CORNER
+
+    def _compare(
+        self, now: FlowView, then: FlowView, uv: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which corners (N, 2) are found in an earlier image, which of them are not where
+        they would be if they stood still, and which moved already in that image.
+        """
+        disparity = self._camera.at(now.disparity, uv)
+        T_then_now = invert(then.T_odom_camera) @ now.T_odom_camera
+        nominal, farther, nearer = (
+            self._camera.carried(uv, np.maximum(disparity + step, 0.1), T_then_now)
+            for step in (0.0, -TOLERANCE_PX, TOLERANCE_PX)
+        )
+        back, returned = _follow(now.left, then.left, uv, nominal[:, :2])
+        followed = np.hypot(*(returned - uv).T) < MAX_RETURN_PX
+        moved_then = np.zeros(len(uv), bool)
+        if then.moving is not None:
+            moved_then = followed & (self._camera.at(then.moving, back) > 0)
+        found = followed & (nominal[:, 2] > 0)
+        found &= self._camera.contains(back) & self._camera.contains(nominal[:, :2])
+        found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(MAX_ZOOM)
+        found &= np.hypot(*(nominal[:, :2] - uv).T) < MAX_SHIFT_PX
+        there = self._camera.at(then.disparity, back)
+        differs = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) > FLOW_TOLERANCE_PX
+        tolerance = TOLERANCE_PX * (1 + (nominal[:, 2] / np.maximum(disparity, 0.1)) ** 2)
+        differs |= (there > 0) & (np.abs(there - nominal[:, 2]) > tolerance)
+        return found, differs, moved_then
+
+
+def _follow(
+    now: NDArray[np.uint8], then: NDArray[np.uint8], uv: Array, guess: Array
+) -> tuple[Array, Array]:
+    """Return where corners (N, 2) are in another image, and where they come to from there in the
+    first one.
+    """
+    start, target = (a.astype(np.float32).reshape(-1, 1, 2) for a in (uv, guess))
+    how = {'winSize': WINDOW, 'maxLevel': LEVELS, 'flags': cv2.OPTFLOW_USE_INITIAL_FLOW}
+    back, ok, _ = cv2.calcOpticalFlowPyrLK(now, then, start, target.copy(), **how)
+    again, ok_again, _ = cv2.calcOpticalFlowPyrLK(then, now, back, start.copy(), **how)
+    again[(ok.ravel() == 0) | (ok_again.ravel() == 0)] = np.inf
+    return back.reshape(-1, 2).astype(np.float64), again.reshape(-1, 2).astype(np.float64)
+
+
+def _distance_to_segment(p: Array, a: Array, b: Array) -> Array:
+    """Return the distances (N,) of points from the segments between others, (N, 2) each."""
+    along = b - a
+    t = ((p - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
+    return np.asarray(np.hypot(*(p - a - np.clip(t, 0, 1)[:, None] * along).T))
+
+
+def _outvoting(
+    uv: Array, disparity: Array, moved: NDArray[np.bool_], still: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the corners (N,) that moved and whose neighbours at the same depth mostly did, too."""
+    result = moved.copy()
+    if not moved.any():
+        return result
+    tree = cKDTree(uv)
+    for i in np.flatnonzero(moved):
+        near = np.array(tree.query_ball_point(uv[i], NEIGHBOUR_PX))
+        near = near[np.abs(disparity[near] - disparity[i]) < 2 * TOLERANCE_PX]
+        result[i] = moved[near].sum() >= MIN_MOVING and moved[near].sum() > still[near].sum()
+    return result
+
+
+def _discs(disparity: Disparity, uv: Array, of_corner: Array) -> NDArray[np.uint8]:
+    """Return the pixels (h, w) around corners that are at the same depth."""
+    height, width = disparity.shape
+    mask = np.zeros(disparity.shape, np.uint8)
+    for (u, v), d in zip(np.rint(uv).astype(int), of_corner, strict=True):
+        rows = slice(max(0, v - DISC_PX), min(height, v + DISC_PX + 1))
+        columns = slice(max(0, u - DISC_PX), min(width, u + DISC_PX + 1))
+        mask[rows, columns] |= np.abs(disparity[rows, columns] - d) < 2 * TOLERANCE_PX
+    return mask
+
+
+class SmallCamera:
+    """Projects between the shrunk image and the left optical frame.
+
+    factor: pixels of the camera per pixel here. size: (w, h). focal, centre: (2,) px.
+    disparity_m: disparity times depth. rays: (3, h w), the points of all pixels at one metre.
+    """
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self.factor = factor = max(1, round(camera.width / WIDTH_PX))
+        self.size = (camera.width // factor, camera.height // factor)
+        self.disparity_m = camera.disparity_times_depth / factor
+        self.focal = np.array([camera.fx, camera.fy]) / factor
+        self.centre = (np.array([camera.cx, camera.cy]) + 0.5) / factor - 0.5
+        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self.size))
+        full_u, full_v = ((axis + 0.5) * factor - 0.5 for axis in (u, v))
+        rays = [(full_u - camera.cx) / camera.fx, (full_v - camera.cy) / camera.fy, np.ones_like(u)]
+        self.rays = np.stack(rays).reshape(3, -1).astype(np.float32)
+
+    def contains(self, uv: Array) -> NDArray[np.bool_]:
+        """Return which pixels (N, 2) lie in the image."""
+        at = np.rint(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0))
+        return np.asarray((at >= 0).all(axis=1) & (at < self.size).all(axis=1))
+
+    def at(self, image: NDArray[Any], uv: Array) -> Array:
+        """Return the values (N,) of an image (h, w) at pixels (N, 2), 0 outside."""
+        inside = self.contains(uv)
+        u, v = np.where(inside[:, None], np.rint(uv), 0).astype(np.intp).T
+        return np.where(inside, image[v, u], 0.0).astype(np.float64)
+
+    def carried(self, uv: Array, disparity: Array, T_then_now: Array) -> Array:
+        """Return pixel and disparity (N, 3) that points have in another image; the disparity is 0
+        behind the camera.
+        """
+        depth = self.disparity_m / disparity
+        points = np.column_stack([(uv - self.centre) / self.focal * depth[:, None], depth])
+        there = transform_points(T_then_now, points)
+        front = there[:, 2] > MIN_DEPTH_M
+        z = np.where(front, there[:, 2], 1.0)
+        pixel = self.focal * there[:, :2] / z[:, None] + self.centre
+        return np.column_stack([pixel, np.where(front, self.disparity_m / z, 0.0)])

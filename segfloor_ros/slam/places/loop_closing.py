@@ -1,0 +1,144 @@
+"""Closing a loop: keyframes and points move so that both ends meet, and become one map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.map.keyframe_record import LoopEdge, Match
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.fusion import fuse_duplicates
+from segfloor_ros.slam.mapping.level_ground import LevelGround
+from segfloor_ros.slam.places.pose_graph import PoseGraph, optimise
+from segfloor_ros.slam.results import NO_POINT
+
+FUSED_KEYFRAMES = 10
+LINK_SIGMA_M = 0.01
+LINK_SIGMA_RAD = 0.002
+"""Error of the motion between two keyframes that share points; only the ratio to that of a loop
+matters, and how far apart they stand does not."""
+
+LOOP_SIGMA_M = 0.02
+LOOP_SIGMA_RAD = 0.004
+MIN_LOOP_WEIGHT = 0.25
+"""A loop that switches an earlier one off contradicts it, and is not closed."""
+
+
+@dataclass(frozen=True)
+class Closing:
+    """A loop to be closed, copied out of the map."""
+
+    matches: list[Match]
+    edges: list[LoopEdge]
+    graph: PoseGraph
+
+
+def plan_closing(
+    sparse_map: SparseMap, matches: list[Match], ground: LevelGround | None = None
+) -> Closing:
+    """Copy the pose graph out of the map, with a loop from each keyframe that sees the place."""
+    keyframes = sparse_map.keyframes
+    poses = np.stack([k.T_camera_world for k in keyframes])
+    i, j = sparse_map.links()
+    new = [_edge(sparse_map, match) for match in matches]
+    loops = [*sparse_map.loops, *new]
+    T_loops = np.stack([loop.T_i_j for loop in loops])
+    sigma = np.concatenate(
+        [
+            np.tile([LINK_SIGMA_M] * 3 + [LINK_SIGMA_RAD] * 3, (len(i), 1)),
+            np.tile([LOOP_SIGMA_M] * 3 + [LOOP_SIGMA_RAD] * 3, (len(loops), 1)),
+        ]
+    )
+    fixed = np.zeros(len(keyframes), bool)
+    fixed[0] = True
+    graph = PoseGraph(
+        poses,
+        fixed,
+        np.append(i, [loop.i for loop in loops]).astype(np.intp),
+        np.append(j, [loop.j for loop in loops]).astype(np.intp),
+        np.concatenate([poses[i] @ invert(poses[j]), T_loops]),
+        sigma,
+        # What is new is expected to pull; what was found before must go on to fit.
+        (np.arange(len(sigma)) >= len(i)) & (np.arange(len(sigma)) < len(sigma) - len(new)),
+        ground,
+    )
+    return Closing(matches, new, graph)
+
+
+def _edge(sparse_map: SparseMap, match: Match) -> LoopEdge:
+    place = sparse_map.keyframes[match.place]
+    return LoopEdge(match.keyframe, match.place, match.T_camera_world @ place.T_world_camera)
+
+
+def solve_closing(closing: Closing) -> tuple[Array, Array]:
+    """Optimise the copy; safe on another thread."""
+    return optimise(closing.graph)
+
+
+def apply_closing(
+    camera: StereoCamera,
+    sparse_map: SparseMap,
+    closing: Closing,
+    result: tuple[Array, Array],
+) -> bool:
+    """Bring a closed loop into the map, which has had no new keyframe since. False, and nothing
+    moves, where the loop contradicts the rest of the map.
+    """
+    poses, weight = result
+    if weight.min() < MIN_LOOP_WEIGHT:
+        return False
+    move_keyframes(sparse_map, poses)
+    sparse_map.loops += closing.edges
+    for match in closing.matches:
+        _merge(sparse_map, match)
+    fuse_latest(camera, sparse_map, closing.matches[-1].keyframe)
+    return True
+
+
+def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> None:
+    """Merge what the keyframes up to the latest know twice, now that both ends are one map."""
+    for keyframe in sparse_map.keyframes[max(0, latest - FUSED_KEYFRAMES) : latest + 1]:
+        if keyframe.retired is None:
+            fuse_duplicates(camera, sparse_map, keyframe)
+
+
+def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
+    """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
+    point, holder, _ = sparse_map.edges()
+    last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
+    last[point] = holder
+    before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
+    motion = invert(T_camera_world) @ before
+    R, t = motion[last, :3, :3], motion[last, :3, 3]
+    for column in (sparse_map.xyz_world, sparse_map.viewing_direction):
+        column[:] = (R @ column[:, :, None])[:, :, 0]
+    sparse_map.xyz_world[:] += t
+    for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
+        keyframe.T_camera_world = pose
+    sparse_map.follow()
+
+
+def _merge(sparse_map: SparseMap, match: Match) -> None:
+    """Make one point of what a keyframe knows as its own and the place as another."""
+    keyframe = sparse_map.keyframes[match.keyframe]
+    if keyframe.retired is not None:
+        return
+    same = sparse_map.alive[match.ids] & (sparse_map.stable_id[match.ids] == match.stable_ids)
+    own = np.where(same, keyframe.point_id[match.rows], NO_POINT)
+    merge_pairs(sparse_map, own, match.ids)
+
+
+def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np.integer]) -> None:
+    """Make one of each pair (own[i], old[i]), (N,), of point rows; -1 is no point."""
+    pairs = (own >= 0) & (old >= 0) & (own != old)
+    own, old = own[pairs], old[pairs]
+    _, first = np.unique(own, return_index=True)
+    own, old = own[first], old[first]
+    apart = ~np.isin(own, old) & ~sparse_map.seen_together(own, old)
+    own, old = own[apart], old[apart]
+    older = sparse_map.stable_id[own] < sparse_map.stable_id[old]
+    sparse_map.merge(np.where(older, own, old), np.where(older, old, own))

@@ -1,0 +1,210 @@
+"""Place recognition: which keyframes look like a view, and whether it truly is the same place.
+
+Candidates come from binary words, grouped by covisibility (Mur-Artal and Tardos, Fast
+Relocalisation and Loop Closing in Keyframe-Based SLAM, ICRA 2014). Buildings repeat themselves:
+what counts is the geometry. A place is the same when most of what should be seen there is seen,
+where it should be, all over the image.
+
+The index of places: which keyframes hold the words of a view (Nister and Stewenius, Scalable
+Recognition with a Vocabulary Tree, CVPR 2006: inverted files and tf-idf).
+"""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.map_file import Arrays, joined, split
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.vocabulary import NUM_WORDS, Vocabulary
+from segfloor_ros.slam.results import Track
+from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.map_tracking import Tracker
+
+BEST_KEYFRAMES = 10
+"""Keyframes that look most like a view, around which groups are made."""
+
+GROUP_KEYFRAMES = 10
+MIN_FOUND = 25
+MIN_FOUND_SHARE = 0.10
+"""Share of the points expected in view that must be found: far points alone fit many places."""
+
+COLUMNS, ROWS = 4, 3
+MIN_EXPECTED = 8
+MIN_CELLS_SHARE = 0.6
+"""Share of the parts of the image that must show what is expected there: a poster or a shelf that
+stands elsewhere too fills only some."""
+
+
+class PlaceRecognition:
+    """The places of a map by their look."""
+
+    def __init__(self, camera: StereoCamera, tracker: Tracker, sparse_map: SparseMap) -> None:
+        self._camera = camera
+        self._tracker = tracker
+        self._map = sparse_map
+        self._vocabulary = Vocabulary.load()
+        self._index = PlaceIndex()
+        self._latest: tuple[Features, NDArray[np.int32]] | None = None
+
+    def add(self, keyframe: KeyframeRecord) -> None:
+        """Take in a keyframe."""
+        self._index.add(keyframe.index, self._words(keyframe.features))
+
+    def _words(self, features: Features) -> NDArray[np.int32]:
+        """Return the words (N,) of features; those of the latest view are asked for twice."""
+        if self._latest is None or self._latest[0] is not features:
+            self._latest = features, self._vocabulary.words(features.descriptor)
+        return self._latest[1]
+
+    def reset(self) -> None:
+        """Begin again with an empty map."""
+        self._index.reset()
+
+    def to_arrays(self) -> Arrays:
+        """Return the words of all keyframes."""
+        words, length = joined(
+            [self._index.words_of(k.index) for k in self._map.keyframes], np.zeros(0, np.int32)
+        )
+        return {'words': words.astype(np.uint16), 'word_count': length}
+
+    def from_arrays(self, arrays: Arrays) -> None:
+        """Take in the words of the keyframes that come next."""
+        for words in split(arrays['words'], arrays['word_count']):
+            self._index.add(len(self._index), words.astype(np.int32))
+
+    def score(self, features: Features) -> Array:
+        """Return how much each keyframe (K,) looks like a view, in [0, 1]; those that are retired
+        not at all.
+        """
+        keyframes = self._map.keyframes
+        score = self._index.score(self._words(features), len(keyframes))
+        return score * np.array([k.retired is None for k in keyframes])
+
+    def groups(self, score: Array, count: int) -> list[NDArray[np.intp]]:
+        """Return up to `count` groups of covisible keyframes, by index, that look most like a view
+        as scored (K,); each keyframe is in one of them only.
+        """
+        best = np.argsort(-score, kind='stable')[:BEST_KEYFRAMES]
+        links = self._map.links()
+        groups = [self._around(int(k), score, links) for k in best if score[k] > 0]
+        groups.sort(key=lambda group: -float(score[group].sum()))
+        chosen: list[NDArray[np.intp]] = []
+        for group in groups:
+            if not any(np.isin(group[0], other).any() for other in chosen):
+                chosen.append(group)
+        return chosen[:count]
+
+    def _around(
+        self, index: int, score: Array, links: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ) -> NDArray[np.intp]:
+        """Return a keyframe and those linked to it that look most like the view."""
+        i, j = links
+        others = np.union1d(j[i == index], i[j == index])
+        others = others[np.argsort(-score[others], kind='stable')]
+        others = others[score[others] > 0][: GROUP_KEYFRAMES - 1]
+        return np.append(index, others).astype(np.intp)
+
+    def locate(
+        self, images: Images, features: Features, ids: NDArray[np.int32], offset_px: float
+    ) -> Track | None:
+        """Find a camera among points `ids` (N,); None unless it sees them."""
+        observations = self._tracker.pixel_observations(features)
+        tree = cKDTree(features.uv_px)
+        estimate = self._tracker.locate(features, tree, observations, self._map, ids)
+        if estimate is None:
+            return None
+        return self.confirm(images, features, ids, estimate.T_camera_world, offset_px)
+
+    def confirm(
+        self,
+        images: Images,
+        features: Features,
+        ids: NDArray[np.int32],
+        T_camera_world: Array,
+        offset_px: float,
+    ) -> Track | None:
+        """Find a camera that should be at a pose from which points `ids` (N,) are seen; None
+        unless it sees them.
+        """
+        track = self._tracker.track_at(images, features, self._map, ids, T_camera_world, offset_px)
+        return track if track is not None and self.is_same_place(track) else None
+
+    def is_same_place(self, track: Track) -> bool:
+        """Whether a frame shows enough of what it should, all over the image."""
+        found, expected = len(track.point_ids), len(track.visible_ids)
+        if found < MIN_FOUND or found < MIN_FOUND_SHARE * expected:
+            return False
+        return self.agreement(track) >= MIN_CELLS_SHARE
+
+    def agreement(self, track: Track) -> float:
+        """Return the share of the parts of the image that show what is expected there, by more than
+        chance; 0 where no part expects enough.
+        """
+        seen, there = (
+            self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
+            for ids in (track.point_ids, track.visible_ids)
+        )
+        full = there >= MIN_EXPECTED
+        agree = seen - np.sqrt(seen) >= 0.5 * MIN_FOUND_SHARE * there
+        return float(agree[full].mean()) if full.any() else 0.0
+
+    def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
+        """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""
+        uv = self._camera.project(transform_points(T_camera_world, xyz_world))[:, :2]
+        size = (self._camera.width / COLUMNS, self._camera.height / ROWS)
+        column, row = np.clip(uv // size, 0, (COLUMNS - 1, ROWS - 1)).astype(np.intp).T
+        return np.bincount(row * COLUMNS + column, minlength=COLUMNS * ROWS)
+
+
+class PlaceIndex:
+    """Keyframes by the words they hold. The budget of features is the same for every view, so a
+    word counts once per view, and what weighs it is how rare it is in the map.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all keyframes."""
+        self._keyframes = [array('i') for _ in range(NUM_WORDS)]
+        self._words: dict[int, NDArray[np.int32]] = {}
+
+    def __len__(self) -> int:
+        return len(self._words)
+
+    def add(self, keyframe: int, words: NDArray[np.int32]) -> None:
+        """Take in a keyframe, by index, with the words (N,) of its features."""
+        own = np.unique(words)
+        self._words[keyframe] = own
+        for word in own.tolist():
+            self._keyframes[word].append(keyframe)
+
+    def words_of(self, keyframe: int) -> NDArray[np.int32]:
+        """Return the words (N,) of a keyframe, ascending."""
+        return self._words.get(keyframe, np.zeros(0, np.int32))
+
+    def remove(self, keyframe: int) -> None:
+        """Forget a keyframe."""
+        for word in self._words.pop(keyframe, np.zeros(0, np.int32)).tolist():
+            self._keyframes[word].remove(keyframe)
+
+    def score(self, words: NDArray[np.int32], count: int) -> Array:
+        """Return how much of a view with words (N,) each keyframe (count,) holds, in [0, 1]: words
+        weigh as much as they tell, log(keyframes / keyframes that hold the word).
+        """
+        own = [self._keyframes[word] for word in np.unique(words).tolist()]
+        holders = np.array([len(keyframes) for keyframes in own], np.intp)
+        weight = np.log((len(self) + 1.0) / (holders + 1.0)) + 1e-9
+        found = [np.frombuffer(keyframes, np.int32) for keyframes in own if keyframes]
+        if not found:
+            return np.zeros(count)
+        held = np.bincount(np.concatenate(found), np.repeat(weight, holders), minlength=count)
+        return held[:count] / weight.sum()

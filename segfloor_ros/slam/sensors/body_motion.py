@@ -1,0 +1,263 @@
+"""The motion of the camera between two frames as wheels and gyroscope tell it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.geometry import Array, adjoint, invert, make_transform
+from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
+from segfloor_ros.slam.sensors.gravity import Gravity
+from segfloor_ros.slam.sensors.gyroscope import Gyroscope
+from segfloor_ros.slam.sensors.inertial_odometry import InertialOdometry
+from segfloor_ros.slam.sensors.wheel_odometry import (
+    Stretch,
+    WheelCalibrator,
+    WheelOdometry,
+    Window,
+    yaw_of,
+)
+
+SIGMA_ROOT_M = 0.01
+"""Error of a way told by wheels, per root metre, in any direction of the floor."""
+
+SIGMA_ROOT_UP_M, SIGMA_ROOT_TILT_RAD = 0.01, 0.02
+"""How far a floor that wheels take for a plane goes up and tilts, per root metre."""
+
+SIGMA_TURN_SHARE = 0.03
+"""Error of a turn told by wheels, as a share of it."""
+
+SIGMA_ROOT_TURN_RAD = 0.01
+"""Error of the heading told by wheels, per root metre."""
+
+SLIP_M_S = 0.5
+"""Error of a speed told by wheels that slip."""
+
+SLIP_NS = 1_000_000_000
+"""Wheels that slipped are not believed for so long."""
+
+WINDOW_M, WINDOW_RAD, WINDOW_NS = 0.1, 0.1, 1_000_000_000
+"""A stretch of the drive to learn from ends when one of these is reached."""
+
+WINDOWS_TO_JUDGE = 25
+"""Stretches after which something is said of the wheels; the slip of a few of them is not it."""
+
+SLIP_REMARK = 'wheel odometry and images disagreed; the wheels slip, or the images show what moves'
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RelativeMotion:
+    """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
+    twist in exp(twist) T_now_before, translation first. told_by: wheels, an IMU, or a gyroscope
+    alone with a speed that is taken for constant.
+    """
+
+    T_now_before: Array
+    covariance: Array
+    told_by: Literal['wheels', 'IMU', 'gyroscope'] = 'wheels'
+
+    @property
+    def by_wheels(self) -> bool:
+        """Whether wheels told it."""
+        return self.told_by == 'wheels'
+
+    @classmethod
+    def none(cls) -> RelativeMotion:
+        """Return the motion of no time at all."""
+        return cls(np.eye(4), np.zeros((6, 6)))
+
+    def then(self, later: RelativeMotion) -> RelativeMotion:
+        """Return the motion over both stretches (Barfoot 2017, section 7.3.3, to second order)."""
+        A = adjoint(later.T_now_before)
+        return RelativeMotion(
+            later.T_now_before @ self.T_now_before,
+            A @ self.covariance @ A.T + later.covariance,
+            later.told_by if self.by_wheels else self.told_by,
+        )
+
+
+class BodyMotion:
+    """Tells the motion between frames, and learns from the images what is wrong with the sensors.
+
+    T_base_left: (4, 4), the mount; without it wheels cannot be used. messages: used, by sensor.
+    slips: stretches in which the wheels did not agree with the images. remarks: what seems wrong
+    with wheels and IMU, in words.
+    """
+
+    def __init__(self) -> None:
+        self.T_base_left: Array | None = None
+        self.messages = {'wheel_odometry': 0, 'imu': 0}
+        self.slips = 0
+        self.remarks: dict[str, str] = {}
+        self.gyroscope = Gyroscope()
+        self.gravity = Gravity(self.gyroscope)
+        self._inertial = InertialOdometry(self.gyroscope, self.gravity)
+        self._wheels = WheelOdometry()
+        self._calibrator = WheelCalibrator()
+        self._window: tuple[int, Array] | None = None
+        self._window_rate_rad_s = math.nan
+        self._last_seen: tuple[int, Array] | None = None
+        self._slipped_ns: int | None = None
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in what a sensor measured."""
+        if isinstance(measurement, WheelPose):
+            self.messages['wheel_odometry'] += 1
+            self._wheels.add(measurement)
+        elif isinstance(measurement, ImuSample):
+            self.messages['imu'] += 1
+            self.gyroscope.add(measurement)
+
+    def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
+        """Return R_now_before (3, 3) of the camera as the gyroscope tells it, and the standard
+        deviation of its angles in radians.
+        """
+        turn = self.gyroscope.turn(before_ns, now_ns)
+        return None if turn is None else (turn[0].T, turn[1])
+
+    @property
+    def lag_ns(self) -> int:
+        """How much later than that of an image the stamps of what is measured at its time are."""
+        return max(0, round(1e9 * max(self.gyroscope.lag_s, self._calibrator.current.lag_s)))
+
+    def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
+        """Return the motion of the camera between two times; None where wheels tell nothing."""
+        lag_ns = round(self._calibrator.current.lag_s * 1e9)
+        told = self._wheels.stretch(before_ns + lag_ns, now_ns + lag_ns)
+        if told is None or self.T_base_left is None:
+            return None
+        R_base_left = self.T_base_left[:3, :3]
+        seconds = (now_ns - before_ns) * 1e-9
+        turn = self.gyroscope.turn(before_ns, now_ns)
+        R = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
+        way_m, turn_rad = self._calibrator.current.base_motion(
+            told.T_before_now, None if R is None else yaw_of(R)
+        )
+        if R is None:
+            R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+        T_before_now = make_transform(R, np.append(way_m, 0.0))
+        variance = self._variance(told, None if turn is None else turn[1])
+        if self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS:
+            variance[:2] += (SLIP_M_S * seconds) ** 2
+        A = adjoint(invert(self.T_base_left))
+        return RelativeMotion(
+            invert(self.T_base_left) @ invert(T_before_now) @ self.T_base_left,
+            A @ np.diag(variance) @ A.T,
+        )
+
+    def _variance(self, told: Stretch, sigma_turn: float | None) -> Array:
+        """Return the variances (6,) of a motion in the base's axes."""
+        calibration = self._calibrator.current
+        length_m = float(np.linalg.norm(told.T_before_now[:3, 3]))
+        on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
+        up = SIGMA_ROOT_UP_M**2 * length_m
+        tilt = SIGMA_ROOT_TILT_RAD**2 * length_m
+        yaw = SIGMA_ROOT_TURN_RAD**2 * length_m
+        yaw += (SIGMA_TURN_SHARE * yaw_of(told.T_before_now)) ** 2
+        yaw += (calibration.lag_sigma_s * told.turning_up_rad_s) ** 2
+        on_floor += float(calibration.lag_sigma_s * np.linalg.norm(told.speeding_up_m_s)) ** 2
+        if sigma_turn is not None:
+            tilt = yaw = sigma_turn**2
+        return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
+
+    def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
+        """Learn from the pose of a frame that the images tell well."""
+        self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
+        self._inertial.see(stamp_ns, T_odom_camera, R_world_odom)
+        rate_before, rate_rad_s = self._window_rate_rad_s, self._turn_rate(stamp_ns, T_odom_camera)
+        if self._window is None:
+            self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
+            return
+        before_ns, T_odom_before = self._window
+        T_before_now = invert(T_odom_before) @ T_odom_camera
+        angle = np.linalg.norm(Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec())
+        if (
+            np.linalg.norm(T_before_now[:3, 3]) < WINDOW_M
+            and angle < WINDOW_RAD
+            and stamp_ns - before_ns < WINDOW_NS
+        ):
+            return
+        self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
+        self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
+        self._remark(self.gyroscope.remarks())
+        turning_up = 0.0 if math.isnan(rate_before) else rate_rad_s - rate_before
+        self._learn_wheels(T_before_now, before_ns, stamp_ns, turning_up)
+
+    def _turn_rate(self, stamp_ns: int, T_odom_camera: Array) -> float:
+        """Return how fast the base turns as the last two frames see it, NaN after one."""
+        before, self._last_seen = self._last_seen, (stamp_ns, T_odom_camera)
+        if before is None or self.T_base_left is None:
+            return math.nan
+        turned = self.T_base_left[:3, :3] @ before[1][:3, :3].T @ T_odom_camera[:3, :3]
+        return yaw_of(turned @ self.T_base_left[:3, :3].T) * 1e9 / max(stamp_ns - before[0], 1)
+
+    def felt(
+        self, before_ns: int, now_ns: int, T_odom_before: Array, R_world_odom: Array
+    ) -> RelativeMotion | None:
+        """Return the motion of the camera since the last pose as an IMU alone tells it."""
+        turn, way = self.turn(before_ns, now_ns), self._inertial.way(now_ns, R_world_odom)
+        if turn is None or way is None:
+            return None
+        R_now_before, sigma_rad = turn
+        moved_m = -R_now_before @ T_odom_before[:3, :3].T @ way.moved_m
+        variance = np.array([way.variance_m2] * 3 + [sigma_rad**2] * 3)
+        return RelativeMotion(
+            make_transform(R_now_before, moved_m),
+            np.diag(variance),
+            'IMU' if way.is_felt else 'gyroscope',
+        )
+
+    def carry(
+        self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array, on_wheels: bool
+    ) -> None:
+        """Note the pose of a frame that no image tells, but wheels or an IMU alone."""
+        self._window = self._last_seen = None
+        if on_wheels:
+            self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
+            self._inertial.see(stamp_ns, T_odom_camera, R_world_odom)
+        else:
+            self._inertial.carry(stamp_ns, T_odom_camera, R_world_odom)
+
+    def reset_world(self) -> None:
+        """Forget where up is: the world is another one."""
+        self.gravity = Gravity(self.gyroscope)
+        self._inertial = InertialOdometry(self.gyroscope, self.gravity)
+
+    def stop(self) -> None:
+        """Note that there is a frame without a pose."""
+        self._window = self._last_seen = None
+        self.gravity.stop()
+        self._inertial.stop()
+
+    def _learn_wheels(
+        self, T_before_now: Array, before_ns: int, now_ns: int, turning_up_rad_s: float
+    ) -> None:
+        told = self._wheels.stretch(before_ns, now_ns)
+        if told is None or self.T_base_left is None:
+            return
+        seen = self.T_base_left @ T_before_now @ invert(self.T_base_left)
+        window = Window(seen[:2, 3], yaw_of(seen), turning_up_rad_s, told)
+        if not self._calibrator.add(window):
+            self.slips += 1
+            in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS
+            self._slipped_ns = now_ns
+            logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
+            if in_a_row:
+                self._remark({'slip': SLIP_REMARK})
+        if len(self._calibrator) >= WINDOWS_TO_JUDGE:
+            self._remark(self._calibrator.current.remarks())
+
+    def _remark(self, remarks: Mapping[str, str]) -> None:
+        """Say each thing that is wrong once."""
+        for what, remark in remarks.items():
+            if what not in self.remarks:
+                logger.warning('%s', remark)
+            self.remarks[what] = remark

@@ -1,0 +1,139 @@
+"""What wheels and an accelerometer tell of keyframes, as part of a bundle adjustment.
+
+With e = log(T_now T_before^-1 Z^-1) for a measured motion Z, twists of both poses change it, to
+first order, by d_now - Ad(T_now T_before^-1) d_before (Barfoot 2017, section 8.3.2). With e = u x z
+for up in the camera as its pose has it, u, and as it was felt, z, a turn d of the pose changes it
+by (d x u) x z. The cost is Huber's: wheels that slip lie by much more than they are taken to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.geometry import Array, adjoint, invert, se3_log
+from segfloor_ros.measurements import Up
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.mapping.normal_equations import System
+from segfloor_ros.slam.sensors.body_motion import RelativeMotion
+
+CHI2_95 = 12.59
+"""The 95 % quantile of the chi-squared distribution with six degrees of freedom."""
+
+FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
+"""No motion is measured better: the base shakes on its way."""
+
+
+class Factor(Protocol):
+    """Something measured of one or two keyframes, by their place in the problem."""
+
+    @property
+    def information(self) -> Array:
+        """The inverse covariance (D, D) of the error."""
+
+    def error(self, T_camera_world: Array) -> Array:
+        """Return the error (D,) of poses (K, 4, 4)."""
+
+    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
+        """Return the keyframes, and the derivative (D, 6) of the error by the twist of each."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """The motion of the camera from keyframe `before` to keyframe `now`."""
+
+    before: int
+    now: int
+    motion: RelativeMotion
+
+    @property
+    def information(self) -> Array:
+        """The inverse covariance (6, 6) of the error."""
+        return np.linalg.inv(self.motion.covariance + np.diag(FLOOR_SIGMA**2))
+
+    def error(self, T_camera_world: Array) -> Array:
+        """Return the twist (6,) by which poses (K, 4, 4) miss the measured motion."""
+        moved = T_camera_world[self.now] @ invert(T_camera_world[self.before])
+        return se3_log(moved @ invert(self.motion.T_now_before))
+
+    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
+        """Return the keyframes, and the derivative (6, 6) of the error by the twist of each."""
+        moved = T_camera_world[self.now] @ invert(T_camera_world[self.before])
+        return [(self.before, -adjoint(moved)), (self.now, np.eye(6))]
+
+
+@dataclass(frozen=True)
+class Level:
+    """Up in the camera of a keyframe as it was felt, and up_world (3,), as it is in the world."""
+
+    keyframe: int
+    felt: Up
+    up_world: Array
+
+    @property
+    def information(self) -> Array:
+        """The inverse covariance (3, 3) of the error."""
+        return np.eye(3) / self.felt.sigma_rad**2
+
+    def error(self, T_camera_world: Array) -> Array:
+        """Return the tilt (3,) in radians, about the axes of the camera."""
+        return np.cross(T_camera_world[self.keyframe, :3, :3] @ self.up_world, self.felt.direction)
+
+    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
+        """Return the keyframe, and the derivative (3, 6) of the error by its twist."""
+        up, felt = T_camera_world[self.keyframe, :3, :3] @ self.up_world, self.felt.direction
+        by_turn = np.outer(up, felt) - float(up @ felt) * np.eye(3)
+        return [(self.keyframe, np.hstack([np.zeros((3, 3)), by_turn]))]
+
+
+def factors_of(
+    keyframes: Sequence[KeyframeRecord], slot: NDArray[np.intp], up_world: Up | None
+) -> tuple[Factor, ...]:
+    """Return what is measured of the keyframes of a problem; slot: (K,) their place in it, -1 for
+    others.
+    """
+    found: list[Factor] = []
+    for k in np.flatnonzero(slot >= 0).tolist():
+        motion, felt = keyframes[k].motion, keyframes[k].up
+        if k > 0 and motion is not None and slot[k - 1] >= 0:
+            found.append(Link(int(slot[k - 1]), int(slot[k]), motion))
+        if felt is not None and up_world is not None:
+            found.append(Level(int(slot[k]), felt, up_world.direction))
+    return tuple(found)
+
+
+def chi2(factor: Factor, T_camera_world: Array) -> float:
+    """Return the squared, normalised error."""
+    error = factor.error(T_camera_world)
+    return float(error @ factor.information @ error)
+
+
+def cost(factor: Factor, T_camera_world: Array) -> float:
+    """Return the Huber cost of the error."""
+    squared = chi2(factor, T_camera_world)
+    return squared if squared <= CHI2_95 else 2 * float(np.sqrt(CHI2_95 * squared)) - CHI2_95
+
+
+def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor]) -> System:
+    """Return normal equations with what is measured of keyframes, where those that move come
+    first.
+    """
+    if not factors:
+        return system
+    U, rhs, between = system.U.copy(), system.camera_rhs.copy(), []
+    for factor in factors:
+        error = factor.error(T_camera_world)
+        squared = chi2(factor, T_camera_world)
+        weighted = factor.information * min(1.0, float(np.sqrt(CHI2_95 / max(squared, 1e-12))))
+        terms = [(k, J) for k, J in factor.jacobians(T_camera_world) if k < len(U)]
+        for k, J in terms:
+            U[k] += J.T @ weighted @ J
+            rhs[k] -= J.T @ weighted @ error
+        if len(terms) == 2:
+            (j, J_j), (k, J_k) = terms
+            between.append((j, k, J_j.T @ weighted @ J_k))
+    return replace(system, U=U, camera_rhs=rhs, between=tuple(between))

@@ -1,0 +1,355 @@
+"""The front end of SLAM: where the camera is, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from segfloor_ros.camera.depth import is_disparity
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.geometry import Array
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition
+from segfloor_ros.slam.places.relocalisation import Relocaliser, is_within
+from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
+from segfloor_ros.slam.sensors.body_motion import BodyMotion
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.tracking.consensus import Consensus, differ
+from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
+from segfloor_ros.slam.tracking.firm_points import count_firm
+from segfloor_ros.slam.tracking.following import Follower
+from segfloor_ros.slam.tracking.images import (
+    FrozenCheck,
+    ImageRotation,
+    Images,
+    Region,
+    expected_shift,
+    image_fault,
+    is_inside,
+    join,
+)
+from segfloor_ros.slam.tracking.local_map import LocalMap
+from segfloor_ros.slam.tracking.map_tracking import Tracker
+from segfloor_ros.slam.tracking.motion import MAX_BLIND_SIGMA_M, CameraMotion, sigma_m
+from segfloor_ros.slam.tracking.pose import PoseEstimate
+from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer
+
+RECOVERY_RATIO = 0.15
+"""Share of the points expected in view that a camera which was lost must find: far points alone
+fit many places."""
+
+CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
+"""Points, and their share of those expected, that must be found where the sensors have the camera
+somewhere else: wheels slip, but a view that begins anew may be of another place."""
+
+CARRY_ON = 0.6
+"""A poor pose gives way to the motion so far, where that explains this share of its points."""
+
+FEW_POINTS, RESUMING_POINTS = 50, 60
+"""Wheels tell the pose better than fewer points, spread over the image, that do not slide along
+edges, and an IMU alone better than half as many. A few more end a blind stretch."""
+
+PLENTY = 100
+"""With so many points in view the place is certain enough, whatever they are."""
+
+
+class FrontEnd:
+    """Tracks frames against the map, and looks for a camera that was lost.
+
+    offset_px: the error that all disparities share. is_fixed: whether the map stays as it is.
+    is_poor: whether the last pose was told by few points of many. seen_sigma_m: how uncertain the
+    last image leaves the place of the camera, 0 where it shows plenty or nothing.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: StereoSlamSettings,
+        sparse_map: SparseMap,
+        body: BodyMotion,
+    ) -> None:
+        self.consensus = Consensus(camera)
+        self.motion = CameraMotion(settings.max_speed_mps, body)
+        self.local = LocalMap(camera, settings, sparse_map)
+        self.follower = Follower(camera, self.consensus, settings.tracked_points)
+        self.tracker = Tracker(camera, self.consensus)
+        self.extractor = FeatureExtractor(settings)
+        self.places = PlaceRecognition(camera, self.tracker, sparse_map)
+        self.offset_px = self.seen_sigma_m = 0.0
+        self.is_fixed = self.is_poor = False
+        self.frames_since_keyframe = 0
+        self._camera = camera
+        self._map = sparse_map
+        self._prior: PoseEstimate | None = None
+        self._tells_less = False
+        self._relocaliser = Relocaliser(sparse_map, self.places)
+        self._frozen = FrozenCheck()
+        self._rotation = ImageRotation(camera)
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether the camera is looked for in the whole map."""
+        return self.motion.is_lost and not self._relocaliser.is_narrow
+
+    def leave_map(self) -> None:
+        """Forget what was seen of the map: another one takes its place."""
+        self.motion.stop()
+        self.local.point_ids = np.zeros(0, np.int32)
+        self.follower.reset()
+        self._relocaliser.reset()
+
+    def start_lost(self, T_world_odom: Array | None) -> None:
+        """Go on with a map in which the camera must be found. T_world_odom: (4, 4), where the drive
+        that made it goes on.
+        """
+        if T_world_odom is not None:
+            last = self._map.keyframes[-1]
+            self.motion.T_camera_world = last.T_camera_world
+            self.motion.T_world_odom = T_world_odom
+            self.local.move_to(last.point_id[last.point_id != NO_POINT], last.T_camera_world)
+        self.motion.stop()
+
+    def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
+        """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
+        here = is_within(self.motion.T_camera_world @ T_world_camera, reach_m, reach_rad)
+        if here and not self.motion.is_lost:
+            return
+        self.leave_map()
+        self._relocaliser.search_near(T_world_camera, reach_m, reach_rad)
+
+    def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
+        """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
+        self.motion.move_map(T_reference_before, T_reference_after)
+        self.local.drop_dead()
+        self.follower.drop_dead(self._map)
+
+    def fault(self, frame: StereoFrame) -> str:
+        """Return why a pair of images cannot be tracked, or ''."""
+        points = self._map.xyz_world[self.follower.seen_ids]
+        motion = self.motion
+        shift = partial(
+            expected_shift,
+            self._camera,
+            points,
+            motion.T_camera_world,
+            motion.predict(frame.stamp_ns),
+        )
+        frozen = self._frozen.frozen(frame.left, shift)
+        fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
+        if frozen and not fault:
+            return 'the image is the one before although the camera was moving'
+        return fault
+
+    def track(self, frame: StereoFrame, images: Images) -> Track | None:
+        """Find the pose of a frame: from the one before, else by its features."""
+        predictions = self._predict_poses(frame, images)
+        self.is_poor, self.seen_sigma_m = False, 0.0
+        self._prior = self.motion.prior(frame.stamp_ns)
+        track = self.follower.follow(
+            images, self._map, self.local.point_ids, predictions[0], self.offset_px
+        )
+        if track is None:
+            track = self._search(frame, images, predictions)
+        if track is None or not self.is_believable(track, images, frame.stamp_ns):
+            self.follower.reset()
+            return None
+        T_seen, track = track.T_camera_world, self._weighed(track, images)
+        self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
+        self.follower.see(images, track.point_ids, track.uv_px)
+        self.local.move_to(track.point_ids, track.T_camera_world)
+        if not self.is_fixed:
+            self._map.note_tracking(track.visible_ids, track.point_ids)
+        self.frames_since_keyframe += 1
+        return track
+
+    def is_believable(self, track: Track, images: Images, stamp_ns: int) -> bool:
+        """Whether the camera can have come to where the images have it."""
+        motion, pose = self.motion, track.T_camera_world
+        if motion.is_lost:
+            return motion.may_face(pose, stamp_ns)
+        few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
+        few = few if motion.prior(stamp_ns) else few // 2 if motion.is_felt(stamp_ns) else 0
+        if few and count_firm(images.left, track.uv_px) < few:
+            return False
+        if len(track.point_ids) < PLENTY:
+            self.seen_sigma_m = self._sigma_m(track, images)
+        if motion.is_consistent(pose, track.covariance, stamp_ns):
+            return motion.is_plausible(pose, stamp_ns)
+        least, ratio = CONTRARY_WHEN_BLIND if motion.is_blind else CONTRARY
+        return len(track.point_ids) >= least and _recognised(track, ratio)
+
+    def _sigma_m(self, track: Track, images: Images) -> float:
+        """Return how uncertain an image leaves the place along the axis on which it is most."""
+        return sigma_m(self._information(track, images).covariance(track.T_camera_world))
+
+    def _information(self, track: Track, images: Images) -> PoseInformation:
+        return PoseInformation(
+            self._camera,
+            images.left,
+            self._map.xyz_world[track.point_ids],
+            track.observations.without_offset(self.offset_px),
+            track.estimate.noise_factor,
+        )
+
+    def _weighed(self, track: Track, images: Images) -> Track:
+        """Return a track with the pose that images and sensors tell together; that of the images
+        where the sensors contradict it.
+        """
+        self._tells_less = False
+        if self._prior is not None and differ(track.estimate, self._prior):
+            self._prior = None
+        if self._prior is None:
+            return track
+        information = self._information(track, images)
+        self._tells_less = information.tells_less(track.T_camera_world, self._prior)
+        return replace(track, estimate=information.fused(track.estimate, self._prior))
+
+    def bridge(self, frame: StereoFrame, fault: str) -> None:
+        """Go on without the images, where the sensors allow it."""
+        if self.motion.bridge(frame.stamp_ns):
+            self.local.move_to(np.zeros(0, np.int32), self.motion.T_camera_world)
+            self.frames_since_keyframe += 1
+        elif not fault or self.motion.is_blind or self.motion.is_lost:
+            self.motion.lose(frame.stamp_ns)
+
+    def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
+        """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
+        self._rotation.see(images.left)
+        turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
+        steady = self.motion.steady(frame.stamp_ns)
+        measured = self.motion.measured_pose(frame.stamp_ns)
+        return [steady, turned] if measured is None else [measured, steady, turned]
+
+    def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
+        """Find the pose by the features of the frame, without its predecessor."""
+        features = self.extractor.extract(frame.left, images.excluded)
+        track = self.tracker.track(
+            images,
+            features,
+            self._map,
+            self.local.point_ids,
+            predictions,
+            self.offset_px,
+        )
+        if not (self.motion.is_lost or self.motion.is_blind):
+            return self._carry_on(images, features, frame.stamp_ns, track)
+        if track is not None and _recognised(track, RECOVERY_RATIO):
+            return track
+        return self._relocalise(images, features, frame.stamp_ns)
+
+    def _carry_on(
+        self, images: Images, features: Features, stamp_ns: int, track: Track | None
+    ) -> Track | None:
+        """Return the pose that the motion so far leads to, where it explains more points that have
+        a record of standing still, or where a pose is poor, nearly as many: what comes close and
+        fills the image has the most points, and takes the pose along.
+        """
+        self.is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
+        steady = self.motion.expected(stamp_ns)
+        close = self.tracker.track_at(
+            images,
+            features,
+            self._map,
+            self.local.point_ids,
+            steady.T_camera_world,
+            self.offset_px,
+            steady,
+            is_given=True,
+        )
+        if close is None or len(close.point_ids) < MIN_TRACKED:
+            return track
+        if track is not None:
+            told, explained = (self._count_proven(t) for t in (track, close))
+            if explained <= (CARRY_ON if self.is_poor else 1.0) * told:
+                return track
+        self.is_poor = True
+        return close
+
+    def _count_proven(self, track: Track) -> int:
+        proven = self.consensus.proven(self._map, track.point_ids, track.T_camera_world)
+        return int(proven.sum())
+
+    def _relocalise(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
+        """Look for the view in the whole map."""
+        motion = self.motion
+        is_possible = partial(motion.may_face, stamp_ns=stamp_ns)
+        lost_at = motion.T_camera_world if motion.lost_here else None
+        found = self._relocaliser.find_surely(
+            images, features, self.offset_px, is_possible, lost_at
+        )
+        if found is None:
+            return None
+        pose = found.T_camera_world
+        around = self.local.points_around(found.point_ids, pose)
+        return self.tracker.track_at(images, features, self._map, around, pose, self.offset_px)
+
+    def is_new_place(self) -> bool:
+        """Whether the sensors have the camera somewhere new: the map goes on from there."""
+        motion = self.motion
+        if not motion.is_blind or motion.sigma_m > MAX_BLIND_SIGMA_M:
+            return False
+        return self.local.is_new_view(motion.T_camera_world)
+
+    def exclude(self, images: Images, region: Region | None) -> Images:
+        """Return the images without a region in which something moves."""
+        if region is None:
+            return images
+        self.follower.drop_inside(region)
+        return replace(images, excluded=join(images.excluded, region))
+
+    def observe(
+        self, frame: StereoFrame, images: Images, track: Track | None
+    ) -> ObservedFeatures | None:
+        """Return the features of a frame and which of them show map points, now that the pose is
+        known; it is refined by all of them. None where too few do.
+        """
+        if track is not None and track.observed is not None:
+            inside = is_inside(images.excluded, track.observed.features.uv_px)
+            observed = track.observed.take(np.flatnonzero(~inside))
+            return self._no_surer(images, observed)
+        features = self.extractor.extract(frame.left, images.excluded)
+        if track is None:
+            if not self._map.keyframes:
+                self.motion.take(self.motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
+            none = np.full(len(features), NO_POINT, np.int32)
+            return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
+        pose = self.motion.T_camera_world
+        matched = self.tracker.track_at(
+            images,
+            features,
+            self._map,
+            self.local.point_ids,
+            pose,
+            self.offset_px,
+            track.estimate,
+        )
+        if matched is None:
+            return None
+        assert matched.observed is not None
+        self.motion.T_camera_world = self._weighed(matched, images).T_camera_world
+        self._map.note_tracking(matched.visible_ids, matched.point_ids)
+        return self._no_surer(images, matched.observed)
+
+    def _no_surer(self, images: Images, observed: ObservedFeatures) -> ObservedFeatures:
+        """Return the features of a frame; where wheels know some direction better than they do, no
+        surer than their patches.
+        """
+        if not self._tells_less:
+            return observed
+        return replace(observed, observations=no_surer(images.left, observed.observations))
+
+    def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
+        """Track on from the points of a keyframe, old and new."""
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        ids = keyframe.point_id[rows]
+        self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
+        self.local.move_to(ids, keyframe.T_camera_world)
+        self.frames_since_keyframe = 0
+
+
+def _recognised(track: Track, ratio: float) -> bool:
+    """Whether a camera that was lost sees enough of what it should see there."""
+    return len(track.point_ids) >= ratio * len(track.visible_ids)

@@ -1,0 +1,282 @@
+"""Tracking: the pose of a frame from the map points it sees again.
+
+Which map points a camera at a given pose should see, and where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import Array, transform_points
+from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
+from segfloor_ros.slam.tracking.consensus import (
+    MIN_AGREEMENT,
+    Agreement,
+    Consensus,
+)
+from segfloor_ros.slam.tracking.features import (
+    PYRAMID_LEVELS,
+    PYRAMID_SCALE,
+    Features,
+    Matches,
+    match_predicted,
+    match_unguided,
+)
+from segfloor_ros.slam.tracking.images import Images, Region, is_inside
+from segfloor_ros.slam.tracking.point_measurement import align_pixels, measure_disparity
+from segfloor_ros.slam.tracking.pose import PoseEstimate, solve_pnp
+
+SIGMA_PIXEL = 0.6
+"""Standard deviation of a corner's position at the finest pyramid level, px; grows with the
+level.
+"""
+
+MAX_CORNER_NOISE_FACTOR = 2.0
+"""Corners are not worse than this times `SIGMA_PIXEL`; beyond it the matches are wrong."""
+
+MATCH_RADIUS_PX = 15.0
+"""Search radius around a predicted pixel, at the finest pyramid level."""
+
+WIDE_SEARCH = 3.0
+"""Factor on the search radius when the first search finds too little."""
+
+MIN_PNP_INLIERS = 10
+"""Fewest matches behind a first guess of the pose; chance gives five or six."""
+
+NARROW_SEARCH = 0.4
+"""Factor on the search radius once a pose is known from this very frame."""
+
+MIN_VIEW_COSINE = 0.5
+"""A point is recognised up to 60 degrees from the direction it was last seen from."""
+
+
+class Tracker:
+    """Finds the pose of frames against the local map."""
+
+    def __init__(self, camera: StereoCamera, consensus: Consensus) -> None:
+        self._camera = camera
+        self._consensus = consensus
+
+    def pixel_observations(self, features: Features) -> Observations:
+        """Return the observations of features (N) before any disparity is known."""
+        uvd = np.full((len(features), 3), np.nan)
+        uvd[:, :2] = features.uv_px
+        sigma = np.full((len(features), 3), 1.0)
+        scale = PYRAMID_SCALE ** features.octave.astype(np.float64)
+        sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
+        return Observations(uvd, sigma)
+
+    def track(
+        self,
+        images: Images,
+        features: Features,
+        sparse_map: SparseMap,
+        local_ids: NDArray[np.int32],
+        predictions: Sequence[Array],
+        offset_px: float = 0.0,
+    ) -> Track | None:
+        """Find the pose of a frame near one of the predicted ones, tried in order.
+
+        offset_px: the known error of all disparities, measured minus true; the returned
+        observations still have it.
+        None when too few points are found again.
+        """
+        if len(features) == 0 or len(local_ids) == 0:
+            return None
+        tree = cKDTree(features.uv_px)
+        observations = self.pixel_observations(features)
+        estimate = self._coarse_pose(
+            features, tree, observations, sparse_map, local_ids, predictions
+        )
+        if estimate is None:
+            return None
+        pose = estimate.T_camera_world
+        return self.track_at(images, features, sparse_map, local_ids, pose, offset_px)
+
+    def track_at(
+        self,
+        images: Images,
+        features: Features,
+        sparse_map: SparseMap,
+        local_ids: NDArray[np.int32],
+        T_camera_world: Array,
+        offset_px: float = 0.0,
+        known: PoseEstimate | None = None,
+        is_given: bool = False,
+    ) -> Track | None:
+        """Find which features show map points, and the pose, which is known to a few pixels; as
+        `track` for the rest. known: the pose as the same images told it before; or, with is_given,
+        where the camera is, and only its points are looked for.
+        """
+        if len(features) == 0 or len(local_ids) == 0:
+            return None
+        observations = self.pixel_observations(features)
+        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, images.excluded)
+        tree = cKDTree(features.uv_px)
+        points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
+        if len(rows) < (MIN_TRACKED if known is None else 1):
+            return None
+        ids = seen.ids[points]
+        align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
+        guess_px = seen.uvd_px[points, 2] + offset_px
+        measure_disparity(images, observations, rows, guess_px)
+        measured = observations.take(rows).without_offset(offset_px)
+        found = None
+        if not is_given:
+            found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
+        if found is None or not self._agree(found):
+            if known is None:
+                return None
+            found = self._consensus.at(known, sparse_map, ids, measured)
+        estimate = found.estimate
+        rows, ids = rows[estimate.inliers], ids[estimate.inliers]
+        point_id = np.full(len(features), NO_POINT, np.int32)
+        point_id[rows] = ids
+        return Track(
+            estimate,
+            ids,
+            observations.take(rows),
+            seen.ids,
+            ObservedFeatures(
+                features, observations.with_noise_factor(estimate.noise_factor), point_id
+            ),
+        )
+
+    def _coarse_pose(
+        self,
+        features: Features,
+        tree: cKDTree,
+        observations: Observations,
+        sparse_map: SparseMap,
+        local_ids: NDArray[np.int32],
+        predictions: Sequence[Array],
+    ) -> PoseEstimate | None:
+        """Search around the predictions, then wider around the first, then without any."""
+        attempts = [(T, 1.0) for T in predictions] + [(T, WIDE_SEARCH) for T in predictions[:1]]
+        for T_predicted, factor in attempts:
+            seen = self._predict(sparse_map, local_ids, T_predicted)
+            points, rows = self._search(features, tree, sparse_map, seen, factor)
+            estimate = self._believable(
+                observations, sparse_map, seen.ids[points], rows, T_predicted
+            )
+            if estimate is not None:
+                return estimate
+        return self.locate(features, tree, observations, sparse_map, local_ids)
+
+    def locate(
+        self,
+        features: Features,
+        tree: cKDTree,
+        observations: Observations,
+        sparse_map: SparseMap,
+        ids: NDArray[np.int32],
+    ) -> PoseEstimate | None:
+        """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
+        a first guess, which then has to find more points where they should be.
+        """
+        points, rows = match_unguided(sparse_map.descriptor[ids], features.descriptor)
+        found = solve_pnp(self._camera, sparse_map.xyz_world[ids[points]], features.uv_px[rows])
+        if found is None or found[1].sum() < MIN_PNP_INLIERS:
+            return None
+        seen = self._predict(sparse_map, ids, found[0])
+        points, rows = self._search(features, tree, sparse_map, seen, 1.0)
+        return self._believable(observations, sparse_map, seen.ids[points], rows, found[0])
+
+    def _believable(
+        self,
+        observations: Observations,
+        sparse_map: SparseMap,
+        ids: NDArray[np.int32],
+        rows: NDArray[np.intp],
+        T_start: Array,
+    ) -> PoseEstimate | None:
+        """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
+        if len(rows) < MIN_TRACKED:
+            return None
+        found = self._consensus.refine(
+            T_start, sparse_map, ids, observations.take(rows), MAX_CORNER_NOISE_FACTOR
+        )
+        return found.estimate if self._agree(found) else None
+
+    def _agree(self, found: Agreement) -> bool:
+        return found.agreeing >= MIN_TRACKED and found.share >= MIN_AGREEMENT
+
+    def _predict(
+        self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
+    ) -> Prediction:
+        return predict_points(self._camera, sparse_map, ids, T_camera_world)
+
+    def _search(
+        self,
+        features: Features,
+        tree: cKDTree,
+        sparse_map: SparseMap,
+        seen: Prediction,
+        radius_factor: float,
+    ) -> Matches:
+        scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
+        return match_predicted(
+            features,
+            tree,
+            seen.uvd_px[:, :2],
+            seen.octave,
+            sparse_map.descriptor[seen.ids],
+            radius_factor * MATCH_RADIUS_PX * scale,
+        )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Map points expected in the image: ids (N,), pixel and disparity (N, 3), pyramid level
+    (N,).
+    """
+
+    ids: NDArray[np.int32]
+    uvd_px: Array
+    octave: Array
+
+    def take(self, rows: NDArray[np.intp]) -> Prediction:
+        """Return the chosen rows."""
+        return Prediction(self.ids[rows], self.uvd_px[rows], self.octave[rows])
+
+
+def predict_points(
+    camera: StereoCamera,
+    sparse_map: SparseMap,
+    ids: NDArray[np.int32],
+    T_camera_world: Array,
+    excluded: Region | None = None,
+) -> Prediction:
+    """Project points (N,) into the image and keep those that a camera there should recognise:
+    inside the image, from about the known direction, at a size the pyramid has, and not in a region
+    that is excluded.
+    """
+    points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
+    front = points[:, 2] > MIN_DEPTH_M
+    ids, points = ids[front], points[front]
+    uvr = camera.project(points)
+    distance = np.sqrt((points**2).sum(axis=1))
+    direction = points @ T_camera_world[:3, :3] / distance[:, None]
+    cosine = (direction * sparse_map.viewing_direction[ids]).sum(axis=1)
+    zoom = np.log(sparse_map.viewing_distance_m[ids] / distance)
+    octave = sparse_map.viewing_octave[ids] + zoom / np.log(PYRAMID_SCALE)
+    visible = (
+        (uvr[:, 0] >= 0)
+        & (uvr[:, 0] < camera.width)
+        & (uvr[:, 1] >= 0)
+        & (uvr[:, 1] < camera.height)
+        & (cosine > MIN_VIEW_COSINE)
+        & (octave > -1.5)
+        & (octave < PYRAMID_LEVELS + 0.5)
+    )
+    uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
+    visible[visible] = ~is_inside(excluded, uvr[visible, :2])
+    return Prediction(ids[visible], uvd[visible], octave[visible])

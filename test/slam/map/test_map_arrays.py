@@ -1,0 +1,191 @@
+"""A map that is saved, loaded, localized in, and mapped on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.geometry import invert
+from segfloor_ros.map_file import MapFile, from_bytes, to_bytes
+from segfloor_ros.slam.saved_slam import load_slam, save_slam
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+SETTINGS = StereoSlamSettings(num_features=600)
+ROOM = StereoRoom()
+
+
+def there(count, aside=0.0):
+    return [planar_pose(0.04 * k, aside, 0.03 * k) for k in range(count)]
+
+
+def drive(slam, poses):
+    """Return the results, and the errors in metres of the frames that were tracked."""
+    results = [slam.process(ROOM.frame(k, pose))[0] for k, pose in enumerate(poses)]
+    pairs = [(r, p) for r, p in zip(results, poses, strict=True) if r.tracked]
+    return results, [
+        np.linalg.norm((invert(pose) @ r.T_map_odom @ r.T_odom_base)[:3, 3]) for r, pose in pairs
+    ]
+
+
+@pytest.fixture(scope='module')
+def mapped():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    drive(slam, there(25))
+    return slam
+
+
+def loaded(mapped, localize, **options):
+    slam = StereoSlam(CAMERA, SETTINGS)
+    load_slam(slam, CAMERA, save_slam(mapped, CAMERA), 'x', localize, **options)
+    return slam
+
+
+def test_a_loaded_map_is_the_one_that_was_saved(mapped):
+    slam = loaded(mapped, localize=True)
+    alive = np.flatnonzero(mapped.map.alive)
+    order = alive[np.argsort(mapped.map.stable_id[alive])]
+    np.testing.assert_array_equal(slam.map.stable_id, mapped.map.stable_id[order])
+    np.testing.assert_array_equal(slam.map.xyz_world, mapped.map.xyz_world[order])
+    np.testing.assert_array_equal(slam.map.observer_count, mapped.map.observer_count[order])
+    np.testing.assert_array_equal(slam.map.patch, mapped.map.patch[order])
+    assert slam.map.num_ever == mapped.map.num_ever
+    for a, b in zip(slam.map.keyframes, mapped.map.keyframes, strict=True):
+        np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-12)
+        assert a.links == b.links
+        assert (a.retired is None) == (b.retired is None)
+    stamps = [k.stamp_ns for k in slam.map.keyframes]
+    assert stamps[-1] < 0
+    assert np.diff(stamps).tolist() == np.diff([k.stamp_ns for k in mapped.map.keyframes]).tolist()
+
+
+def test_saving_again_does_not_grow_the_file(mapped):
+    saved = mapped.to_arrays()
+
+    def size(arrays):
+        return len(to_bytes(MapFile({}, {'slam': arrays})))
+
+    again = loaded(mapped, localize=True).to_arrays()
+    assert size(again) == pytest.approx(size(saved), rel=0.01)
+    assert size(saved) < 60_000 * len(saved['keyframe_stamp_ns'])
+    back = from_bytes(to_bytes(MapFile({}, {'slam': saved})), 'x').parts['slam']
+    for name, array in saved.items():
+        np.testing.assert_array_equal(back[name], array)
+
+
+def test_localizing_finds_the_camera_and_adds_nothing(mapped):
+    saved = mapped.to_arrays()
+    slam = loaded(mapped, localize=True)
+    results, errors = drive(slam, there(20, aside=0.05)[3:])
+    assert sum(not r.tracked for r in results[:3]) < 3
+    assert all(r.tracked for r in results[3:])
+    assert all(r.keyframe is None for r in results)
+    assert max(errors) < 0.02
+    again = slam.to_arrays()
+    for name in ('point_xyz_world', 'point_found_count', 'keyframe_T_camera_world'):
+        np.testing.assert_array_equal(again[name], saved[name])
+
+
+def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
+    saved = mapped.to_arrays()
+    slam = loaded(mapped, localize=False)
+    before = slam.map.num_ever, len(slam.map.keyframes)
+    poses = there(25)[15:] + [planar_pose(1.0, 0.04 * k, 0.75 + 0.06 * k) for k in range(12)]
+    results, errors = drive(slam, poses)
+    assert all(r.tracked for r in results[3:])
+    assert max(errors) < 0.03
+    assert len(slam.map.keyframes) > before[1]
+    new = [r.keyframe for r in results if r.keyframe][-1]
+    assert new.cloud.point_id.max() >= before[0]
+    assert set(saved['point_stable_id'][:50]) & set(new.cloud.point_id.tolist())
+
+
+def test_another_room_is_not_this_one(mapped):
+    slam = loaded(mapped, localize=True)
+    other = StereoRoom(seed=77)
+    for k in range(6):
+        result = slam.process(other.frame(k, planar_pose(0.04 * k, 0, 0)))[0]
+        assert not result.tracked
+        assert result.covariance[0, 0] > 1e3
+
+
+def test_frames_in_a_row_must_find_who_is_lost(mapped):
+    slam = loaded(mapped, localize=True)
+    here, other = there(25)[10], StereoRoom(seed=77)
+    rooms = [ROOM, other, ROOM, other, ROOM, ROOM, ROOM]
+    tracked = [slam.process(room.frame(k, here))[0].tracked for k, room in enumerate(rooms)]
+    assert tracked == [False] * 5 + [True] * 2
+
+
+def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch):
+    slam = loaded(mapped, localize=False, ends_ns=None)
+    here, other = there(25)[-1], StereoRoom(seed=77)
+    assert slam.process(ROOM.frame(30, here))[0].tracked
+    monkeypatch.setattr(
+        'segfloor_ros.slam.tracking.front_end.RECOVERY_RATIO', 1.0
+    )  # the whole map alone
+    monkeypatch.setattr('segfloor_ros.slam.places.relocalisation.MIN_AGREEMENT', 1.01)
+    assert not slam.process(other.frame(31, here))[0].tracked
+    assert slam.process(ROOM.frame(32, here))[0].tracked
+
+
+def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkeypatch):
+    monkeypatch.setattr('segfloor_ros.slam.places.relocalisation.MIN_AGREEMENT', 1.01)
+    slam = loaded(mapped, localize=True)
+    results = [slam.process(ROOM.frame(k, there(25)[10]))[0] for k in range(5)]
+    assert not any(result.tracked for result in results)
+
+
+def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
+    mapped._front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
+    slam = loaded(mapped, localize=False, ends_ns=None)
+    stamps = [k.stamp_ns for k in slam.map.keyframes]
+    assert stamps == [k.stamp_ns for k in mapped.map.keyframes]
+    result = slam.process(ROOM.frame(30, there(25)[-1]))[0]
+    assert result.tracked
+    error = invert(there(25)[-1]) @ result.T_map_odom @ result.T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.03
+    np.testing.assert_allclose(slam.T_world_odom, mapped.T_world_odom, atol=1e-9)
+
+
+def test_a_search_around_a_pose_finds_the_camera_there_alone(mapped):
+    here, elsewhere = there(25)[5], planar_pose(30.0, 0.0, 0.0)
+    slam = loaded(mapped, localize=True)
+    slam.search_near(elsewhere, 1.0, 0.5)
+    assert not any(slam.process(ROOM.frame(k, here))[0].tracked for k in range(3))
+    slam.search_near(here, 0.5, 0.5)
+    assert slam.process(ROOM.frame(4, here))[0].tracked
+    slam.search_near(elsewhere, 1.0, 0.5)
+    assert not slam.process(ROOM.frame(5, here))[0].tracked
+
+
+def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mapped):
+    slam = loaded(mapped, localize=False)
+    # It looks at the wall behind, then turns to what is known.
+    start = [planar_pose(0.0, 0.1 * min(k, 3), 2.6) for k in range(13)]
+    turn = [planar_pose(0.02 * k, 0.3, 2.6 - 0.11 * k) for k in range(25)]
+    on = [planar_pose(0.5 + 0.03 * k, 0.3 - 0.02 * k, -0.1 + 0.03 * k) for k in range(12)]
+    results, _ = drive(slam, start + turn + on)
+    apart = [r for r in results if 'outside the loaded map' in r.state]
+    assert len(apart) > 10
+    first = apart[0]
+    np.testing.assert_allclose(first.T_map_odom @ first.T_odom_base, np.eye(4), atol=1e-6)
+    last = [r.keyframe for r in results if r.keyframe][-1]
+    before = [r.keyframe for r in apart if r.keyframe]
+    assert len(before[0].path.stamp_ns) == 1
+    assert len(last.path.stamp_ns) > len(mapped.map.keyframes) + 3
+    assert results[-1].tracked and results[-1].state == 'tracking'
+    error = invert((start + turn + on)[-1]) @ results[-1].T_map_odom @ results[-1].T_odom_base
+    assert np.linalg.norm(error[:3, 3]) < 0.03
+    # What was mapped apart has moved along, with its ids.
+    own = before[-1].cloud.point_id
+    assert own.min() >= mapped.map.num_ever
+    assert np.isin(own, last.cloud.point_id).mean() > 0.5
+    at = np.searchsorted(last.path.stamp_ns, before[0].stamp_ns)
+    truth = start[[r.index for r in results].index(before[0].frame_index)]
+    np.testing.assert_allclose(last.path.T_map_base[at], truth, atol=0.05)
+    # odom goes on without a jump.
+    odom = np.stack([r.T_odom_base for r in results if r.tracked])
+    steps = np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.15

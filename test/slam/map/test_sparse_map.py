@@ -1,0 +1,123 @@
+"""The sparse map's bookkeeping on small hand-made maps."""
+
+import numpy as np
+
+from segfloor_ros.geometry import make_transform
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
+
+
+def keyframe(index, point_id, x=0.0):
+    count = len(point_id)
+    found = Features(
+        np.zeros((count, 2), np.float32),
+        np.zeros(count, np.uint8),
+        np.full((count, 32), index, np.uint8),
+    )
+    return KeyframeRecord(
+        index,
+        10 * index,
+        1000 * index,
+        make_transform(np.eye(3), np.array([-x, 0.0, 0.0])),
+        found,
+        Observations(np.zeros((count, 3)), np.ones((count, 3))),
+        np.array(point_id, np.int32),
+    )
+
+
+def add(sparse_map, record, new_rows=(), new_xyz=()):
+    patches = np.full((len(record.point_id), SIDE_PX, SIDE_PX), record.index, np.uint8)
+    new_xyz = np.array(new_xyz, np.float64).reshape(-1, 3)
+    sparse_map.add_keyframe(record, patches, np.array(new_rows, np.intp), new_xyz)
+
+
+def two_keyframes():
+    """Points 0, 1, 2 at z = 2, made by keyframe 0; keyframe 1, a metre to the right, sees 1
+    and 2.
+    """
+    sparse_map = SparseMap()
+    first = keyframe(0, [NO_POINT] * 4)
+    add(sparse_map, first, [0, 1, 3], [[0, 0, 2], [1, 0, 2], [2, 0, 2]])
+    second = keyframe(1, [2, NO_POINT, 1], x=1.0)
+    add(sparse_map, second)
+    return sparse_map, first, second
+
+
+def test_ids_count_up_and_link_both_ways():
+    sparse_map, first, _ = two_keyframes()
+    np.testing.assert_array_equal(first.point_id, [0, 1, NO_POINT, 2])
+    np.testing.assert_array_equal(sparse_map.observer_count, [1, 2, 2])
+    np.testing.assert_array_equal(sparse_map.points_of(np.array([1])), [1, 2])
+    order, shared = sparse_map.covisible(np.array([1, 2]))
+    np.testing.assert_array_equal(order, [1, 0])
+    np.testing.assert_array_equal(shared, [2, 2])
+
+
+def test_a_point_takes_on_the_latest_view_but_keeps_its_patch_while_its_size_stays():
+    sparse_map, _, _ = two_keyframes()
+    np.testing.assert_array_equal(sparse_map.descriptor[:, 0], [0, 1, 1])
+    # Keyframe 1 sees point 1 from 2.0 m instead of 2.24 m, and point 2 from 2.24 instead of 2.83 m.
+    np.testing.assert_allclose(sparse_map.viewing_distance_m, [2, 2, np.sqrt(5)])
+    np.testing.assert_array_equal(sparse_map.patch[:, 0, 0], [0, 0, 0])
+    nearer = keyframe(2, [2], x=2.0)
+    nearer.T_camera_world[2, 3] = -1.0
+    add(sparse_map, nearer)
+    assert sparse_map.patch[2, 0, 0] == 2
+
+
+def test_removed_points_vanish_everywhere_and_leave_their_rows_but_not_their_ids():
+    sparse_map, first, second = two_keyframes()
+    sparse_map.remove_points(np.array([1]))
+    np.testing.assert_array_equal(first.point_id, [0, NO_POINT, NO_POINT, 2])
+    np.testing.assert_array_equal(second.point_id, [2, NO_POINT, NO_POINT])
+    np.testing.assert_array_equal(sparse_map.alive, [True, False, True])
+    third = keyframe(2, [NO_POINT])
+    add(sparse_map, third, [0], [[0, 0, 5]])
+    np.testing.assert_array_equal(third.point_id, [1])
+    np.testing.assert_array_equal(sparse_map.stable_id, [0, 3, 2])
+    np.testing.assert_array_equal(sparse_map.xyz_world[1], [0, 0, 5])
+    np.testing.assert_array_equal(sparse_map.observer_count, [1, 1, 2])
+    np.testing.assert_array_equal(sparse_map.patch[1, 0, 0], 2)
+
+
+def test_rows_are_reused_before_new_ones_are_made():
+    sparse_map, _, _ = two_keyframes()
+    sparse_map.remove_points(np.array([0, 2]))
+    third = keyframe(2, [NO_POINT] * 3)
+    add(sparse_map, third, [0, 1, 2], [[0, 0, 5], [0, 0, 6], [0, 0, 7]])
+    np.testing.assert_array_equal(third.point_id, [0, 2, 3])
+    np.testing.assert_array_equal(sparse_map.stable_id, [3, 1, 4, 5])
+    np.testing.assert_array_equal(sparse_map.xyz_world[:, 2], [5, 2, 6, 7])
+    assert sparse_map.alive.all()
+
+
+def test_unlinking_the_last_observer_removes_the_point():
+    sparse_map, first, second = two_keyframes()
+    sparse_map.unlink(second, np.array([0]))
+    np.testing.assert_array_equal(sparse_map.observer_count, [1, 2, 1])
+    assert sparse_map.alive.all()
+    sparse_map.unlink(first, np.array([3]))
+    np.testing.assert_array_equal(sparse_map.alive, [True, True, False])
+    points, keyframes, rows = sparse_map.edges_of(np.array([0, 1, 2]))
+    edges = set(zip(points.tolist(), keyframes.tolist(), rows.tolist(), strict=True))
+    assert edges == {(0, 0, 0), (1, 0, 1), (1, 1, 2)}
+
+
+def test_points_that_tracking_seldom_finds_are_poor():
+    sparse_map, _, _ = two_keyframes()
+    for _ in range(10):
+        sparse_map.note_tracking(np.array([0, 1, 2]), np.array([1, 2]))
+    # Point 0 was found once (when it was made) in eleven chances.
+    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.25), [0])
+    np.testing.assert_array_equal(sparse_map.poor_points(0, 0.05), [])
+
+
+def test_grows_beyond_its_first_buffer():
+    sparse_map = SparseMap()
+    xyz = np.random.default_rng(0).normal(size=(3000, 3))
+    add(sparse_map, keyframe(0, [NO_POINT] * 3000), np.arange(3000), xyz)
+    np.testing.assert_array_equal(sparse_map.xyz_world, xyz)

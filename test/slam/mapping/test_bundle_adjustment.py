@@ -1,0 +1,158 @@
+"""Bundle adjustment on synthetic problems with known answers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import se3_exp, transform_points
+from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.mapping import normal_equations
+from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, adjust
+from segfloor_ros.slam.mapping.normal_equations import inverse_cholesky
+from segfloor_ros.slam.sensors.body_motion import RelativeMotion
+from segfloor_ros.slam.sensors.motion_links import Link
+
+CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
+
+
+def make_problem(num_keyframes=5, num_points=150, num_free=3, sigma=0.0, seed=0):
+    """Return a problem at the truth: cameras along a line, all points seen by all, the last
+    ones fixed.
+    """
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(2.0, 8.0, num_points)
+    points = np.stack(
+        [rng.uniform(-0.7, 0.7, num_points) * z, rng.uniform(-0.5, 0.5, num_points) * z, z], 1
+    )
+    poses = np.stack(
+        [
+            se3_exp(np.array([-0.1 * k, 0.01 * k, -0.15 * k, 0, 0.02 * k, 0]))
+            for k in range(num_keyframes)
+        ]
+    )
+    keyframe, point = (
+        grid.ravel()
+        for grid in np.meshgrid(np.arange(num_keyframes), np.arange(num_points), indexing='ij')
+    )
+    uvr = np.concatenate([CAMERA.project(transform_points(pose, points)) for pose in poses])
+    uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
+    uvd += rng.normal(size=uvd.shape) * sigma
+    seen = Observations(uvd, np.full(uvd.shape, max(sigma, 0.1)))
+    return BundleProblem(poses, num_free, points, keyframe, point, seen)
+
+
+def disturbed(problem, seed=1):
+    rng = np.random.default_rng(seed)
+    poses = problem.T_camera_world.copy()
+    free = problem.num_free
+    poses[:free] = (
+        se3_exp(rng.normal(size=(free, 6)) * [0.03, 0.03, 0.03, 0.01, 0.01, 0.01]) @ poses[:free]
+    )
+    points = problem.points_world + rng.normal(size=problem.points_world.shape) * 0.05
+    return BundleProblem(poses, free, points, problem.keyframe, problem.point, problem.observations)
+
+
+def test_returns_to_the_truth_from_a_disturbed_start():
+    truth = make_problem()
+    result = adjust(CAMERA, disturbed(truth), iterations=15)
+    np.testing.assert_allclose(result.T_camera_world, truth.T_camera_world, atol=1e-4)
+    np.testing.assert_allclose(result.points_world, truth.points_world, atol=2e-3)
+    assert result.cost_after < 1e-3 * result.cost_before
+    assert result.inliers.all()
+
+
+def test_fixed_keyframes_do_not_move():
+    truth = make_problem(sigma=0.3)
+    result = adjust(CAMERA, disturbed(truth), iterations=5)
+    np.testing.assert_array_equal(result.T_camera_world[3:], truth.T_camera_world[3:])
+
+
+def test_noise_is_averaged_and_outliers_are_named():
+    truth = make_problem(sigma=0.3)
+    spoiled = truth.observations.uvd_px.copy()
+    bad = np.arange(0, len(spoiled), 37)
+    spoiled[bad, 0] += 25.0
+    problem = BundleProblem(
+        truth.T_camera_world,
+        truth.num_free,
+        truth.points_world,
+        truth.keyframe,
+        truth.point,
+        Observations(spoiled, truth.observations.sigma_px),
+    )
+    result = adjust(CAMERA, disturbed(problem), iterations=20)
+    assert not result.inliers[bad].any()
+    good = np.setdiff1d(np.arange(len(spoiled)), bad)
+    assert result.inliers[good].mean() > 0.9
+    errors = np.linalg.norm(
+        result.T_camera_world[:3, :3, 3] - truth.T_camera_world[:3, :3, 3], axis=1
+    )
+    assert errors.max() < 0.01
+
+
+def test_a_step_equals_the_solution_of_the_full_normal_equations():
+    # The Schur complement is an exact elimination: compare with a dense solve by numeric Jacobians.
+    problem = disturbed(make_problem(num_keyframes=2, num_points=6, num_free=1))
+    damping = 1e-4
+
+    def residual(parameters):
+        pose = se3_exp(parameters[:6]) @ problem.T_camera_world[0]
+        points = problem.points_world + parameters[6:].reshape(-1, 3)
+        predicted = []
+        for T in (pose, problem.T_camera_world[1]):
+            uvr = CAMERA.project(transform_points(T, points))
+            predicted.append(np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1))
+        errors = np.concatenate(predicted) - problem.observations.uvd_px
+        return errors.ravel() / 0.1
+
+    size = 6 + 18
+    J = np.stack(
+        [(residual(step) - residual(-step)) / 2e-6 for step in 1e-6 * np.eye(size)], axis=1
+    )
+    r = residual(np.zeros(size))
+    chi2 = (r.reshape(-1, 3) ** 2).sum(axis=1)
+    weight = np.repeat(np.sqrt(np.minimum(1, 7.815 / chi2)), 3)
+    H = J.T @ (J * weight[:, None])
+    step = np.linalg.solve(H + damping * np.diag(np.diag(H)), -J.T @ (weight * r))
+    result = adjust(CAMERA, problem, iterations=1)
+    if result.cost_after < result.cost_before:
+        np.testing.assert_allclose(
+            result.points_world - problem.points_world,
+            step[6:].reshape(-1, 3),
+            rtol=1e-3,
+            atol=1e-6,
+        )
+        np.testing.assert_allclose(
+            result.T_camera_world[0], se3_exp(step[:6]) @ problem.T_camera_world[0], atol=1e-6
+        )
+    else:
+        raise AssertionError('the first step must lower the cost')
+
+
+def test_the_sparse_solution_is_the_dense_one(monkeypatch):
+    problem = disturbed(make_problem(num_keyframes=8, num_free=6, sigma=0.2))
+    motion = RelativeMotion(np.eye(4), 1e-3 * np.eye(6))
+    tied = replace(problem, factors=(Link(1, 2, motion), Link(4, 3, motion), Link(5, 6, motion)))
+    for given in (problem, tied):
+        dense = adjust(CAMERA, given, iterations=3)
+        monkeypatch.setattr(normal_equations, 'DENSE_KEYFRAMES', 0)
+        found = adjust(CAMERA, given, iterations=3)
+        monkeypatch.undo()
+        np.testing.assert_allclose(found.T_camera_world, dense.T_camera_world, atol=1e-9)
+        np.testing.assert_allclose(found.points_world, dense.points_world, atol=1e-8)
+        assert found.cost_after < 0.5 * found.cost_before
+        assert found.offset.value_px == pytest.approx(dense.offset.value_px, abs=1e-9)
+        assert found.offset.information == pytest.approx(dense.offset.information, rel=1e-6)
+
+
+def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_known():
+    A = np.random.default_rng(4).normal(size=(50, 3, 3))
+    A = np.swapaxes(A, 1, 2) @ A + 1e-3 * np.eye(3)
+    A[0] = np.diag([1e4, 1e4, 1e-6])
+    L_inverse = np.moveaxis(inverse_cholesky(np.moveaxis(A, 0, -1)), -1, 0)
+    assert not np.triu(L_inverse, 1).any()
+    np.testing.assert_allclose(
+        np.swapaxes(L_inverse, 1, 2) @ L_inverse @ A, [np.eye(3)] * 50, atol=1e-9
+    )

@@ -1,0 +1,90 @@
+"""The whole map, adjusted after it was bent, and brought back into one that has grown since."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from segfloor_ros.geometry import invert, se3_exp
+from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.map_arrays import fill_map
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.disparity_offset import NO_OFFSET
+from segfloor_ros.slam.mapping.global_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.slam.places.loop_closing import move_keyframes
+from tools.map_costs import CAMERA, bend, made_up_map, ring
+
+COUNT = 80
+
+
+@pytest.fixture
+def bent():
+    sparse_map = SparseMap()
+    fill_map(sparse_map, made_up_map(COUNT, np.random.default_rng(2)))
+    bend(sparse_map)
+    return sparse_map
+
+
+def errors_m(sparse_map):
+    poses = np.stack([k.T_camera_world for k in sparse_map.keyframes[:COUNT]])
+    return np.linalg.norm(invert(poses)[:, :3, 3] - invert(ring(COUNT))[:, :3, 3], axis=1)
+
+
+def adjust(sparse_map, meanwhile=lambda: None):
+    copied = copy_map(sparse_map, NO_OFFSET, None, None)
+    result = solve_global(CAMERA, copied, lambda: True)
+    meanwhile()
+    apply_global(sparse_map, result)
+
+
+def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
+    first = bent.keyframes[0].T_camera_world.copy()
+    before = errors_m(bent).max()
+    adjust(bent)
+    assert before > 0.1
+    assert errors_m(bent).max() < 0.05 * before
+    np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
+
+
+def test_what_was_mapped_meanwhile_moves_along(bent):
+    last = bent.keyframes[-1]
+    ahead = se3_exp(np.array([0.0, 0.0, -0.2, 0.0, 0.0, 0.0]))
+
+    def map_on():
+        none = np.zeros(0, np.intp)
+        bent.keyframes.append(
+            KeyframeRecord(
+                COUNT,
+                COUNT,
+                last.stamp_ns + 1,
+                ahead @ last.T_camera_world,
+                last.features.take(none),
+                last.observations.take(none),
+                np.zeros(0, np.int32),
+            )
+        )
+
+    adjust(bent, map_on)
+    new = bent.keyframes[COUNT]
+    np.testing.assert_allclose(new.T_camera_world @ last.T_world_camera, ahead, atol=1e-9)
+
+
+def test_what_moved_meanwhile_keeps_its_move(bent):
+    poses = np.stack([k.T_camera_world for k in bent.keyframes])
+    step = se3_exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def local_adjustment():
+        moved = poses.copy()
+        moved[40] = step @ poses[40]
+        move_keyframes(bent, moved)
+
+    adjust(bent, local_adjustment)
+    error = bent.keyframes[40].T_camera_world @ invert(ring(COUNT)[40])
+    np.testing.assert_allclose(error[:3, 3], step[:3, 3], atol=0.006)
+
+
+def test_an_adjustment_that_is_no_longer_wanted_changes_nothing(bent):
+    before = np.stack([k.T_camera_world for k in bent.keyframes])
+    copied = copy_map(bent, NO_OFFSET, None, None)
+    apply_global(bent, solve_global(CAMERA, copied, lambda: False))
+    np.testing.assert_array_equal(before, np.stack([k.T_camera_world for k in bent.keyframes]))

@@ -1,0 +1,74 @@
+"""Conditions A1, A2, A3 and B, one at a time."""
+
+import numpy as np
+import pytest
+
+from segfloor_ros.geometry import make_transform, se3_exp
+from segfloor_ros.slam.mapping.keyframe_policy import View, is_keyframe, novelty
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.tracking.images import FrozenCheck, image_fault
+
+SETTINGS = StereoSlamSettings(
+    keyframe_max_frames=30,
+    keyframe_min_frames=3,
+    keyframe_motion_ratio=0.05,
+    keyframe_turn_rad=0.1,
+)
+STILL = np.eye(4)
+MOVED = make_transform(np.eye(3), np.array([0.0, 0.0, 0.2]))
+TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
+
+
+@pytest.mark.parametrize(
+    ('motion', 'depth_m', 'expected'),
+    [(STILL, 2.0, 0.0), (MOVED, 2.0, 2.0), (MOVED, 8.0, 0.5), (TURNED, 2.0, 1.5)],
+)
+def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
+    assert novelty(motion, depth_m, SETTINGS) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ('view', 'expected'),
+    [
+        (View(10, 200, 300, 0.0), False),  # nothing new
+        (View(10, 200, 300, 1.1), True),  # A2
+        (View(10, 200, 300, 0.9), False),
+        (View(2, 200, 300, 1.5), False),  # too soon
+        (View(1, 200, 300, 4.0), True),  # so new that it waits for no frames
+        (View(1, 200, 300, 1.5, found_share=0.4), True),  # the next frame finds fewer still
+        (View(1, 200, 300, 0.9, found_share=0.4), False),  # as many are found from a known view
+        (View(1, 200, 300, 1.5, mapper_idle=False, found_share=0.4), False),
+        (View(10, 200, 300, 1.5, mapper_idle=False), False),  # mapper busy
+        (View(30, 200, 300, 1.5, mapper_idle=False), True),  # A1: too many frames
+        (View(500, 200, 300, 0.0), False),  # standing still adds nothing
+        (View(1, 74, 300, 0.0), True),  # A3: 74 < 0.25 · 300
+        (View(1, 76, 300, 0.0), False),
+        (View(1, 15, 300, 1.5), False),  # B: not more than 15 tracked
+    ],
+)
+def test_conditions(view, expected):
+    assert is_keyframe(view, SETTINGS) is expected
+
+
+def textured():
+    return np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8)
+
+
+def test_image_faults_are_named():
+    good = textured()
+    assert image_fault(good, good) == ''
+    assert 'left image without contrast' in image_fault(np.zeros_like(good), good)
+    assert 'right image without contrast' in image_fault(good, np.full_like(good, 255))
+    half = good.copy()
+    half[24:] = 128
+    assert 'left image incomplete' in image_fault(half, good)
+
+
+def test_an_image_is_frozen_when_it_repeats_although_the_camera_was_moving():
+    one, two = np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
+    check = FrozenCheck()
+    assert not check.frozen(one, lambda: 0.05)  # nothing came before
+    assert check.frozen(one.copy(), lambda: 0.05)
+    assert check.frozen(one.copy(), lambda: 0.0)  # still the same one
+    assert not check.frozen(two, lambda: 0.05)
+    assert not check.frozen(two.copy(), lambda: 0.0005)  # it stands still

@@ -1,0 +1,103 @@
+"""What mapping refuses: features at another depth than their point, and adjustments gone astray."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_sparse_map import add, keyframe
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.geometry import make_transform
+from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
+
+CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
+"""f b = 30 px m: at 2 m a disparity of 15 px."""
+
+RNG = np.random.default_rng(3)
+SCENES = {
+    # A wall at 2 m, and a point that seems to lie in front of it, at 1.2 m.
+    'wall': (
+        np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.6, -0.1, 0.5, 0.9)]),
+        25.0,
+    ),
+    # The floor 0.4 m below the camera, and a point that seems to lie behind it, at 6 m.
+    'floor': (
+        np.stack([RNG.uniform(-1, 1, 16), np.full(16, 0.4), np.linspace(1.0, 3.4, 16)], axis=1),
+        5.0,
+    ),
+}
+
+
+@pytest.fixture(params=SCENES)
+def scene(request):
+    """Points (16, 3) in front of keyframe 0, and a disparity that contradicts that of point 3."""
+    return SCENES[request.param]
+
+
+def seen(points, index, point_id, x=0.0):
+    """A keyframe at x that sees points where they are."""
+    record = keyframe(index, point_id, x)
+    uvr = CAMERA.project(points - [x, 0.0, 0.0])
+    uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
+    return replace(record, observations=Observations(uvd, np.full((len(points), 3), 0.5)))
+
+
+def mapped(points):
+    """A map of points, made by keyframe 0, and a mapper without any offset."""
+    sparse_map = SparseMap()
+    rows = np.arange(len(points))
+    add(sparse_map, seen(points, 0, [NO_POINT] * len(points)), rows, points)
+    return sparse_map, LocalMapper(CAMERA, StereoSlamSettings())
+
+
+def patches(points):
+    return np.zeros((len(points), SIDE_PX, SIDE_PX), np.uint8)
+
+
+def test_a_feature_whose_disparity_contradicts_its_point_gets_one_of_its_own(scene):
+    points, contradicting_px = scene
+    sparse_map, mapper = mapped(points)
+    second = seen(points, 1, np.arange(len(points)), x=0.1)
+    second.observations.uvd_px[[3, 5], 2] = contradicting_px, np.nan
+    mapper.insert(sparse_map, second, patches(points))
+    kept = np.arange(len(points)) != 3
+    np.testing.assert_array_equal(second.point_id[kept], np.flatnonzero(kept))
+    assert second.point_id[3] == len(points)
+    np.testing.assert_allclose(sparse_map.xyz_world[len(points), 2], 30.0 / contradicting_px)
+
+
+def test_an_adjustment_that_loses_what_the_newest_keyframe_saw_changes_nothing(scene):
+    points, _ = scene
+    sparse_map, mapper = mapped(points)
+    second = seen(points, 1, np.arange(len(points)), x=0.1)
+    mapper.insert(sparse_map, second, patches(points))
+    before, mapped_before = second.T_camera_world.copy(), sparse_map.xyz_world.copy()
+    adjustment = mapper.plan_adjustment(sparse_map, second)
+    result = mapper.solve(adjustment)
+    turned = make_transform(np.eye(3), np.array([0.5, 0.0, 0.0])) @ result.T_camera_world
+    newest = adjustment.edge_keyframe == 1
+    astray = replace(result, T_camera_world=turned, inliers=~newest)
+    mapper.apply(sparse_map, adjustment, astray)
+    np.testing.assert_array_equal(second.T_camera_world, before)
+    np.testing.assert_array_equal(sparse_map.xyz_world, mapped_before)
+    mapper.apply(sparse_map, adjustment, replace(astray, inliers=np.ones_like(newest)))
+    assert not np.array_equal(second.T_camera_world, before)
+
+
+def test_an_adjustment_retires_views_of_what_others_have_seen_as_well(scene):
+    points, _ = scene
+    sparse_map, mapper = mapped(points)
+    for index in range(1, 9):
+        view = seen(points, index, np.arange(len(points)), x=0.01 * index)
+        mapper.insert(sparse_map, view, patches(points))
+    adjustment = mapper.plan_adjustment(sparse_map, view)
+    mapper.apply(sparse_map, adjustment, mapper.solve(adjustment))
+    retired = [k.index for k in sparse_map.keyframes if k.retired]
+    # Neither the first nor the latest three; three others must go on seeing each point.
+    assert retired == [1, 2, 3, 4, 5]
+    assert sparse_map.alive.all()

@@ -1,0 +1,110 @@
+"""The comparison of a stereo pair with earlier views."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA
+
+from segfloor_ros.slam.moving.moving_regions import MovingRegions
+from segfloor_ros.slam.moving.scene_flow import FlowVotes
+
+FACTOR = 2
+"""The images are twice as wide as those that are searched."""
+
+WALL_PX, NEARER_PX = 4.0, 12.0
+
+
+def pair(texture, disparity_px):
+    """A wall that fills both images at a disparity of the shrunk image."""
+    shift = round(FACTOR * disparity_px)
+    left = texture[:, 100 : 100 + CAMERA.width]
+    return left, texture[:, 100 + shift : 100 + shift + CAMERA.width]
+
+
+def noise(width):
+    grey = np.random.default_rng(2).normal(128, 40, (CAMERA.height // FACTOR, width // FACTOR))
+    big = grey.repeat(FACTOR, axis=0).repeat(FACTOR, axis=1)
+    return np.clip(big, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def regions():
+    """Five earlier views of a wall from here."""
+    made = MovingRegions(CAMERA)
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    for _ in range(5):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), wall)
+    return made
+
+
+def found_share(regions, texture, disparity_px):
+    regions.measure(*pair(texture, disparity_px))
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:100] = NEARER_PX
+    found = regions.find(seen, np.eye(4), None)
+    return (found[20:100, 60:100] > 0).mean(), (found[:, 110:] > 0).mean()
+
+
+def test_what_stands_in_front_of_what_was_seen_moves(regions):
+    inside, outside = found_share(regions, noise(600), NEARER_PX)
+    assert inside > 0.95 and outside == 0
+
+
+def test_what_a_single_view_saw_through_does_not_move():
+    made = MovingRegions(CAMERA)
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    for disparity in (wall, np.zeros_like(wall)):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), disparity)
+    assert found_share(made, noise(600), NEARER_PX) == (0.0, 0.0)
+
+
+def test_a_pattern_that_repeats_does_not_move(regions):
+    tile = noise(round(FACTOR * (NEARER_PX - WALL_PX)))
+    inside, _ = found_share(regions, np.tile(tile, 40)[:, :600], NEARER_PX)
+    assert inside == 0
+
+
+def test_a_thing_of_which_most_corners_moved_moves_as_a_whole_where_it_stood_before():
+    made = MovingRegions(CAMERA)
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:100] = NEARER_PX
+    for _ in range(5):
+        made.remember(SimpleNamespace(T_camera_world=np.eye(4)), seen)
+    made.measure(*pair(noise(600), NEARER_PX))
+    moving, still = np.zeros(seen.shape, np.uint8), np.zeros(seen.shape, np.uint8)
+    moving[50:60, 75:85] = still[50:60, 120:130] = 1
+    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
+    assert (found[30:90, 64:96] > 0).mean() > 0.95
+    assert not found[:, 110:].any()
+    still[25:45, 62:98] = 1
+    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
+    assert (found[30:90, 64:96] > 0).mean() < 0.2
+
+
+def test_a_strip_no_wider_than_a_block_does_not_move(regions):
+    regions.measure(*pair(noise(600), NEARER_PX))
+    seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    seen[20:100, 60:64] = NEARER_PX
+    assert not regions.find(seen, np.eye(4), None).any()
+
+
+def test_points_are_seen_through_where_the_image_shows_what_is_behind_them(regions):
+    wall = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
+    depth_m = CAMERA.disparity_times_depth / FACTOR / np.array([WALL_PX, NEARER_PX, 2.0])
+    points = np.stack([np.zeros(3), np.zeros(3), depth_m], axis=1)
+    np.testing.assert_array_equal(regions.seen_through(wall, points), [False, True, False])
+
+
+def test_the_feet_below_shins_that_move_are_left_out_too(regions):
+    disparity = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), NEARER_PX, np.float32)
+    moving, low = np.zeros(disparity.shape, np.uint8), np.zeros(disparity.shape, bool)
+    moving[40:60, 70:80] = 255
+    np.testing.assert_array_equal(regions._with_feet(moving, disparity, low), moving)
+    low[50:] = True
+    found = regions._with_feet(moving, disparity, low)
+    foot_px = 0.2 * CAMERA.fx / CAMERA.disparity_times_depth * NEARER_PX
+    below = np.flatnonzero(found[:, 75])
+    assert below.min() == 40
+    assert 0.75 * foot_px < below.max() - 59 <= foot_px
+    assert not found[45, :69].any()

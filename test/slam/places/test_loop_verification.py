@@ -1,0 +1,90 @@
+"""What a loop must stand before it is believed, on maps made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_mapping import CAMERA, SCENES, seen
+from test_places import row_of_views
+from test_sparse_map import add, keyframe
+
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.geometry import make_transform, se3_exp
+from segfloor_ros.slam.map.keyframe_record import Match
+from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain
+from segfloor_ros.slam.results import NO_POINT
+
+MOUNT = Mount(0.4, 0.15)
+POINTS, _ = SCENES['wall']
+ROWS = np.arange(len(POINTS))
+NONE = np.zeros(0, np.int32)
+
+
+def objection(centre, drift, own=ROWS, apart=0.0):
+    """Return what speaks against a camera at `centre`, that the map has at centre + drift, seeing
+    keyframe 0's points again. own: which of its own points each feature shows; apart: how much
+    further away than these the place's points are.
+    """
+    sparse_map = SparseMap()
+    add(sparse_map, seen(POINTS, 0, [NO_POINT] * len(POINTS)), ROWS, POINTS)
+    centre, drift = np.array(centre), np.array(drift)
+    now = keyframe(1, [NO_POINT] * len(POINTS))
+    uvd = CAMERA.project(POINTS - centre)
+    uvd[:, 2] = 15.0
+    now = replace(now, observations=Observations(uvd, np.full(uvd.shape, 0.5)))
+    now.T_camera_world = make_transform(np.eye(3), -(centre + drift))
+    add(sparse_map, now, ROWS, POINTS[own] + drift)
+    pose = make_transform(np.eye(3), -centre)
+    match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
+    sparse_map.xyz_world[ROWS] *= 1.0 - apart
+    checks = LoopChecks(CAMERA, sparse_map)
+    return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match, MOUNT)
+
+
+def test_a_place_seen_again_after_a_drift_is_sound():
+    assert objection((0.1, 0.0, 0.0), (0.2, 0.0, 0.1)) == ''
+
+
+def test_what_is_no_drift_is_no_loop():
+    assert objection((0.1, 0.0, 0.0), (0.01, 0.0, 0.0)) == 'no drift'
+
+
+def test_more_drift_than_the_way_can_have_is_another_place():
+    assert objection((0.1, 0.0, 0.0), (0.6, 0.0, 0.1)) == 'more than drift'
+
+
+def test_a_camera_that_hangs_above_the_place_is_not_there():
+    # Optical axes: y points down.
+    assert objection((0.1, -0.25, 0.0), (0.0, 0.25, 0.0)) == 'another floor'
+
+
+def test_own_points_must_lie_where_the_place_shows_what_they_match():
+    found = objection((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), np.roll(ROWS, 5))
+    assert found == 'not seen from the other side'
+
+
+def test_free_space_does_not_run_through_what_stands_there():
+    # Every pixel fits, but the place's points stand half way to what the keyframe sees.
+    found = objection((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), apart=0.5)
+    assert found == 'free space through obstacles'
+
+
+@pytest.mark.parametrize(
+    ('views', 'drifts_m', 'expected'),
+    [
+        ([21, 23, 25], [0.2, 0.2, 0.2], True),
+        ([21, 25], [0.2, 0.2], False),  # two keyframes alone
+        ([21, 23, 25], [0.5, 0.2, 0.2], False),  # they tell different drifts
+        ([24, 24, 25], [0.2, 0.2, 0.2], False),  # the camera has hardly moved
+    ],
+)
+def test_three_keyframes_on_the_move_must_tell_the_same_drift(views, drifts_m, expected):
+    sparse_map = row_of_views(26, list(range(10)), 0.1)
+    matches = []
+    for index, drift_m in zip(views, drifts_m, strict=True):
+        drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        pose = sparse_map.keyframes[index].T_camera_world @ drift
+        matches.append(Match(index, 0, pose, NONE, NONE, NONE))
+    assert are_certain(sparse_map, matches) is expected

@@ -1,0 +1,92 @@
+"""Loops: found, verified and closed in a room whose map was bent on purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.geometry import invert, make_transform, se3_exp
+from segfloor_ros.slam.map.keyframe_record import Match
+from segfloor_ros.slam.places.loop_closing import move_keyframes
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+SETTINGS = StereoSlamSettings(num_features=600)
+TURN = 52
+BENT_AT = 44
+
+
+def on_the_spot(count):
+    """A turn of a bit more than a circle, 8 degrees a frame, along a small circle."""
+    angles = np.radians(8.0) * np.arange(count)
+    return [planar_pose(0.3 * np.sin(a), 0.3 * (1 - np.cos(a)), a) for a in angles]
+
+
+def bend(slam, drift):
+    """Let the path have drifted: from the tenth keyframe on each a bit more, the latest by all of
+    `drift` (6,).
+    """
+    keyframes = slam.map.keyframes
+    before = keyframes[-1].T_camera_world
+    share = np.clip((np.arange(len(keyframes)) - 10) / (len(keyframes) - 11), 0, 1)
+    poses = np.stack([k.T_camera_world for k in keyframes])
+    move_keyframes(slam.map, poses @ se3_exp(share[:, None] * drift))
+    slam._front_end.motion.move_map(before, keyframes[-1].T_camera_world)
+
+
+def drive(drift):
+    """Returns the SLAM and the error in metres of each frame after a turn with a drift."""
+    room, slam, errors = StereoRoom(), StereoSlam(CAMERA, SETTINGS, MOUNT), []
+    poses = on_the_spot(TURN + 14)
+    for k, pose in enumerate(poses):
+        if k == BENT_AT:
+            bend(slam, drift)
+        result = slam.process(room.frame(k, pose))[0]
+        assert result.tracked
+        error = invert(pose) @ result.T_map_odom @ result.T_odom_base
+        errors.append(np.linalg.norm(error[:3, 3]))
+    return slam, errors
+
+
+@pytest.fixture(scope='module')
+def closed():
+    return drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
+
+
+def test_a_drift_is_found_and_taken_away(closed):
+    slam, errors = closed
+    assert max(errors[BENT_AT : BENT_AT + 3]) > 0.1
+    assert slam.loop_count >= 1
+    assert errors[-1] < 0.03
+
+
+def test_both_ends_become_one_map(closed):
+    slam, _ = closed
+    last = slam.map.keyframes[-1]
+    order, shared = slam.map.covisible(last.point_id[last.point_id >= 0])
+    assert shared[order < 8].max(initial=0) > 50
+
+
+def test_more_drift_than_a_path_can_have_is_no_loop():
+    slam, _ = drive(np.array([0.8, 0.0, 0.6, 0.0, 0.0, 0.0]))
+    assert slam.loop_count == 0
+
+
+@pytest.mark.parametrize(
+    ('up_m', 'tilt_rad', 'expected'),
+    [(0.0, 0.0, True), (0.3, 0.0, False), (0.0, 0.35, False), (0.05, 0.1, True)],
+)
+def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, expected):
+    slam, _ = closed
+    place = slam.map.keyframes[0]
+    T_base_now = make_transform(
+        Rotation.from_euler('y', tilt_rad).as_matrix(), np.array([0.1, 0.0, up_m])
+    )
+    T_base_left = MOUNT.T_base_left
+    T_place_now = invert(T_base_left) @ T_base_now @ T_base_left
+    none = np.zeros(0, np.int32)
+    pose = invert(T_place_now) @ place.T_camera_world
+    match = Match(1, 0, pose, none, none, none)
+    assert slam._back_end.loops._checks.is_level(match, MOUNT) is expected

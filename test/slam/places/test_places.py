@@ -1,0 +1,120 @@
+"""Places that are seen again: what covers a view by hand-made cameras, and laps of a room."""
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+from test_sparse_map import add, keyframe
+
+from segfloor_ros.geometry import se3_exp
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.known_views import (
+    LOOK_AGAIN,
+    RECENT,
+    covered_share,
+    view_novelty,
+    views_near,
+)
+from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+HERE = np.eye(4)
+WALL = np.stack([np.linspace(-0.5, 0.5, 10), np.zeros(10), np.full(10, 2.0)], axis=1)
+"""Ten points at z = 2."""
+
+RNG = np.random.default_rng(6)
+FLOOR = np.stack([RNG.uniform(-1, 1, 10), np.full(10, 0.5), RNG.uniform(4, 6, 10)], axis=1)
+"""Ten points of a floor, some 5 m away."""
+
+SCENES = [(2.0, WALL), (5.0, FLOOR)]
+SETTINGS = StereoSlamSettings(keyframe_motion_ratio=0.05)
+
+
+def turned(angle_rad):
+    return se3_exp(np.array([0.0, 0.0, 0.0, 0.0, angle_rad, 0.0]))
+
+
+def test_a_view_covers_itself_and_half_of_one_turned_by_half_the_field_of_view():
+    assert covered_share(CAMERA, [HERE], HERE, 2.0) == 1.0
+    half_fov = np.arctan(CAMERA.width / 2 / CAMERA.fx)
+    assert covered_share(CAMERA, [turned(half_fov)], HERE, 2.0) == pytest.approx(0.5, abs=0.1)
+    assert covered_share(CAMERA, [turned(np.pi)], HERE, 2.0) == 0.0
+    both = [turned(half_fov), turned(-half_fov)]
+    assert covered_share(CAMERA, both, HERE, 2.0) > 0.85  # corners lean out of turned images
+
+
+def row_of_views(count, ids, spacing_m, xyz=WALL):
+    """A map whose keyframes stand side by side and see the points `ids` of ten."""
+    sparse_map = SparseMap()
+    add(sparse_map, keyframe(0, [NO_POINT] * 10), np.arange(10), xyz)
+    for index in range(1, count):
+        add(sparse_map, keyframe(index, ids, x=spacing_m * index))
+    return sparse_map
+
+
+def camera_at(x):
+    return se3_exp(np.array([-x, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def test_near_views_come_nearest_first_and_not_beyond_reach():
+    sparse_map = row_of_views(8, list(range(10)), 0.3)
+    np.testing.assert_array_equal(views_near(sparse_map, camera_at(0.62), 2.0, 3), [2, 3, 1])
+    # Half the depth of 2 m is 1 m: the keyframes at 1.8 and 2.1 m are out of reach.
+    near = views_near(sparse_map, camera_at(0.62), 2.0, 99)
+    np.testing.assert_array_equal(np.sort(near), [0, 1, 2, 3, 4, 5])
+    assert len(views_near(sparse_map, turned(2.0), 2.0, 99)) == 0
+
+
+@pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
+def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
+    ids = np.arange(10, dtype=np.int32)
+    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.01 * depth_m, xyz)
+    # 0.15 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
+    beside = camera_at(-0.075 * depth_m)
+    new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, beside, depth_m)
+    assert new == pytest.approx(0.5)
+    # Points that the earlier views did not see, or a view that looks past them, are new.
+    unknown = sparse_map_without(sparse_map, range(5))
+    assert view_novelty(CAMERA, SETTINGS, unknown, ids, beside, depth_m) > 1.5
+    aside = turned(0.17) @ camera_at(-0.01 * depth_m)
+    assert view_novelty(CAMERA, SETTINGS, sparse_map, ids, aside, depth_m) > 1.5
+
+
+@pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
+def test_a_known_place_is_looked_at_again_now_and_then(depth_m, xyz):
+    ids = np.arange(10, dtype=np.int32)
+    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.1 * depth_m, xyz)
+    # The nearest of the latest keyframes stands at half the depth, ten times what makes a view new.
+    new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, camera_at(0.0), depth_m)
+    assert new == pytest.approx(10 / LOOK_AGAIN)
+
+
+def sparse_map_without(sparse_map, views):
+    for index in views:
+        view = sparse_map.keyframes[index]
+        sparse_map.unlink(view, np.flatnonzero(view.point_id != NO_POINT))
+    return sparse_map
+
+
+def test_laps_of_a_room_add_no_points_after_the_second():
+    room = StereoRoom()
+    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=500), MOUNT)
+    rng = np.random.default_rng(2)
+    per_lap, size, error_m = 20, [], []
+    for k in range(3 * per_lap):
+        angle = 2 * np.pi * k / per_lap
+        # Never quite the same way: some centimetres beside it.
+        x, y = 0.4 * np.sin(angle) + rng.normal(scale=0.01), 0.1 * np.cos(angle)
+        truth = planar_pose(x, y, 0.15 * np.sin(angle))
+        if k == 0:
+            start = truth
+        result = slam.process(room.frame(k, truth))[0]
+        assert result.tracked
+        T_map_base = result.T_map_odom @ result.T_odom_base
+        error_m.append(np.linalg.norm((np.linalg.inv(start) @ truth - T_map_base)[:3, 3]))
+        if k % per_lap == per_lap - 1:
+            size.append((len(slam.map.keyframes), int(slam.map.alive.sum())))
+    keyframes, points = np.array(size).T
+    assert keyframes[2] <= keyframes[1] + 1
+    assert points[2] <= 1.03 * points[1]
+    assert max(error_m[-per_lap:]) < 1.5 * max(error_m[:per_lap]) + 0.002

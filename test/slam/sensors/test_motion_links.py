@@ -1,0 +1,74 @@
+"""Measured motions between keyframes in a bundle adjustment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from segfloor_ros.geometry import invert, se3_exp, se3_log
+from segfloor_ros.slam.mapping.normal_equations import System
+from segfloor_ros.slam.sensors.body_motion import RelativeMotion
+from segfloor_ros.slam.sensors.motion_links import CHI2_95, Link, chi2, cost, with_factors
+
+RNG = np.random.default_rng(4)
+POSES = np.stack([se3_exp(RNG.normal(size=6) * 0.4) for _ in range(3)])
+COVARIANCE = np.diag([4e-4, 9e-4, 4e-4, 1e-4, 1e-4, 4e-4])
+
+
+def link(before, now, error):
+    """A link that its poses miss by a twist."""
+    moved = POSES[now] @ invert(POSES[before])
+    return Link(before, now, RelativeMotion(se3_exp(-np.array(error)) @ moved, COVARIANCE))
+
+
+def empty_system(count):
+    none = np.zeros
+    return System(
+        none((count, 6, 6)), none((3, 3, 0)), none((6, 3, 0)), none(count + 1, np.intp),
+        none(0, np.intp), none((count, 6)), none((3, 0)), none((count, 6)), none((3, 0)), 1.0, 0.0,
+    )  # fmt: skip
+
+
+def test_the_error_is_the_twist_by_which_the_poses_miss():
+    error = np.array([0.01, -0.02, 0.03, 0.002, 0.001, -0.003])
+    np.testing.assert_allclose(link(0, 1, error).error(POSES), error, atol=1e-9)
+
+
+def test_poses_that_move_as_measured_cost_nothing_and_slip_costs_less_than_its_square():
+    assert cost(link(0, 1, np.zeros(6)), POSES) == pytest.approx(0.0, abs=1e-9)
+    small, large = (link(0, 1, [x, 0, 0, 0, 0, 0]) for x in (0.01, 1.0))
+    assert cost(small, POSES) == pytest.approx(0.01**2 / (4e-4 + 1e-6), rel=1e-3)
+    assert cost(large, POSES) < 0.2 * chi2(large, POSES)
+
+
+def test_the_right_hand_side_is_the_slope_of_the_cost():
+    links = (link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0]))
+    system = with_factors(empty_system(2), POSES, links)
+    for k in range(2):
+        for axis in range(6):
+            twist = np.zeros(6)
+            twist[axis] = 1e-5
+            costs = []
+            for sign in (1, -1):
+                moved = POSES.copy()
+                moved[k] = se3_exp(sign * twist) @ moved[k]
+                costs.append(sum(cost(item, moved) for item in links))
+            slope = (costs[0] - costs[1]) / 2e-5
+            # The cost is a sum of squares: its slope is twice the gradient's half.
+            assert -2 * system.camera_rhs[k, axis] == pytest.approx(slope, rel=0.02, abs=0.3)
+
+
+def test_a_step_brings_free_poses_where_they_were_measured():
+    links = (link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0]))
+    step = with_factors(empty_system(2), POSES, links).solve(0.0)
+    moved = POSES.copy()
+    moved[:2] = se3_exp(step.twists) @ moved[:2]
+    assert all(chi2(item, moved) < 1e-3 * CHI2_95 for item in links)
+    # The third pose was held; both others moved.
+    for k in range(2):
+        assert np.linalg.norm(se3_log(moved[k] @ invert(POSES[k]))) > 1e-3
+
+
+def test_without_links_the_system_stays_as_it_is():
+    system = empty_system(2)
+    assert with_factors(system, POSES, ()) is system

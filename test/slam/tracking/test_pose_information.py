@@ -1,0 +1,144 @@
+"""How well points tell the pose, in images drawn for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.measurements import WheelPose
+from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.slam.tracking.pose import PoseEstimate
+from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer
+
+RNG = np.random.default_rng(3)
+V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
+MIDDLE = np.array([CAMERA.cx, CAMERA.cy])
+
+
+def noisy(image):
+    return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+
+def information(image, uv_px, depth_m=2.0):
+    """Return what points in one plane tell, seen where they are from the origin."""
+    points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
+    disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
+    sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
+    return PoseInformation(CAMERA, image, points, sure)
+
+
+def sigmas_m(image, uv_px):
+    """Return the standard deviations of the place along x, y and z."""
+    return np.sqrt(np.diag(information(image, uv_px).covariance(np.eye(4))))[:3]
+
+
+def anywhere(count):
+    return RNG.uniform(12, [CAMERA.width - 12, CAMERA.height - 12], (count, 2))
+
+
+@pytest.mark.parametrize('contrast', [12, 30, 80])
+@pytest.mark.parametrize('slope', [0.0, 0.6, -1.3])
+def test_points_on_an_edge_tell_nothing_along_it(contrast, slope):
+    image = noisy(np.where(U - MIDDLE[0] > slope * (V - MIDDLE[1]), 100 + contrast, 100.0))
+    rows = np.arange(30, CAMERA.height - 30, 2)
+    on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
+    covariance = information(image, on_edge).covariance(np.eye(4))[:3, :3]
+    along = np.array([slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
+    assert np.sqrt(along @ covariance @ along) > 0.03
+
+
+def test_a_plain_face_tells_nothing():
+    assert sigmas_m(noisy(np.full(U.shape, 90.0)), anywhere(200)).min() > 0.1
+
+
+def test_corners_and_weak_textures_tell_the_place_to_millimetres():
+    corners = noisy(100 + 40.0 * ((U // 40 + V // 40) % 2))
+    columns, rows = (np.arange(40, n - 20, 40) - 0.5 for n in (CAMERA.width, CAMERA.height))
+    at = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    assert sigmas_m(corners, at).max() < 0.003
+    weak = noisy(100 + 6 * np.sin(U * 0.9) * np.sin(V * 1.1))
+    assert sigmas_m(weak, anywhere(100)).max() < 0.003
+
+
+def test_points_whose_patches_overlap_count_as_one():
+    texture = noisy(RNG.uniform(60, 160, U.shape))
+    places = anywhere(30)
+    once = sigmas_m(texture, places)
+    often = sigmas_m(texture, np.repeat(places, 10, axis=0) + RNG.uniform(-1, 1, (300, 2)))
+    np.testing.assert_allclose(often, once, rtol=0.3)
+
+
+def test_no_point_tells_nothing():
+    assert sigmas_m(noisy(np.full(U.shape, 90.0)), np.zeros((0, 2))).min() == pytest.approx(1.0)
+
+
+def test_what_edges_do_not_tell_the_prior_does():
+    image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
+    rows = np.arange(30.0, CAMERA.height - 30, 12)
+    on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
+    told = information(image, on_edge)
+    off = np.eye(4)
+    off[:3, 3] = 0.01, 0.01, 0.0
+    prior = PoseEstimate(off, np.zeros(0, bool), np.diag([0.005] * 3 + [1e-4] * 3) ** 2, 1.0)
+    seen = PoseEstimate(np.eye(4), np.ones(len(rows), bool), 1e-8 * np.eye(6), 1.0)
+    fused = told.fused(seen, prior)
+    across_m, along_m = fused.T_camera_world[:2, 3]
+    assert abs(across_m) < 0.001 and along_m == pytest.approx(0.01, abs=0.002)
+    sigma_m = np.sqrt(np.diag(fused.covariance))
+    assert sigma_m[0] < 0.001 and sigma_m[1] > 0.004
+
+
+def test_a_prior_is_outdone_where_points_tell_every_direction_better():
+    rows = np.arange(30.0, CAMERA.height - 30, 12)
+    on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
+    edge = information(noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge)
+    texture = information(noisy(RNG.uniform(60, 160, U.shape)), anywhere(300))
+    none, wide = np.zeros(0, bool), np.diag([0.02] * 6) ** 2
+    sure_of_turns = np.diag([0.02] * 3 + [1e-5] * 3) ** 2
+    of_wheels, of_gyroscope = (PoseEstimate(np.eye(4), none, P, 1.0) for P in (wide, sure_of_turns))
+    assert edge.tells_less(np.eye(4), of_wheels)
+    assert not texture.tells_less(np.eye(4), of_wheels)
+    assert texture.tells_less(np.eye(4), of_gyroscope)
+
+
+def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_tell_more():
+    room = StereoRoom()
+    frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(8)]
+
+    def median_sigma_px(told):
+        slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+        for pose in told:
+            slam.add(pose)
+        for frame in frames:
+            slam.process(frame)
+        assert len(slam.map.keyframes) > 1
+        assert (slam.map.keyframes[-1].motion is not None) is bool(told)
+        return np.median(slam.map.keyframes[-1].observations.sigma_px[:, :2])
+
+    period_ns = frames[1].stamp_ns // 2
+    wheels = [WheelPose(k * period_ns, planar_pose(0.02 * k, 0, 0)) for k in range(20)]
+    assert median_sigma_px(wheels) < 1.1 * median_sigma_px([])
+
+
+def test_a_pixel_on_an_edge_is_sure_across_it_alone():
+    image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
+    uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
+    sigma_px = no_surer(image, Observations(uvd_px, np.full((1, 3), 0.5))).sigma_px[0]
+    assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
+
+
+def test_a_pose_that_the_images_hardly_tell_is_said_to_be_uncertain(monkeypatch):
+    room = StereoRoom()
+    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
+    seen = [result.state for frame in frames[:2] for result in slam.process(frame)]
+    monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.PLENTY', 10_000)
+    seen += [result.state for result in slam.process(frames[2])]
+    covariance = np.eye(6) * 0.02**2
+    monkeypatch.setattr(PoseInformation, 'covariance', lambda *_: covariance)
+    seen += [result.state for result in slam.process(frames[3])]
+    assert seen[:3] == ['tracking'] * 3
+    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
