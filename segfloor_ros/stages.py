@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.mount import MountEstimator
+from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.floor.disparity import DisparityMatcher, TwoScaleMatcher
+from segfloor_ros.floor.disparity.matching import DisparityMatcher, TwoScaleMatcher
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 TRUTH_STEPS_PER_PX = 4

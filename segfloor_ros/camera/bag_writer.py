@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.bag_messages import IMU, IMU_FRAME, ODOMETRY, TF, BagMessages
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.sources.bag_file import MISSING_LIBRARY
 from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.camera.calibration import EyeCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.images import MAX_PIXELS
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, transform_from_quaternion

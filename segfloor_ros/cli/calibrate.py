@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from segfloor_ros.camera.calibrate import CalibrationResult, calibrate_folder
+from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
 from segfloor_ros.cli.output import console, progress_bar, value_table
 from segfloor_ros.errors import SettingsError
 

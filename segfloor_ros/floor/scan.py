@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity import NOISE_PX
+from segfloor_ros.floor.disparity.matching import NOISE_PX
 from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array

@@ -12,9 +12,29 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.blank_border import blank_border
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.contact import blank_feet
-from segfloor_ros.floor.disparity import BLOCK_PX, TwoScaleMatcher, disparity_range, stereo_view
-from segfloor_ros.floor.filling import (
+from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
+from segfloor_ros.floor.disparity.matching import (
+    BLOCK_PX,
+    TwoScaleMatcher,
+    disparity_range,
+    stereo_view,
+)
+from segfloor_ros.floor.disparity.photometric import compare
+from segfloor_ros.floor.disparity.profile import (
+    BINS_PER_PX,
+    FloorLine,
+    FloorProfile,
+    fit_profile,
+)
+from segfloor_ros.floor.disparity.texture import (
+    MIN_TEXTURE_GREY,
+    NOISE_TEXTURE,
+    noise_grey,
+    row_slope,
+    texture_grey,
+)
+from segfloor_ros.floor.mask.contact import blank_feet
+from segfloor_ros.floor.mask.filling import (
     beside_something,
     beyond_texture,
     drop_islands,
@@ -22,9 +42,12 @@ from segfloor_ros.floor.filling import (
     fill_regions,
     trim_to_edges,
 )
-from segfloor_ros.floor.frame_plane import expectations, plane_of_frame
-from segfloor_ros.floor.hidden import clear_hidden, drop_hidden
-from segfloor_ros.floor.histograms import filtered_v_disparity
+from segfloor_ros.floor.mask.hidden import clear_hidden, drop_hidden
+from segfloor_ros.floor.mask.overhead import OverheadMatcher
+from segfloor_ros.floor.mask.pixel_evidence import Comparison, Evidence, HeightTable, judge
+from segfloor_ros.floor.mask.remembered_floor import FloorMemory
+from segfloor_ros.floor.mask.runs import pixels_where
+from segfloor_ros.floor.mask.view import FloorView, column_step
 from segfloor_ros.floor.observation import (
     FLOOR,
     NOT_FLOOR,
@@ -32,27 +55,9 @@ from segfloor_ros.floor.observation import (
     FloorScan,
     VDisparity,
 )
-from segfloor_ros.floor.overhead import OverheadMatcher
-from segfloor_ros.floor.photometric import compare
-from segfloor_ros.floor.pixel_evidence import Comparison, Evidence, HeightTable, judge
-from segfloor_ros.floor.profile import (
-    BINS_PER_PX,
-    FloorLine,
-    FloorProfile,
-    fit_profile,
-)
-from segfloor_ros.floor.remembered_floor import FloorMemory
-from segfloor_ros.floor.runs import pixels_where
+from segfloor_ros.floor.plane.frame_plane import expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.floor.texture import (
-    MIN_TEXTURE_GREY,
-    NOISE_TEXTURE,
-    noise_grey,
-    row_slope,
-    texture_grey,
-)
-from segfloor_ros.floor.view import FloorView, column_step
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.tracking.images import join
 from segfloor_ros.timing import NoTimes, StageTimes

@@ -7,7 +7,7 @@ import array
 import numpy as np
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.messages.headers import make_header
 

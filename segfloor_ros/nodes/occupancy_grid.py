@@ -18,10 +18,10 @@ from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.map_files import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
-from segfloor_ros.nodes.keyframe_join import KeyframeJoin
-from segfloor_ros.nodes.map_part import MapPart
-from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.stage_node import StageNode
+from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin
+from segfloor_ros.nodes.shared.map_part import MapPart
+from segfloor_ros.nodes.shared.running import run_node
+from segfloor_ros.nodes.shared.stage_node import StageNode
 
 YAML_SUFFIXES = ('.yaml', '.yml')
 POINTS, FEATURES = 'labelled_points', 'keyframe/features'

@@ -30,10 +30,10 @@ from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
-from segfloor_ros.nodes.pacing import ChainPace, ClockPace
-from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.stage_node import StageNode
-from segfloor_ros.nodes.transforms import TfLink
+from segfloor_ros.nodes.shared.pacing import ChainPace, ClockPace
+from segfloor_ros.nodes.shared.running import run_node
+from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.nodes.shared.transforms import TfLink
 
 LOOK_AGAIN_S = 0.05
 """How often is looked for subscribers, and whether the chain has room: its answers say so too."""

@@ -14,14 +14,14 @@ from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.join import MAX_DISORDER_NS
 from segfloor_ros.messages.topics import FRAME_DONE
 from segfloor_ros.node_settings import StereoSlamNodeSettings
-from segfloor_ros.nodes.running import run_node
-from segfloor_ros.nodes.sensor_input import InitialPose, MaskInput, SensorInput
-from segfloor_ros.nodes.slam_maps import SlamMaps
-from segfloor_ros.nodes.slam_outputs import CameraFrames, LostTime, SlamOutputs
-from segfloor_ros.nodes.stage_node import StageNode
-from segfloor_ros.nodes.stereo_input import Pair, PairQueue, StereoInput
-from segfloor_ros.nodes.transforms import Transforms
-from segfloor_ros.nodes.when_idle import WhenIdle
+from segfloor_ros.nodes.shared.running import run_node
+from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.nodes.shared.transforms import Transforms
+from segfloor_ros.nodes.shared.when_idle import WhenIdle
+from segfloor_ros.nodes.slam.sensor_input import InitialPose, MaskInput, SensorInput
+from segfloor_ros.nodes.slam.slam_maps import SlamMaps
+from segfloor_ros.nodes.slam.slam_outputs import CameraFrames, LostTime, SlamOutputs
+from segfloor_ros.nodes.slam.stereo_input import Pair, PairQueue, StereoInput
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, saved_camera
 from segfloor_ros.slam.stereo_slam import StereoSlam

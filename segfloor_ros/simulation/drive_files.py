@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from segfloor_ros import __version__
-from segfloor_ros.camera.calibration_files import write_ros_calibration
+from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.grid.map_file import save_map

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.calibration import EyeCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, make_transform

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration_files import write_ros_calibration
+from segfloor_ros.camera.calibration.files import write_ros_calibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import StereoSource, open_source
 

@@ -27,7 +27,7 @@ from camera_recordings import (
     write_rosbag2,
 )
 
-from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
 from segfloor_ros.errors import CalibrationError, InputError
 

@@ -11,8 +11,8 @@ import pytest
 from camera_recordings import write_image
 from chessboards import BASELINE_M, BOARD, K_TRUE, SIZE, SQUARE_M, write_boards
 
-from segfloor_ros.camera.calibrate import calibrate_folder
-from segfloor_ros.camera.calibration_files import read_calibration
+from segfloor_ros.camera.calibration.chessboard import calibrate_folder
+from segfloor_ros.camera.calibration.files import read_calibration
 from segfloor_ros.errors import CalibrationError, InputError
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from camera_recordings import calibration
 
-from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.deblocking import deblocked, is_blocky
-from segfloor_ros.camera.rectification import StereoRectifier
 
 
 def weak_texture(seed: int = 0) -> np.ndarray:

@@ -23,7 +23,8 @@ from camera_recordings import (
     write_rosbag2,
 )
 
-from segfloor_ros.camera.calibration import EyeCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import (
     VIRTUAL_BASELINE_M,
     depth_calibration,
@@ -31,7 +32,6 @@ from segfloor_ros.camera.depth import (
     disparity_of_depth,
     seen_from_right,
 )
-from segfloor_ros.camera.rectification import StereoRectifier
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_topics import IMAGE, find_depth_topics
 from segfloor_ros.errors import InputError

@@ -27,8 +27,8 @@ from camera_recordings import (
     write_kitti,
 )
 
-from segfloor_ros.camera.calibration_files import write_ros_calibration
-from segfloor_ros.camera.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.files import write_ros_calibration
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.errors import CalibrationError, InputError

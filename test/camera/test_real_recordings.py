@@ -11,7 +11,7 @@ from camera_recordings import opened
 from test_bag_writer import assert_same_recording
 
 from segfloor_ros.camera.bag_writer import ImageCoding, convert
-from segfloor_ros.camera.calibrate import calibrate_folder
+from segfloor_ros.camera.calibration.chessboard import calibrate_folder
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 

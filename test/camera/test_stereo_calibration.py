@@ -23,13 +23,13 @@ from camera_recordings import (
 )
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.calibrate import rectified_pixels
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration_files import (
+from segfloor_ros.camera.calibration.chessboard import rectified_pixels
+from segfloor_ros.camera.calibration.files import (
     read_calibration,
     read_kitti_calibration,
     write_ros_calibration,
 )
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.geometry import make_transform, transform_points
 

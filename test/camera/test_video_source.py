@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from camera_recordings import HEIGHT, MS, WIDTH, calibration, opened
 
-from segfloor_ros.camera.calibration_files import write_ros_calibration
+from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.sources.video import is_device
 from segfloor_ros.errors import CalibrationError, InputError
 

@@ -5,7 +5,7 @@ from chessboards import BOARD, K_TRUE, SQUARE_M, write_boards
 from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.camera.calibration_files import read_calibration
+from segfloor_ros.camera.calibration.files import read_calibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 

@@ -11,8 +11,8 @@ from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 from segfloor_ros.camera.deblocking import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
+from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.observation import FLOOR
-from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 

@@ -20,8 +20,8 @@ from floor_scenes import (
 )
 
 from segfloor_ros.camera.model import Mount
+from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
-from segfloor_ros.floor.profile import FloorLine
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 

@@ -6,7 +6,7 @@ from node_messages import grid_arrays
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints

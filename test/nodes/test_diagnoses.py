@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.rectification import rows_apart_px
-from segfloor_ros.floor.mount_check import MountCheck
+from segfloor_ros.camera.calibration.rectification import rows_apart_px
+from segfloor_ros.floor.plane.mount_check import MountCheck
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, Level

@@ -21,7 +21,7 @@ from segfloor_ros.messages.headers import to_time
 from segfloor_ros.messages.images import compressed_message, image_message
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.connections import likeness
+from segfloor_ros.nodes.shared.connections import likeness
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 GIVEN = (

@@ -16,7 +16,7 @@ from segfloor_ros.messages.camera_info import camera_info_message, rectified_cal
 from segfloor_ros.messages.diagnostics import HEALTH, Level
 from segfloor_ros.messages.images import image_message
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.reporter import LossCounter, loss_in_words
+from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 GIVEN = (

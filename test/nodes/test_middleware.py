@@ -10,7 +10,7 @@ import pytest
 from node_chain import NodeChain
 
 from segfloor_ros.messages.topics import CLOUD
-from segfloor_ros.nodes.running import NAMED_BY, PROFILES, prepare_middleware
+from segfloor_ros.nodes.shared.running import NAMED_BY, PROFILES, prepare_middleware
 
 STEREO_PAIR_BYTES = 2 * 1226 * 370
 

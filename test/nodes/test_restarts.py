@@ -24,7 +24,7 @@ from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM
-from segfloor_ros.nodes.kept_state import KeptState
+from segfloor_ros.nodes.shared.kept_state import KeptState
 
 PLACES = 80
 """More than are driven past: a place that is seen again makes no keyframe."""
@@ -244,7 +244,7 @@ def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
 
 def test_a_folder_that_others_can_write_to_is_not_used(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
-    monkeypatch.setattr('segfloor_ros.nodes.kept_state.IN_MEMORY', tmp_path)
+    monkeypatch.setattr('segfloor_ros.nodes.shared.kept_state.IN_MEMORY', tmp_path)
     kept = KeptState('/robot/open', 30.0)
     keep(kept)
     kept._file.parent.chmod(0o777)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_made_maps import row_of_views
 from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_pose
-from test_places import row_of_views
 
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.fusion import find_duplicates

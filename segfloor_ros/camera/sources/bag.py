@@ -10,8 +10,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration_files import given_calibration, given_left_calibration
+from segfloor_ros.camera.calibration.files import given_calibration, given_left_calibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.images import Grey, depth_image, grey_image
 from segfloor_ros.camera.model import StereoCamera

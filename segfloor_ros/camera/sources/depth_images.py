@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import EyeCalibration
-from segfloor_ros.camera.calibration_files import given_left_calibration, read_eye_calibration
+from segfloor_ros.camera.calibration.files import given_left_calibration, read_eye_calibration
+from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import files

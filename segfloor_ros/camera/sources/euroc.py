@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.calibration_files import (
+from segfloor_ros.camera.calibration.files import (
     given_calibration,
     read_body_pose,
     read_calibration,
 )
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import files
 from segfloor_ros.camera.sources.pairing import Stamped

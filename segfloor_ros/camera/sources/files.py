@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.images import CorruptImageError, Grey, decode_file
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, check_forward, rate_of
 from segfloor_ros.camera.sources.sensor_files import check_shared_clock

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from segfloor_ros.camera.calibration_files import (
+from segfloor_ros.camera.calibration.files import (
     find_calibration,
     given_left_calibration,
     read_eye_calibration,

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from segfloor_ros.camera.calibration_files import (
+from segfloor_ros.camera.calibration.files import (
     given_calibration,
     given_left_calibration,
     read_kitti_calibration,

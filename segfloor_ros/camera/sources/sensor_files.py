@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration_files import read_body_pose
+from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.camera.sources.pairing import nanoseconds
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import StereoCalibration
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.camera.rectification import StereoRectifier
 from segfloor_ros.errors import InputError
 from segfloor_ros.measurements import DEPTH, RecordedSensor
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration import StereoCalibration
-from segfloor_ros.camera.calibration_files import find_calibration
+from segfloor_ros.camera.calibration.files import find_calibration
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.images import Grey, to_grey
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource

@@ -1,6 +1,6 @@
 """Places: which keyframe shows the same place, and what follows from it.
 
-In: a view, by its visual words. Out: a loop that is closed, a lost camera found again, a submap merged.
-The way in is `place_recognition.PlaceRecognition`; `loops`, `relocalisation` and `known_map` use it.
+In: a view, by its words. Out: a loop is closed, a lost camera found again, a submap merged.
+The way in is `place_recognition.PlaceRecognition`; `loops`, `relocalisation`, `known_map` use it.
 Papers: Galvez-Lopez and Tardos, Bags of Binary Words (2012); Nister and Stewenius (2006).
 """

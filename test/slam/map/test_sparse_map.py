@@ -1,38 +1,10 @@
 """The sparse map's bookkeeping on small hand-made maps."""
 
 import numpy as np
+from hand_made_maps import add, keyframe
 
-from segfloor_ros.geometry import make_transform
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
-from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.tracking.features import Features
-from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
-
-
-def keyframe(index, point_id, x=0.0):
-    count = len(point_id)
-    found = Features(
-        np.zeros((count, 2), np.float32),
-        np.zeros(count, np.uint8),
-        np.full((count, 32), index, np.uint8),
-    )
-    return KeyframeRecord(
-        index,
-        10 * index,
-        1000 * index,
-        make_transform(np.eye(3), np.array([-x, 0.0, 0.0])),
-        found,
-        Observations(np.zeros((count, 3)), np.ones((count, 3))),
-        np.array(point_id, np.int32),
-    )
-
-
-def add(sparse_map, record, new_rows=(), new_xyz=()):
-    patches = np.full((len(record.point_id), SIDE_PX, SIDE_PX), record.index, np.uint8)
-    new_xyz = np.array(new_xyz, np.float64).reshape(-1, 3)
-    sparse_map.add_keyframe(record, patches, np.array(new_rows, np.intp), new_xyz)
 
 
 def two_keyframes():

@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from bundle_problems import CAMERA as VGA
+from bundle_problems import disturbed, make_problem
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
-from test_bundle_adjustment import CAMERA as VGA
-from test_bundle_adjustment import disturbed, make_problem
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import make_transform, se3_exp, transform_points

@@ -1,7 +1,7 @@
 """Duplicate points: found by pixel, depth and look; merged with all that hangs on them."""
 
 import numpy as np
-from test_sparse_map import add, keyframe
+from hand_made_maps import add, keyframe
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import transform_points

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bundle_problems import CAMERA
 from stereo_room import MOUNT, planar_pose
-from test_bundle_adjustment import CAMERA
 
 from segfloor_ros.geometry import invert, se3_exp
 from segfloor_ros.slam.map.residuals import Observations

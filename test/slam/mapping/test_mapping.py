@@ -4,47 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_sparse_map import add, keyframe
+from hand_made_maps import CAMERA, SCENES, add, seen
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
-CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
-"""f b = 30 px m: at 2 m a disparity of 15 px."""
-
-RNG = np.random.default_rng(3)
-SCENES = {
-    # A wall at 2 m, and a point that seems to lie in front of it, at 1.2 m.
-    'wall': (
-        np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.6, -0.1, 0.5, 0.9)]),
-        25.0,
-    ),
-    # The floor 0.4 m below the camera, and a point that seems to lie behind it, at 6 m.
-    'floor': (
-        np.stack([RNG.uniform(-1, 1, 16), np.full(16, 0.4), np.linspace(1.0, 3.4, 16)], axis=1),
-        5.0,
-    ),
-}
-
 
 @pytest.fixture(params=SCENES)
 def scene(request):
     """Points (16, 3) in front of keyframe 0, and a disparity that contradicts that of point 3."""
     return SCENES[request.param]
-
-
-def seen(points, index, point_id, x=0.0):
-    """A keyframe at x that sees points where they are."""
-    record = keyframe(index, point_id, x)
-    uvr = CAMERA.project(points - [x, 0.0, 0.0])
-    uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
-    return replace(record, observations=Observations(uvd, np.full((len(points), 3), 0.5)))
 
 
 def mapped(points):

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from hand_made_maps import add, keyframe
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
-from test_sparse_map import add, keyframe
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import make_transform

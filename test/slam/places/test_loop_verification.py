@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_mapping import CAMERA, SCENES, seen
-from test_places import row_of_views
-from test_sparse_map import add, keyframe
+from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp

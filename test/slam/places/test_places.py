@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from hand_made_maps import WALL, row_of_views
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
-from test_sparse_map import add, keyframe
 
 from segfloor_ros.geometry import se3_exp
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import (
     LOOK_AGAIN,
     RECENT,
@@ -19,8 +18,6 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE = np.eye(4)
-WALL = np.stack([np.linspace(-0.5, 0.5, 10), np.zeros(10), np.full(10, 2.0)], axis=1)
-"""Ten points at z = 2."""
 
 RNG = np.random.default_rng(6)
 FLOOR = np.stack([RNG.uniform(-1, 1, 10), np.full(10, 0.5), RNG.uniform(4, 6, 10)], axis=1)
@@ -41,15 +38,6 @@ def test_a_view_covers_itself_and_half_of_one_turned_by_half_the_field_of_view()
     assert covered_share(CAMERA, [turned(np.pi)], HERE, 2.0) == 0.0
     both = [turned(half_fov), turned(-half_fov)]
     assert covered_share(CAMERA, both, HERE, 2.0) > 0.85  # corners lean out of turned images
-
-
-def row_of_views(count, ids, spacing_m, xyz=WALL):
-    """A map whose keyframes stand side by side and see the points `ids` of ten."""
-    sparse_map = SparseMap()
-    add(sparse_map, keyframe(0, [NO_POINT] * 10), np.arange(10), xyz)
-    for index in range(1, count):
-        add(sparse_map, keyframe(index, ids, x=spacing_m * index))
-    return sparse_map
 
 
 def camera_at(x):

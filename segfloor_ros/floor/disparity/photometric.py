@@ -1,0 +1,87 @@
+"""The floor tested on the images themselves.
+
+Semi-global matching prefers surfaces that face the camera and, where texture is weak, agrees with
+whatever repeats: the blocks of a compressed image, its neighbours. Here the right image is drawn
+as it would look were everything floor, and compared with the left one. What then agrees about as
+well as it does with the matched disparities cannot be said not to be floor.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.floor.disparity.profile import FloorProfile
+from segfloor_ros.floor.mask.pixel_evidence import Comparison
+from segfloor_ros.floor.mask.view import FloorView
+
+_STEP_PX = 2
+"""Every so many pixels of the image are compared, in rows and in columns."""
+_WINDOW = 5
+_WIDE_WINDOW = 15
+"""What too little texture leaves open in a small window a larger one often tells."""
+_AGAINST_GREY = 1.0
+"""By how much the images must contradict the floor to deny it, beyond their noise."""
+_LIKENESS_GREY = 3.0
+"""How much left and right may differ on the floor, beyond their noise."""
+_WIDE_RATIO = 1.15
+_WIDE_MARGIN_GREY = 0.05
+_WIDE_SHARE = 0.65
+_MARGIN_PX = 4.0
+"""So near to the right image's border interpolation is unsure."""
+_NOISE_SHARE = 2.0
+"""Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
+
+
+def compare(
+    view: FloorView,
+    profile: FloorProfile,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    disparity: NDArray[np.float32],
+    noise_grey: float,
+) -> Comparison:
+    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
+
+    left, right: whole image rows (R, image width). Where the right image does not reach,
+    nothing speaks against the floor nor for it.
+    """
+    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    sampled = left[::_STEP_PX, ::_STEP_PX]
+    steps = (np.arange(0, size, _STEP_PX, dtype=np.float32) for size in left.shape)
+    rows, columns = np.meshgrid(*steps, indexing='ij')
+    floor_px = profile.at_pixels(view.derolled[part])
+    matched_px = disparity[part]
+
+    def difference(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+        at = columns - disparity_px
+        seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return _local_difference(sampled, seen)
+
+    floor, matched = difference(floor_px), difference(matched_px)
+    margin = _AGAINST_GREY + 0.5 * noise_grey
+    against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
+    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
+    wide = (_WIDE_WINDOW, _WIDE_WINDOW)
+    denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
+    worse = floor > 1.1 * matched
+    denied &= (matched_px > 0) & worse
+    denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
+    contrary = against | (floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey)
+    reached = columns >= floor_px + _MARGIN_PX
+    contradicted = (against, denied, unlike)
+    masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
+    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
+
+
+def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the local mean absolute difference, free of differences in brightness."""
+    difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
+    difference -= cv2.blur(difference, (_WINDOW, _WINDOW))
+    return cv2.blur(np.abs(difference), (_WINDOW, _WINDOW))
+
+
+def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    size = (shape[1], shape[0])
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0

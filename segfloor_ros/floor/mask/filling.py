@@ -1,0 +1,252 @@
+"""Floor where the image alone cannot tell: between floor, and where the picture goes on alike."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.floor.disparity.profile import FloorProfile
+from segfloor_ros.floor.disparity.texture import EDGE_SLOPE
+from segfloor_ros.floor.mask.contact import fill_to_contact
+from segfloor_ros.floor.mask.pixel_evidence import Comparison
+from segfloor_ros.floor.mask.runs import Runs, pixels_where
+from segfloor_ros.floor.mask.view import FloorView
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+
+_STEP_PX = 2
+"""Regions are found at this part of the resolution."""
+_MIN_REGION_PX = 15
+_THREAD_PX = 3
+_ISLAND_SHARE = 0.05
+"""Patches of floor smaller than this share of the largest are dropped."""
+_BORDER_PX = 12
+_MIN_SLOPE = 1.5
+"""Grey levels per pixel at half resolution; weaker edges bound no region."""
+_STRONG_SLOPE = 10.0
+"""Stronger edges than this are the border of something."""
+_TEXTURE_MARGIN = 7
+_HOLE_ROWS = 12
+"""As high as the window in which texture is measured."""
+_TEXTURED_SHARE = 0.7
+_UNMATCHED_PX = 12
+"""So wide a strip at the border of what both cameras see may be without matches."""
+
+
+def fill_regions(
+    view: FloorView,
+    mask: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+    disparity: NDArray[np.float32],
+    compared: Comparison,
+    textured: NDArray[np.bool_],
+    barred: NDArray[np.bool_],
+    min_share: float,
+) -> NDArray[np.uint8]:
+    """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
+    floor.
+
+    image: whole image rows (R, image width). barred: (R, W), where no region goes on. A region is
+    bounded by edges of the image stronger than most of the floor's own; floor by evidence must be
+    in `min_share` of its columns. In it a pixel becomes floor below floor, the next evidence up its
+    column; or between floor on its left and right; or, if it is not blank, nearer than any of its
+    floor.
+    """
+    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    small = mask[part]
+    floor = small == FLOOR
+    if np.count_nonzero(floor) < _MIN_REGION_PX:
+        return mask
+    slope = _slope(image)
+    own = slope.take(np.flatnonzero(floor)[::7])
+    limit = max(_MIN_SLOPE, float(np.percentile(own, 90)))
+    agreed = compared.consistent[part] & ~compared.denied[part]
+    alike = (small != NOT_FLOOR) & agreed & (slope < limit)
+    core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, region = cv2.connectedComponents(core, connectivity=4)
+    top = _top_of_supported(region, count, floor, min_share)
+    highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
+    not_blank = cv2.erode(
+        textured[part].astype(np.uint8),
+        np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8),
+    )
+    rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
+    inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
+    nearer = (rows >= highest) & (not_blank > 0)
+    fill = inside & (nearer | _next_to_floor(small))
+    fill &= ~barred[part]
+    mask = with_floor(mask, _enlarged(fill, mask))
+    # Light on the floor is no border, where both ends of a stretch are known.
+    no_border = agreed & (slope < _STRONG_SLOPE)
+    to_contact = fill_to_contact(view, mask, no_border, disparity, compared, textured)
+    return with_floor(mask, _enlarged(to_contact, mask))
+
+
+def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    smooth = cv2.blur(image, (5, 5))[::_STEP_PX, ::_STEP_PX]
+    return cv2.magnitude(
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
+    )
+
+
+def _top_of_supported(
+    region: NDArray[np.int32], count: int, floor: NDArray[np.bool_], min_share: float
+) -> NDArray[np.intp]:
+    """Return the topmost row (count,) with floor of each region, the number of rows where it has
+    too little.
+    """
+    height, width = region.shape
+    rows, columns = pixels_where(floor)
+    owner: NDArray[np.intp] = region[rows, columns].astype(np.intp)
+    large = np.flatnonzero(np.bincount(owner, minlength=count) >= _MIN_REGION_PX)
+    large = large[large > 0]
+    number = np.zeros(count, np.intp)
+    number[large] = np.arange(1, len(large) + 1)
+    owner = number[owner]
+
+    def columns_of(owner: NDArray[np.intp], columns: NDArray[np.int32]) -> NDArray[np.intp]:
+        cells = np.bincount(owner * width + columns, minlength=(len(large) + 1) * width)
+        return np.count_nonzero(cells.reshape(-1, width), axis=1)
+
+    extent = columns_of(
+        number[region].reshape(-1), np.tile(np.arange(width, dtype=np.int32), height)
+    )
+    wide = columns_of(owner, columns) >= min_share * extent
+    first = np.full(len(large) + 1, height, np.intp)
+    first[owner[::-1]] = rows[::-1]  # the topmost comes last
+    top = np.full(count, height, np.intp)
+    top[large] = np.where(wide, first, height)[1:]
+    return top
+
+
+def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of NO_EVIDENCE where the next evidence up the column is floor, or that to the left and
+    that to the right.
+    """
+    nothing = mask == NO_EVIDENCE
+    across, turned = Runs.of(nothing), np.ascontiguousarray(mask.T)
+    between = across.before(mask, NO_EVIDENCE) == FLOOR
+    between &= across.after(mask, NO_EVIDENCE) == FLOOR
+    return across.painted(between) | _below_floor(turned).T
+
+
+def _below_floor(turned: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of NO_EVIDENCE in a mask that is turned, (W, R), where the next evidence up the column
+    is floor.
+    """
+    nothing = Runs.of(turned == NO_EVIDENCE)
+    return nothing.painted(nothing.before(turned, NO_EVIDENCE) == FLOOR)
+
+
+def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of what only the left camera sees, at the left border of a mask (R, W), where it does
+    not lie beside floor that both cameras see: what stands there is taken to go on.
+    """
+    floor_px = view.plane_px
+    first = (mask != NO_EVIDENCE).argmax(axis=1)[:, None]
+    begins_with_floor = np.take_along_axis(mask, first, axis=1) == FLOOR
+    begins_with_floor &= first * view.step <= floor_px[:, :1] + _UNMATCHED_PX
+    # Rows in between begin with a hole.
+    near = cv2.dilate(begins_with_floor.view(np.uint8), np.ones((_HOLE_ROWS + 1, 1), np.uint8))
+    return (view.columns < floor_px) & (near == 0)
+
+
+def beyond_texture(mask: NDArray[np.uint8], textured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which blank pixels of a mask (R, W) lie beyond the end of a floor that has texture.
+
+    Up a column nearly all of the floor showed its texture, and now more is blank than a hole in
+    it, up to what is no floor or to the horizon: a blank wall looks like that, and what is known
+    left and right of it says nothing about it. A wall hides what is behind it; where floor is
+    seen farther up, there is none.
+    """
+    turned = np.ascontiguousarray(mask.T)
+    blank = (turned == NO_EVIDENCE) & ~textured.T
+    runs = Runs.of(blank)
+    last = turned.shape[1] - 1
+    foot = np.minimum(runs.stop, last)
+    seen, holes = (
+        np.cumsum(where[:, ::-1], axis=1, dtype=np.int32)[:, ::-1][runs.row, foot]
+        for where in (turned == FLOOR, blank)
+    )
+    ended = (runs.stop - runs.first > _HOLE_ROWS) & (runs.stop <= last)
+    ended &= seen > _TEXTURED_SHARE * (seen + holes)
+    ended &= ~_below_floor(turned)[runs.row, runs.first]
+    beyond: NDArray[np.bool_] = runs.painted(ended).T
+    return beyond
+
+
+def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the mask (R, W) with floor where nothing is known and `where` (R, W) is set."""
+    change = (mask == NO_EVIDENCE) & where
+    return mask ^ (change.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
+
+
+def _enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    size = (mask.shape[1], mask.shape[0])
+    return cv2.resize(picture.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def fill_gaps(
+    view: FloorView,
+    profile: FloorProfile,
+    mask: NDArray[np.uint8],
+    consistent: NDArray[np.bool_],
+    gap_m: float,
+) -> NDArray[np.uint8]:
+    """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
+    are at most `gap_m` apart, where the images do not contradict the floor (`consistent`).
+    """
+    height, width = mask.shape
+    disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
+    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
+    gaps = Runs.of(mask == NO_EVIDENCE)
+    # The matcher leaves out some columns at the right border.
+    at_border = (gaps.stop == width) & (width - gaps.first <= _BORDER_PX // view.step)
+    between = gaps.before(mask, NO_EVIDENCE) == FLOOR
+    between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
+    across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
+    return with_floor(mask, gaps.painted(between & (across <= longest[gaps.row])) & consistent)
+
+
+def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the mask without patches of floor smaller than a share of the largest."""
+    step = _STEP_PX
+    small = (mask[::step, ::step] == FLOOR).astype(np.uint8)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
+    if count < 3:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA]
+    is_lone = area < _ISLAND_SHARE * area[1:].max()
+    if not is_lone.any():
+        return mask
+    lone = _enlarged(is_lone[label], mask) & (mask == FLOOR)
+    return mask ^ (lone.view(np.uint8) * np.uint8(NO_EVIDENCE ^ FLOOR))
+
+
+def trim_to_edges(
+    mask: NDArray[np.uint8], slope: NDArray[np.int16], reach_px: int
+) -> NDArray[np.uint8]:
+    """Return the mask (R, W) without floor that only borrowed its texture from the floor below it.
+    slope: `row_slope` of the image (R, W).
+
+    Texture is measured over a window, so below a blank wall floor reaches up to `reach_px` rows
+    too high. There it is cut off at the strongest edge between the two, and where there is none,
+    where the texture is its own.
+    """
+    # Threads of floor, where the matcher loses hold, are none.
+    whole = (mask == FLOOR).astype(np.uint8)
+    floor = cv2.morphologyEx(whole, cv2.MORPH_OPEN, np.ones((_THREAD_PX, _THREAD_PX), np.uint8))
+    mask = np.where((whole > 0) & (floor == 0), np.uint8(NO_EVIDENCE), mask)
+    nothing = (mask == NO_EVIDENCE).astype(np.uint8)
+    upward = np.ones((reach_px + 1, 1), np.uint8)
+    below_blank = cv2.dilate(nothing, upward, anchor=(0, reach_px)) & floor
+    if not below_blank.any():
+        return mask
+    slope = np.where(below_blank > 0, slope, np.int16(0))
+    strongest = cv2.dilate(slope, np.ones((2 * reach_px + 1, 1), np.uint8))
+    edge = ((slope == strongest) & (slope >= EDGE_SLOPE)).astype(np.uint8)
+    under_edge = cv2.dilate(edge, upward, anchor=(0, reach_px))
+    trimmed = mask.copy()
+    trimmed[(below_blank > 0) & (under_edge == 0)] = NO_EVIDENCE
+    return trimmed

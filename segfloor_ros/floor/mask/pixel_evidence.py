@@ -1,0 +1,146 @@
+"""What each pixel says: floor, not floor, or nothing.
+
+A pixel is judged by its own disparity: its height above the floor that has the same disparity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.floor.disparity.matching import NOISE_PX, SUBPIXEL
+from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
+from segfloor_ros.floor.mask.view import FloorView
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+_MIN_DISPARITY_PX = 2.5
+"""Farther floor is not judged."""
+_SURE_SHARE = 1.5
+"""Disparities tell a step from floor while their noise widens it by no more than this."""
+_CONTACT_HEIGHT_M = 0.12
+"""Up to this height an upright surface is taken to stand on the floor below it."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the images say of each pixel of a view, (R, W) bool where not said otherwise.
+
+    floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
+    against: clearly more like the matched disparity than like floor. denied: the same of the
+    surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor.
+    """
+
+    floor_px: NDArray[np.float32]
+    against: NDArray[np.bool_]
+    denied: NDArray[np.bool_]
+    unlike: NDArray[np.bool_]
+    consistent: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeightTable:
+    """Per disparity step: row: the de-rolled row of the floor. Height above the floor is
+    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor. All (B,)
+    float32, NaN at disparity 0.
+    """
+
+    row: NDArray[np.float32]
+    offset: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    up: NDArray[np.float32]
+    down: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        line: FloorLine,
+        profile: FloorProfile,
+        num_disparities: int,
+        settings: FloorSegmentationSettings,
+    ) -> HeightTable:
+        """Return the table of a profile."""
+        disparity = np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
+        disparity[0] = np.nan
+        scale = line.metres_per_row / disparity
+        # One pixel of disparity is this much height: the camera's height over the disparity.
+        noise_m = NOISE_PX * line.metres_per_row / line.slope / disparity
+        row = profile.row_of_disparity(disparity)
+        tables = (
+            row,
+            scale * row,
+            scale,
+            np.hypot(settings.step_height_m, noise_m),
+            settings.drop_height_m + 2 * noise_m,
+        )
+        return cls(*(table.astype(np.float32) for table in tables))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """mask: (R, W) uint8. above: (R, W) bool, what is matched above the floor."""
+
+    mask: NDArray[np.uint8]
+    above: NDArray[np.bool_]
+
+
+def judge(
+    view: FloorView,
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    textured: NDArray[np.bool_],
+    compared: Comparison,
+    table: HeightTable,
+    settings: FloorSegmentationSettings,
+) -> Evidence:
+    """Return what the pixels (R, W) of the view say by themselves.
+
+    textured: where a disparity means something; compared: what the images say of the floor. A
+    disparity makes floor only where the images agree, and denies it only where they do.
+    """
+    index = (disparity * np.float32(SUBPIXEL)).astype(np.int32)
+    height = table.offset.take(index) - table.scale.take(index) * view.derolled
+    up = table.up.take(index)
+    above = height > up
+    off = above | (height < -table.down.take(index))
+    # What seems to lie below the floor may be what the floor mirrors.
+    sure = (textured & compared.against) | (compared.denied & above)
+    near = disparity >= np.float32(_MIN_DISPARITY_PX)
+    # On a sill the images contradict the floor, and show that it is a sill.
+    sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))
+    sill &= up < np.float32(_SURE_SHARE * settings.step_height_m)
+    floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
+    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    mask[floor] = FLOOR
+    mask[off & sure] = NOT_FLOOR
+    low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
+    mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
+    mask[view.derolled <= view.line.horizon] = NOT_FLOOR
+    return Evidence(mask, height > 0)
+
+
+def _below_contact(
+    view: FloorView,
+    floor_row: NDArray[np.float32],
+    index: NDArray[np.int32],
+    low: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Return the pixels between the foot of an upright surface and where it meets the floor.
+
+    They are lower than a step but belong to the same surface: its disparity says at which row
+    the floor is. floor_row: by disparity step. index: (R, W) disparity steps.
+    """
+    height, width = low.shape
+    at = np.flatnonzero(low)
+    foot = floor_row.take(index.reshape(-1).take(at))
+    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
+    foot -= view.shear_px.take(columns) + np.float32(view.first_row)
+    end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
+    size = (height + 1) * width
+    covered = np.zeros((height + 1, width), np.int16)
+    covered[:height] = low
+    ends = np.bincount(end * np.int32(width) + columns, minlength=size)
+    covered -= ends.reshape(-1, width).astype(np.int16)
+    return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2

@@ -1,0 +1,135 @@
+"""The pixels that can show floor, and where they look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
+
+_WIDE_PX = 480
+"""Of wider images every other column is used: neighbours say the same."""
+
+_NEAR_M = 0.05
+_FAR_M = 1000.0
+_ROWS_PER_PX = 16
+"""Steps per pixel of disparity at which the profile is tabulated."""
+
+
+@dataclass(frozen=True)
+class FloorView:
+    """The image rows that can show floor, as seen with the mount of this very frame.
+
+    first_row: image row of the first one. step: of the columns. columns: (W,) float32, their
+    image columns. shear_px: (W,) float32, what de-rolling adds to the rows of a column.
+    derolled: (R, W) float32, the de-rolled rows. Pixels of the view are (row, column) of these.
+    """
+
+    camera: StereoCamera
+    mount: Mount
+    line: FloorLine
+    first_row: int
+    step: int
+    columns: NDArray[np.float32]
+    shear_px: NDArray[np.float32]
+    derolled: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, camera: StereoCamera, mount: Mount, first_row: int) -> FloorView:
+        """Return the view from `mount` of the rows from `first_row` on."""
+        line = FloorLine.of(camera, mount)
+        step = column_step(camera)
+        columns = np.arange(0, camera.width, step, dtype=np.float32)
+        shear = (line.shear * (columns - camera.cx)).astype(np.float32)
+        rows = np.arange(first_row, camera.height, dtype=np.float32)
+        return cls(camera, mount, line, first_row, step, columns, shear, rows[:, None] + shear)
+
+    @cached_property
+    def plane_px(self) -> NDArray[np.float32]:
+        """Disparity (R, W) of a floor that does not bend."""
+        return np.float32(self.line.slope) * (self.derolled - np.float32(self.line.horizon))
+
+    def rays(self, rows: NDArray[np.number], columns: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return the rays (3, N) of pixels of the view at depth 1, in the base's axes."""
+        camera = self.camera
+        x = (self.columns[columns] - np.float32(camera.cx)) / np.float32(camera.fx)
+        y = ((rows + (self.first_row - camera.cy)) / camera.fy).astype(np.float32)
+        R = self.mount.T_base_left[:3, :3].astype(np.float32)
+        return R[:, 0:1] * x + R[:, 1:2] * y + R[:, 2:3]
+
+    def positions(
+        self,
+        rows: NDArray[np.number],
+        columns: NDArray[np.integer],
+        disparity_px: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Return where pixels of known disparity (N,) are in the base's x-y plane, (2, N)."""
+        depth = np.float32(self.camera.disparity_times_depth) / disparity_px
+        offset = self.mount.T_base_left[:2, 3:4].astype(np.float32)
+        return self.rays(rows, columns)[:2] * depth + offset
+
+    def floor_positions(
+        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
+    ) -> NDArray[np.float32]:
+        """Return where the rays of pixels meet the floor's plane, (2, N) in the base's plane;
+        very far where they do not.
+        """
+        rays = self.rays(rows, columns)
+        depth = np.float32(self.mount.height_m) / np.maximum(-rays[2], np.float32(1e-5))
+        return rays[:2] * depth + self.mount.T_base_left[:2, 3:4].astype(np.float32)
+
+    def pixels_of_floor(self, xy_base: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the view's pixels, (2, N) of row and column, of positions (2, N) on the floor's
+        plane; negative rows where they are behind the camera.
+        """
+        x, y, depth = self._in_camera(xy_base)
+        camera = self.camera
+        v = y / depth * np.float32(camera.fy) + np.float32(camera.cy - self.first_row)
+        u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
+        behind = depth > _FAR_M
+        pixels: NDArray[np.float32] = np.stack(
+            [np.where(behind, np.float32(-1), v), u / np.float32(self.step)]
+        )
+        return pixels
+
+    def pixels_of_profile(
+        self, xy_base: NDArray[np.float32], profile: FloorProfile
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+        """Return the view's rows and columns (N,) of positions (2, N) on the floor as it bends,
+        and its disparity there (N,); negative columns where they are behind the camera.
+        """
+        x, _, depth = self._in_camera(xy_base)
+        camera = self.camera
+        disparity = np.float32(camera.disparity_times_depth) / depth
+        u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
+        steps = np.arange(0, int(disparity.max() * _ROWS_PER_PX) + 2)
+        row_of = profile.row_of_disparity(steps / _ROWS_PER_PX).astype(np.float32)
+        derolled = row_of[(disparity * np.float32(_ROWS_PER_PX) + np.float32(0.5)).astype(np.int32)]
+        v = derolled - np.float32(self.line.shear) * (u - np.float32(camera.cx)) - self.first_row
+        columns = np.rint(u / np.float32(self.step))
+        columns[depth > _FAR_M] = -1
+        return np.rint(v).astype(np.int32), columns.astype(np.int32), disparity
+
+    def _in_camera(
+        self, xy_base: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return positions (2, N) on the floor's plane in the camera's axes, very far ahead where
+        they are behind it.
+        """
+        R_base_left = self.mount.T_base_left[:3, :3].astype(np.float32)
+        t = self.mount.T_base_left[:3, 3].astype(np.float32)
+        dx, dy = xy_base[0] - t[0], xy_base[1] - t[1]
+        x, y, depth = (
+            R_base_left[0, i] * dx + R_base_left[1, i] * dy - R_base_left[2, i] * t[2]
+            for i in range(3)
+        )
+        return x, y, np.where(depth < _NEAR_M, np.float32(2 * _FAR_M), depth)
+
+
+def column_step(camera: StereoCamera) -> int:
+    """Return which columns of the image are used: every one, or every other."""
+    return 2 if camera.width > _WIDE_PX else 1

@@ -1,0 +1,215 @@
+"""What a node receives: subscriptions, joins by stamp and timers that are open while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from segfloor_ros.messages.headers import stamp_of, to_ns
+from segfloor_ros.messages.join import StampJoiner
+from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.shared.reporter import Reporter
+
+LEAST_PERIOD_S = 0.001
+
+
+@dataclass
+class Input:
+    """A subscription or timer: what makes it, what ends it, and when it is wanted while the node
+    works. entity: what has been made; None while it is closed.
+    """
+
+    make: Callable[[], Any]
+    destroy: Callable[[Any], Any]
+    is_wanted: Callable[[], bool] = lambda: True
+    entity: Any = None
+
+
+class Inputs:
+    """The inputs of one node. They are declared once, and opened and closed with its states.
+
+    A fault in a callback is one line in the log that names the topic; the node lives on.
+    """
+
+    def __init__(self, node: Node, reporter: Reporter) -> None:
+        self._node = node
+        self._reporter = reporter
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._inputs: list[Input] = []
+        self._joiners: list[StampJoiner] = []
+        self.subscriptions: dict[str, Subscription] = {}
+        """The open subscriptions by the topic's name as in the code, before remapping."""
+        self.is_open = False
+        """Whether messages are received."""
+
+    def subscribe(
+        self,
+        name: str,
+        callback: Callable[[Any], None],
+        choose_profile: Callable[[], QoSProfile] | None = None,
+        is_wanted: Callable[[], bool] = lambda: True,
+        is_rapid: bool = False,
+    ) -> None:
+        """Receive a topic of `TOPICS`. choose_profile: asked whenever the subscription is made.
+        is_wanted: asked whenever the inputs open, and by `update`. is_rapid: with a message all
+        are taken that have come: to wait for each costs more than the message itself.
+        """
+        topic = TOPICS[name]
+
+        def take(message: Any, info: Mapping[str, Any]) -> None:
+            take_one(message, info)
+            for _ in range(topic.profile.depth if is_rapid else 0):
+                more = _taken(self.subscriptions[name])
+                if more is None:
+                    return
+                take_one(*more)
+
+        def take_one(message: Any, info: Mapping[str, Any]) -> None:
+            stamp_ns, subscription = stamp_of(message), self.subscriptions[name]
+            self._reporter.note_received(topic, stamp_ns, info, subscription)
+            try:
+                callback(message)
+            except Exception as error:
+                self._reporter.log_fault(name, error)
+
+        def subscribe() -> Subscription:
+            profile = choose_profile() if choose_profile else topic.profile
+            # What does not connect is reported by `qos_check`, in words and on /diagnostics.
+            quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+            # rclpy's annotation knows callbacks of one argument only.
+            two_arguments: Any = take
+            made = self._node.create_subscription(
+                topic.type, name, two_arguments, profile, event_callbacks=quiet
+            )
+            self.subscriptions[name] = made
+            return made
+
+        def unsubscribe(made: Subscription) -> None:
+            self.subscriptions.pop(name)
+            self._node.destroy_subscription(made)
+
+        self._inputs.append(Input(subscribe, unsubscribe, is_wanted))
+
+    def join(
+        self,
+        parts: Sequence[str],
+        process: Callable[[int, dict[str, Any]], None],
+        on_message: Callable[[str, int], None] | None = None,
+        choose_profile: Callable[[], QoSProfile] | None = None,
+        is_wanted: Callable[[], bool] = lambda: True,
+        **limits: Any,
+    ) -> None:
+        """Receive topics whose messages belong together by their stamps; `process` gets the stamp
+        and the messages by topic once all have arrived. Those that remain alone are reported.
+        on_message: gets topic and stamp of every message. limits: of the `StampJoiner`.
+        """
+        joiner = StampJoiner(parts, **limits)
+        self._joiners.append(joiner)
+
+        def take(part: str, message: Any) -> None:
+            stamp_ns = to_ns(message.header.stamp)
+            if on_message is not None:
+                on_message(part, stamp_ns)
+            complete = joiner.add(part, stamp_ns, message)
+            self._reporter.report_dropped(joiner, self.publishing_nodes)
+            if complete is not None:
+                process(stamp_ns, complete)
+
+        for part in joiner.all_parts:
+            self.subscribe(part, partial(take, part), choose_profile, is_wanted)
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call something regularly while the inputs are open."""
+        make = partial(self.steady_timer, period_s, callback)
+        self._inputs.append(Input(make, self._node.destroy_timer))
+
+    def repeat(self, step: Callable[[], float]) -> None:
+        """Call something while the inputs are open, each time after as many seconds as it has
+        returned the time before.
+        """
+
+        def start() -> Timer:
+            def run() -> None:
+                timer.timer_period_ns = round(1e9 * max(step(), LEAST_PERIOD_S))
+                timer.reset()
+
+            timer = self.steady_timer(LEAST_PERIOD_S, run)
+            return timer
+
+        self._inputs.append(Input(start, self._node.destroy_timer))
+
+    def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
+        """Make a timer that also runs while the time of a recording stands still."""
+        return self._node.create_timer(period_s, callback, clock=self._steady_clock)
+
+    def open(self) -> None:
+        """Receive from now on what is wanted."""
+        self.is_open = True
+        self.update()
+
+    def update(self) -> None:
+        """While the inputs are open, open those that are wanted by now, and close the others; first
+        close, since two may be of the same topic.
+        """
+        wanted = [self.is_open and one.is_wanted() for one in self._inputs]
+        for one, is_wanted in zip(self._inputs, wanted, strict=True):
+            if not is_wanted and one.entity is not None:
+                entity, one.entity = one.entity, None
+                one.destroy(entity)
+        for one, is_wanted in zip(self._inputs, wanted, strict=True):
+            if is_wanted and one.entity is None:
+                one.entity = one.make()
+
+    def close(self) -> None:
+        """Receive nothing any more, and give up what waits for a partner."""
+        self.is_open = False
+        self.update()
+        self.give_up_waiting()
+
+    def reopen(self) -> None:
+        """Subscribe again, with other profiles."""
+        if self.is_open:
+            self.close()
+            self.open()
+
+    def give_up_waiting(self) -> None:
+        """Drop the messages that wait for a partner."""
+        for joiner in self._joiners:
+            joiner.clear()
+
+    def remove_all(self) -> None:
+        """Close the inputs and declare none any more."""
+        self.close()
+        self._inputs.clear()
+        self._joiners.clear()
+
+    def publisher_count(self, name: str) -> int:
+        """Return how many publishers of a topic that is received now are seen."""
+        found = self.subscriptions.get(name)
+        return found.get_publisher_count() if found is not None else 0
+
+    def publishing_nodes(self, name: str) -> int:
+        """Return how many nodes publish a topic that is received now. One that was killed and
+        started again is one, though for a while both its lives are seen.
+        """
+        known = name in self.subscriptions
+        infos = self._node.get_publishers_info_by_topic(name) if known else []
+        return len({(info.node_namespace, info.node_name) for info in infos})
+
+
+def _taken(subscription: Subscription) -> tuple[Any, Mapping[str, Any]] | None:
+    """Return a message that has come, None without one."""
+    with subscription.handle:
+        message: tuple[Any, Mapping[str, Any]] | None = subscription.handle.take_message(
+            subscription.msg_type, subscription.raw
+        )
+    return message

@@ -1,0 +1,159 @@
+"""What is wrong with a camera and its driver, in words: for the node `stereo_slam`."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.calibration.rectification import rows_apart_px
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.headers import NS_PER_S
+from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+
+RECENT = 10
+SILENT_S = 3.0
+LIVE_NS = 60 * NS_PER_S
+ROWS_APART_PX = 1.5
+CHECK_ROWS_EVERY = 100
+PLAUSIBLE_ROLL_DEG = 20.0
+PLAUSIBLE_PITCH_DEG = 60.0
+
+
+class CameraWatch:
+    """Notices unsynchronised and missing images, missing calibrations, images that are not
+    rectified, and an implausible floor.
+    """
+
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+        self._node = node
+        self._own = own
+
+    def expect(self, left: str, right: str, is_rectified: bool) -> None:
+        """Watch these two topics from now on."""
+        self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
+        self._is_rectified = is_rectified
+        self._last_image_s: dict[str, float] = {}
+        self._is_live = False
+        self._pairs_until_check = 0
+
+    def saw_image(self, topic: str, stamp_ns: int) -> None:
+        """Note an image."""
+        self._stamps[topic].append(stamp_ns)
+        now_ns = self._node.get_clock().now().nanoseconds
+        self._last_image_s[topic] = 1e-9 * now_ns
+        self._is_live = abs(now_ns - stamp_ns) < LIVE_NS
+
+    def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
+        """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
+        has begun.
+        """
+        reporter = self._node.reporter
+        reporter.health.count('skipped')
+        if not is_ready:
+            words = 'skipped: calibration or mount of the camera are not known yet'
+            reporter.report(stamp_ns, Level.WARN, words)
+            return
+        reporter.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
+        reporter.diagnose(
+            'skipped',
+            f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
+            'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
+            'play a recording with lossless set on stereo_camera',
+        )
+
+    def find_problems(self, missing_infos: list[str]) -> None:
+        """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
+        for topic in missing_infos:
+            self._node.reporter.diagnose(
+                topic,
+                f'no message on {topic}: images wait for their calibration; let the driver '
+                'publish it, or remap the topic; `segfloor calibrate` makes one',
+                Level.ERROR,
+            )
+        self._find_silence()
+        self._find_mono()
+        self._find_different_stamps()
+
+    def check_rows(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> None:
+        """Compare the rows of a pair (H, W) that should be rectified, now and then."""
+        if self._pairs_until_check > 0:
+            self._pairs_until_check -= 1
+            return
+        found = rows_apart_px(left, right)
+        if found is None:
+            return
+        self._pairs_until_check = CHECK_ROWS_EVERY
+        if found[0] <= ROWS_APART_PX:
+            return
+        topics = ' and '.join(self._stamps)
+        what = (
+            f'{topics} are not rectified; take image_raw (image_kind: raw) or rectify them'
+            if self._is_rectified
+            else f'the calibration on camera_info is not that of {topics}; calibrate again'
+        )
+        self._node.reporter.diagnose(
+            'rows',
+            f'{what}: the same points stand {found[0]:.1f} rows apart (median of {found[1]})',
+            Level.ERROR,
+            lasts_s=30.0,
+        )
+
+    def judge_measured(self, mount: Mount) -> None:
+        """Say so where the mount that was measured from the floor is hard to believe."""
+        pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
+        if abs(roll) > PLAUSIBLE_ROLL_DEG or abs(pitch) > PLAUSIBLE_PITCH_DEG:
+            self._node.reporter.diagnose(
+                'tilt',
+                f'{next(iter(self._stamps))}: the floor seems tilted by {pitch:.1f} deg along and '
+                f'{roll:.1f} deg across the view, which is hardly so; does the camera see the '
+                'floor? else give camera_height_m, camera_pitch_rad and camera_roll_rad',
+                lasts_s=math.inf,
+            )
+
+    def _find_silence(self) -> None:
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
+        for topic, last_s in self._last_image_s.items():
+            # A recording may end or wait for the nodes; a camera may not. The time of one that has
+            # ended stands still.
+            if self._is_live and now_s - last_s > SILENT_S:
+                self._node.reporter.diagnose(
+                    f'silence of {topic}',
+                    f'no image on {topic} for a while; is the camera connected and its driver '
+                    'running?',
+                    Level.ERROR,
+                )
+
+    def _find_mono(self) -> None:
+        """Decline one camera alone."""
+        left, right = self._stamps
+        if len(self._stamps[left]) < RECENT or self._stamps[right]:
+            return
+        if not self._node.get_publishers_info_by_topic(right):
+            self._node.reporter.diagnose(
+                'one camera',
+                f'images come on {left}, but nobody publishes {right}: one camera alone does not '
+                'tell how far away anything is; publish or remap right or depth images',
+                Level.ERROR,
+            )
+
+    def _find_different_stamps(self) -> None:
+        left, right = self._stamps.values()
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
+        both_come = all(now_s - last_s < 1.0 for last_s in self._last_image_s.values())
+        if not both_come or len(left) < RECENT or len(right) < RECENT:
+            return
+        gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
+        if gap_ns > 1e9 * self._own.sync_tolerance_s:
+            self._node.reporter.diagnose(
+                'stamps',
+                f'the stamps of {" and ".join(self._stamps)} are {1e-6 * gap_ns:.1f} ms apart, '
+                f'more than sync_tolerance_s = {self._own.sync_tolerance_s:g} s: no pairs; trigger '
+                'both cameras together, or allow more',
+                Level.ERROR,
+            )

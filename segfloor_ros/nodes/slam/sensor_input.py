@@ -1,0 +1,267 @@
+"""What the node `stereo_slam` takes besides images: wheel odometry, an IMU, masks of what moves,
+and about where the robot is.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image, Imu
+
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.ros_messages import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.camera.sources.sensor_files import is_upright
+from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.measurements import Measurement, WheelPose
+from segfloor_ros.messages import qos
+from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.nodes.shared.connections import offered_best_effort
+from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.nodes.shared.transforms import Transforms
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
+MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'
+MAX_LATE_S = 0.05
+"""So long an image waits for what sensors measured up to its time."""
+
+NEAR_NS = 5_000_000
+"""Over so short a time what was measured before tells as well."""
+
+LIVE_S = 0.5
+"""A sensor that has said nothing for so long is not waited for."""
+
+MAX_WAITING = 500
+TF_AFTER_S = 3.0
+"""A topic is waited for so long before tf is taken for the wheels' odometry: it takes a while to
+connect."""
+
+
+KEPT = 30
+"""Masks that are kept for frames that have not been processed yet."""
+
+
+SIGMAS = 3.0
+
+LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.5, 0.26
+"""Nobody points more exactly than RViz says by itself: half a metre and 15 degrees."""
+
+
+class SensorInput:
+    """Receives what wheels and IMU measure, in the axes of the rectified left camera.
+
+    on_message: called after each. Where nobody publishes `wheel_odometry` and another node owns
+    odom → base_link, that is taken for it. Where an IMU is, tf tells; without it, one for which
+    up is up in the image is taken to be in the frame of the left images, others are not used.
+    """
+
+    def __init__(
+        self, node: AnyStageNode, transforms: Transforms, on_message: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._transforms = transforms
+        self._on_message = on_message
+        self._takes_best_effort = False
+        self.reset()
+        for name in (WHEELS, IMU):
+            receive = partial(self._receive, name)
+            node.inputs.subscribe(name, receive, self._choose_profile, is_rapid=True)
+
+    def reset(self) -> None:
+        """Know no camera and no measurement."""
+        self._camera: tuple[str, Array] | None = None
+        self._T_left_imu: Array | None = None
+        self._uses_imu = True
+        self._waiting: dict[str, deque[Odometry | Imu]] = {
+            name: deque(maxlen=MAX_WAITING) for name in (WHEELS, IMU)
+        }
+        self._latest: dict[str, tuple[int, float]] = {}
+        self._asked: tuple[int, float] = (0, 0.0)
+        self._began_s = time.monotonic()
+        self._has_tf_wheels = False
+
+    def begin(self, left_frame: str, R_rectified_left: Array) -> None:
+        """Know the camera. R_rectified_left: (3, 3) turns the frame of the left images into the
+        rectified one.
+        """
+        self._camera = left_frame, R_rectified_left
+
+    def adapt_reliability(self) -> None:
+        """Receive best effort where a driver offers no more."""
+        if not self._takes_best_effort and offered_best_effort(self._node, (WHEELS, IMU)):
+            self._takes_best_effort = True
+            self._node.inputs.reopen()
+
+    def _choose_profile(self) -> QoSProfile:
+        return qos.SENSORS if self._takes_best_effort else qos.SENSORS_RELIABLE
+
+    def take(self, stamp_ns: int, lag_ns: int = 0) -> list[Measurement]:
+        """Return what has not been returned yet, up to the first measurement of each sensor at or
+        after the time of an image, so that poses can be interpolated there; lag_ns: by how much
+        later its stamps are. So does a recording that is run without nodes.
+        """
+        wheels = self._tf_wheels(stamp_ns + lag_ns)
+        measured = [self._measured(message) for message in self._due(stamp_ns + lag_ns)]
+        return [*wheels, *(one for one in measured if one is not None)]
+
+    def _due(self, stamp_ns: int) -> Iterator[Odometry | Imu]:
+        """Yield the messages of each sensor up to the first at or after a time."""
+        for name, waiting in self._waiting.items():
+            in_order = sorted(waiting, key=_stamp_ns)
+            count = bisect_left(in_order, stamp_ns, key=_stamp_ns) + 1
+            yield from in_order[:count]
+            self._waiting[name] = deque(in_order[count:], MAX_WAITING)
+
+    def is_behind(self, stamp_ns: int, lag_ns: int = 0) -> bool:
+        """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
+        how much later its stamps are.
+        """
+        now_s = time.monotonic()
+        if self._asked[0] != stamp_ns:
+            self._asked = stamp_ns, now_s
+        if now_s > self._asked[1] + MAX_LATE_S:
+            return False
+        self._look_at_tf(now_s)
+        return any(
+            latest_ns < stamp_ns + lag_ns - NEAR_NS and now_s < heard_s + LIVE_S
+            for latest_ns, heard_s in self._latest.values()
+        )
+
+    def _look_at_tf(self, now_s: float) -> None:
+        """Note how far tf has the base, once it is clear that no topic tells it."""
+        until_ns = self._transforms.fused_until_ns()
+        if WHEELS in self._latest or until_ns is None or now_s < self._began_s + TF_AFTER_S:
+            return
+        self._has_tf_wheels = True
+        if until_ns != self._latest.get(TF_WHEELS, (0, 0.0))[0]:
+            self._latest[TF_WHEELS] = until_ns, now_s
+
+    def _tf_wheels(self, stamp_ns: int) -> list[WheelPose]:
+        T_odom_base = self._transforms.fused_base(stamp_ns) if self._has_tf_wheels else None
+        return [] if T_odom_base is None else [WheelPose(stamp_ns, T_odom_base)]
+
+    def _receive(self, name: str, message: Odometry | Imu) -> None:
+        if self._has_tf_wheels and name == WHEELS:
+            return
+        self._waiting[name].append(message)
+        if name == WHEELS or self._uses_imu:
+            self._note(name, message)
+
+    def _measured(self, message: Odometry | Imu) -> Measurement | None:
+        """Return what a message tells; None where it is not used."""
+        if isinstance(message, Odometry):
+            return wheel_pose(message, WHEELS)
+        if not measures_motion(message):
+            return None
+        T_left_imu = self._place(message)
+        self._uses_imu = T_left_imu is not None
+        if T_left_imu is not None:
+            return imu_sample(message, T_left_imu)
+        # No image waits for what is not used.
+        self._latest.pop(IMU, None)
+        assert self._camera is not None
+        self._node.reporter.diagnose(
+            IMU,
+            f'no tf from {self._camera[0]} to {message.header.frame_id or "its frame"}: '
+            f'{IMU} is not used; let another node publish where the IMU is',
+        )
+        return None
+
+    def _place(self, message: Imu) -> Array | None:
+        """Return where the IMU is in the rectified left optical frame (4, 4); tf may come late."""
+        assert self._camera is not None
+        if self._T_left_imu is None:
+            left_frame, R_rectified_left = self._camera
+            T_rectified_left = make_transform(R_rectified_left, np.zeros(3))
+            T = self._transforms.between(left_frame, message.header.frame_id)
+            if T is None:
+                return T_rectified_left if is_upright(xyz(message.linear_acceleration)) else None
+            self._T_left_imu = T_rectified_left @ T
+        return self._T_left_imu
+
+    def _note(self, name: str, message: Odometry | Imu) -> None:
+        latest_ns = max(_stamp_ns(message), self._latest.get(name, (0, 0.0))[0])
+        self._latest[name] = latest_ns, time.monotonic()
+        self._on_message()
+
+
+def _stamp_ns(message: Odometry | Imu) -> int:
+    return to_ns(message.header.stamp)
+
+
+class MaskInput:
+    """Receives masks and gives each frame the one of its stamp, or the latest that is not too old:
+    a network is slower than the camera, and no frame waits for it.
+    """
+
+    def __init__(self, node: AnyStageNode, timeout_s: float) -> None:
+        self._timeout_ns = round(timeout_s * 1e9)
+        self.reset()
+        node.inputs.subscribe(MASKS, self.take)
+
+    def reset(self) -> None:
+        """Forget the masks."""
+        self._masks: dict[int, Image] = {}
+
+    def take(self, message: Image) -> None:
+        """Keep a mask."""
+        self._masks[to_ns(message.header.stamp)] = message
+        while len(self._masks) > KEPT:
+            del self._masks[min(self._masks)]
+
+    def mask_for(self, stamp_ns: int, rectifier: StereoRectifier) -> NDArray[np.uint8] | None:
+        """Return the mask (H, W) uint8 on the rectified left image of a frame, None where there is
+        none. Raises InputError for one that is no grey image, CalibrationError for a wrong size.
+        """
+        fitting = [at for at in self._masks if stamp_ns - self._timeout_ns <= at <= stamp_ns]
+        if not fitting:
+            return None
+        mask = grey8_image(self._masks[max(fitting)], MASKS)
+        return rectifier.rectify_mask(mask)
+
+
+class InitialPose:
+    """Narrows the search of the camera in a known map to the surroundings of a pose."""
+
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+        self._node = node
+        self._map_frame = own.map_frame
+        self.reset()
+        node.inputs.subscribe(INITIAL_POSE, self._take)
+
+    def reset(self) -> None:
+        """Know no pose."""
+        self._given: tuple[Array, float, float] | None = None
+
+    def apply(self, slam: StereoSlam) -> None:
+        """Have SLAM look around a pose that was given since the last call, once it has a map."""
+        if self._given is not None and slam.mount is not None and slam.map.keyframes:
+            slam.search_near(*self._given)
+            self._given = None
+
+    def _take(self, message: PoseWithCovarianceStamped) -> None:
+        if message.header.frame_id not in ('', self._map_frame):
+            self._node.reporter.warn(
+                f'{INITIAL_POSE} is in frame {message.header.frame_id}; give it in '
+                f'{self._map_frame}'
+            )
+            return
+        T_map_base = pose_array(message.pose.pose)
+        sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
+        reach_m = SIGMAS * max(float(sigma[:3].max()), LEAST_SIGMA_M)
+        reach_rad = SIGMAS * max(float(sigma[3:].max()), LEAST_SIGMA_RAD)
+        self._given = T_map_base, reach_m, reach_rad
+        x, y = T_map_base[:2, 3].tolist()
+        self._node.get_logger().info(f'looks within {reach_m:.1f} m around x {x:.2f}, y {y:.2f}')

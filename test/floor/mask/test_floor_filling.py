@@ -1,0 +1,76 @@
+"""What is filled in and what is dropped, on masks drawn by hand and in a scene."""
+
+import numpy as np
+import pytest
+from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
+
+from segfloor_ros.floor.mask.filling import beside_something, beyond_texture, drop_islands
+from segfloor_ros.floor.mask.view import FloorView
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+
+def test_patches_much_smaller_than_the_floor_are_dropped():
+    mask = np.full((120, 200), NO_EVIDENCE, np.uint8)
+    mask[60:, :100] = FLOOR  # 6000 pixels
+    mask[10:40, 150:180] = FLOOR  # 900, a sixth
+    mask[90:100, 180:190] = FLOOR  # 100, a sixtieth
+    mask[80:110, 192:] = NOT_FLOOR
+    dropped = drop_islands(mask)
+    assert (dropped[90:100, 180:190] == NO_EVIDENCE).all()
+    others = np.ones(mask.shape, bool)
+    others[90:100, 180:190] = False
+    np.testing.assert_array_equal(dropped[others], mask[others])
+
+
+def blank_wall_on_floor(hole_rows, textured_share=1.0, top=NOT_FLOOR):
+    """Return a mask and where it has texture: floor from row 60 on, so many blank rows above it."""
+    mask = np.full((120, 40), top, np.uint8)
+    mask[60 - hole_rows : 60] = NO_EVIDENCE
+    mask[60:] = FLOOR
+    mask[70 : 70 + round(60 * (1 - textured_share))] = NO_EVIDENCE
+    return mask, mask == FLOOR
+
+
+def test_blank_rows_above_textured_floor_are_beyond_its_end():
+    mask, textured = blank_wall_on_floor(30)
+    np.testing.assert_array_equal(beyond_texture(mask, textured), mask == NO_EVIDENCE)
+
+
+def test_holes_and_floor_with_blank_parts_are_not():
+    for mask, textured in (
+        blank_wall_on_floor(10),  # no more than the window of texture
+        blank_wall_on_floor(30, textured_share=0.4),  # this floor has blank parts
+        blank_wall_on_floor(30, top=FLOOR),  # a wall would hide the floor behind it
+    ):
+        assert not beyond_texture(mask, textured).any()
+
+
+def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it():
+    view = FloorView.of(CAMERA, MOUNT, 220)
+    mask = np.full(view.derolled.shape, NO_EVIDENCE, np.uint8)
+    strip = view.columns < view.line.slope * (view.derolled - view.line.horizon)
+    mask[~strip] = FLOOR
+    box, blank = slice(100, 140), slice(180, 220)
+    mask[box][~strip[box]] = NOT_FLOOR
+    mask[blank, :100] = NO_EVIDENCE
+    beside = beside_something(view, mask)
+    assert not beside[~strip].any()
+    for rows in (box, blank):
+        inner = slice(rows.start + 8, rows.stop - 8)
+        assert beside[inner][strip[inner]].all()
+    assert not beside[145:170].any()
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_blank_board_of_the_shade_of_the_floor_is_not_filled(floor_kind):
+    """Floor is seen left and right of it, and nothing tells the two apart but the texture."""
+    width_m, ahead_m, grey = 1.6, 1.5, floor_kind.get('grey', 120.0)
+    corner = (ahead_m, -width_m / 2, 0.0)
+    board = Patch(corner, (0, width_m, 0), (0, 0, 1.5), False, grey=grey, contrast=0.0)
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), board])
+    left, right, floor, _ = scene.render()
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    # No more than three rows at its foot.
+    assert ((mask == FLOOR) & ~floor).sum() < 3 * CAMERA.fx * width_m / ahead_m

@@ -1,0 +1,220 @@
+"""The mount measured from the floor of rendered scenes and of recordings."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from floor_scenes import SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
+
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.stages import make_slam
+
+
+def estimate(scene: Scene, **known) -> Mount | None:
+    left, right, _, _ = scene.render()
+    estimator = MountEstimator(scene.camera, **known)
+    estimator.add(left, right, np.eye(4))
+    return estimator.mount
+
+
+@pytest.mark.parametrize(
+    ('height_m', 'pitch_deg', 'roll_deg'), [(0.3, 7.0, 0.0), (0.5, 15.0, 4.0), (0.25, 0.0, -3.0)]
+)
+def test_one_frame_of_plain_floor_is_enough(height_m, pitch_deg, roll_deg):
+    true = Mount(height_m, np.radians(pitch_deg), np.radians(roll_deg))
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)], mount=true)
+    mount = estimate(scene)
+    assert mount is not None
+    assert mount.height_m == pytest.approx(height_m, rel=0.02)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.2)
+    assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.2)
+
+
+def test_what_is_known_is_kept():
+    scene = Scene([floor_patch(), wall()])
+    mount = estimate(scene, height_m=0.3, roll_rad=0.0, forward_m=0.2, left_m=-0.1)
+    assert mount is not None
+    assert (mount.height_m, mount.roll_rad) == (0.3, 0.0)
+    assert (mount.forward_m, mount.left_m) == (0.2, -0.1)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_table_is_not_the_floor():
+    table = Patch((0.8, -0.8, 0.45), (1.2, 0, 0), (0, 1.6, 0), False, seed=8)
+    scene = Scene([floor_patch(), wall(), table], mount=Mount(0.9, np.radians(15.0)))
+    mount = estimate(scene)
+    assert mount is None or mount.height_m == pytest.approx(0.9, rel=0.03)
+
+
+def test_a_wall_is_not_the_floor():
+    assert estimate(Scene([wall(1.0)], mount=Mount(0.3))) is None
+
+
+def test_nothing_is_seen_of_a_blank_scene():
+    assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
+
+
+def blank_floored(mount: Mount, *things: Patch) -> Scene:
+    """Return a scene whose floor has no texture, with three walls that have, and things."""
+    left = Patch((-1, 1.5, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=3)
+    right = Patch((-1, -1.3, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=4)
+    patches = [
+        floor_patch(grey=175.0, contrast=0.0),
+        left,
+        right,
+        wall(3.0, contrast=45.0),
+        *things,
+    ]
+    return Scene(patches, mount=mount, noise_grey=1.0)
+
+
+def mounts_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> list[Mount | None]:
+    """Return what a robot that drives ahead over the floor has measured after each frame."""
+    estimator = MountEstimator(scene.camera)
+    T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    mounts = []
+    for i in range(frames):
+        here = replace(scene.mount, forward_m=i * step_m)
+        left, right, _, _ = replace(scene, mount=here).render()
+        estimator.add(left, right, T_left_base @ here.T_base_left)
+        mounts.append(estimator.mount)
+    return mounts
+
+
+@pytest.mark.parametrize(('height_m', 'pitch_deg', 'roll_deg'), [(0.35, 8.0, 0.0), (0.2, 5.0, 2.0)])
+def test_a_floor_of_one_colour_is_where_things_stand(height_m, pitch_deg, roll_deg):
+    true = Mount(height_m, np.radians(pitch_deg), np.radians(roll_deg))
+    scene = blank_floored(true, *box(1.6, 0.5, 0.4, 0.3))
+    mount = mounts_on_the_way(scene, 4)[-1]
+    assert mount is not None
+    assert mount.height_m == pytest.approx(height_m, rel=0.03)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(pitch_deg, abs=0.3)
+    assert np.degrees(mount.roll_rad) == pytest.approx(roll_deg, abs=0.5)
+
+
+SWAYING = [(0.35, 8.0), (0.31, 11.0), (0.39, 6.0), (0.33, 12.0), (0.38, 5.0), (0.32, 10.0)]
+"""Heights in m and pitches in degrees of a camera that is carried in a hand."""
+
+
+@pytest.mark.parametrize('poses_sway', [True, False], ids=['seen by SLAM', 'not seen by SLAM'])
+def test_a_camera_that_a_hand_holds_has_no_mount(poses_sway):
+    """Where the poses sway, it keeps no place above the plane; else planes do not repeat."""
+    scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
+    estimator = MountEstimator(scene.camera)
+    T_left_base = np.linalg.inv(scene.mount.T_base_left)
+    for i, (height_m, pitch_deg) in enumerate(SWAYING):
+        seen_from = Mount(height_m, np.radians(pitch_deg), forward_m=0.15 * i)
+        left, right, _, _ = replace(scene, mount=seen_from).render()
+        told = seen_from if poses_sway else replace(scene.mount, forward_m=0.15 * i)
+        estimator.add(left, right, T_left_base @ told.T_base_left)
+    assert estimator.mount is None
+
+
+def test_poses_come_before_the_mount_is_known():
+    scene = blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3))
+    scene = replace(scene, camera=SMALL_CAMERA)
+    slam = make_slam(scene.camera, StereoSlamSettings(keyframe_max_frames=1))
+    come, positions = [], []
+    for i in range(8):
+        here = replace(scene.mount, forward_m=0.1 * i)
+        left, right, _, _ = replace(scene, mount=here).render()
+        come.append(len(slam.process(StereoFrame(i, i * 10**8, left, right))))
+        if slam.provisional is not None:
+            positions.append(slam.provisional.T_odom_base[:3, 3])
+    settled = come.index(max(come))
+    assert settled > 0
+    # One for each frame before, none since, and nothing is lost.
+    assert len(positions) == settled
+    assert come == [0] * settled + [settled + 1] + [1] * (7 - settled)
+    assert positions[-1] == pytest.approx([0.1 * (settled - 1), 0.0, 0.0], abs=0.02)
+
+
+def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
+    """It faces a wall and turns away from it: nothing of what it saw first is seen again."""
+    mount = Mount(0.35, np.radians(8.0))
+    faced = Scene([wall(1.0, contrast=45.0, seed=9)], mount=mount, noise_grey=1.0)
+    room = blank_floored(mount, *box(1.6, 0.5, 0.4, 0.3))
+    slam = make_slam(SMALL_CAMERA, StereoSlamSettings(keyframe_max_frames=1))
+    results = []
+    for i in range(20):
+        here = replace(mount, forward_m=0.1 * max(0, i - 8))
+        scene = replace(faced if i < 3 else room, mount=here, camera=SMALL_CAMERA)
+        left, right, _, _ = scene.render()
+        results += slam.process(StereoFrame(i, i * 4 * 10**8, left, right))
+    assert [r.index for r in results] == list(range(20))
+    assert [r.index for r in results if not r.tracked] == [3, 4, 5, 6]
+    assert slam.mount is not None
+    assert slam.mount.height_m == pytest.approx(0.35, rel=0.04)
+    path = next(r.keyframe.path for r in reversed(results) if r.keyframe)
+    assert path.stamp_ns[0] == results[7].stamp_ns
+
+
+def test_after_a_while_the_best_plane_will_do():
+    """A rug is all that has texture: its height is known to two per cent, never better."""
+    rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=20.0, seed=5)
+    floor, blank = floor_patch(grey=175.0, contrast=0.0), wall(4.0, contrast=0.0)
+    scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=2.0)
+    mounts = mounts_on_the_way(scene, 24, step_m=0.01)
+    mount = mounts[-1]
+    assert mounts[14] is None
+    assert mount is not None
+    assert mount.height_m == pytest.approx(0.3, rel=0.05)
+
+
+def test_posters_on_a_blank_wall_are_not_the_floor():
+    """They hang at one height, and nothing shows where the wall ends."""
+    poster = [
+        Patch((2.9, y, 0.12), (0, 0.5, 0), (0, 0, 0.4), False, contrast=45.0, seed=i)
+        for i, y in enumerate((-1.0, 0.5))
+    ]
+    floor = floor_patch(grey=175.0, contrast=0.0)
+    blank = wall(3.0, grey=175.0, contrast=0.0)
+    scene = Scene([floor, blank, *poster], mount=Mount(0.35, np.radians(8.0)), noise_grey=1.0)
+    assert mounts_on_the_way(scene, 8) == [None] * 8
+
+
+def test_disagreement_names_both_numbers():
+    used, seen = Mount(0.35, np.radians(7.0)), Mount(0.30, np.radians(10.0))
+    words = disagreement(used, seen)
+    assert words is not None
+    for number in ('0.350 m', '0.300 m', '7.0 deg', '10.0 deg'):
+        assert number in words
+    assert disagreement(used, used) is None
+
+
+def kitti_folder(folder, pose_name='poses.txt'):
+    rows = [line.split() for line in (folder / 'calib.txt').read_text().splitlines()]
+    P0, P1 = (np.array(row[1:], float).reshape(3, 4) for row in rows[:2])
+    image = cv2.imread(str(folder / 'image_0' / '000000.png'), 0)
+    camera = StereoCamera(
+        image.shape[1], image.shape[0], P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P1[0, 0]
+    )
+    poses = np.tile(np.eye(4), (len(np.loadtxt(folder / pose_name)), 1, 1))
+    poses[:, :3] = np.loadtxt(folder / pose_name).reshape(-1, 3, 4)
+    return camera, poses
+
+
+def measured(folder, frames) -> Mount | None:
+    camera, poses = kitti_folder(folder)
+    estimator = MountEstimator(camera)
+    for i in frames:
+        pair = [cv2.imread(str(folder / f'image_{k}' / f'{i:06d}.png'), 0) for k in (0, 1)]
+        estimator.add(*pair, poses[i])
+    return estimator.mount
+
+
+def test_corridor(shared_data):
+    mount = measured(shared_data / 'corridor', [0])
+    assert mount is not None
+    assert mount.height_m == pytest.approx(0.30, abs=0.005)
+    assert np.degrees(mount.pitch_rad) == pytest.approx(7.0, abs=0.2)
+    assert np.degrees(mount.roll_rad) == pytest.approx(0.0, abs=0.2)
+
+
+def test_car_on_a_road(shared_data):
+    mount = measured(shared_data / 'kitti06', range(0, 30, 3))
+    assert mount is not None
+    assert mount.height_m == pytest.approx(1.65, abs=0.05)

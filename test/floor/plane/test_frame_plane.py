@@ -1,0 +1,40 @@
+"""The plane of the floor in one frame: as the camera is mounted, or level in the map."""
+
+import numpy as np
+import pytest
+from floor_scenes import MOUNT, SMALL_CAMERA
+
+from segfloor_ros.floor.plane.frame_plane import expectations, likeliest, plane_of_frame
+
+
+def pitched(pitch_deg: float):
+    """Return the pose (4, 4) of a base that looks down by so much."""
+    angle, pose = np.radians(pitch_deg), np.eye(4)
+    pose[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
+    return pose
+
+
+@pytest.mark.parametrize(
+    ('share', 'pitch_deg', 'expected'),
+    [
+        ((0.3, 0.1), 4.0, 0),
+        ((0.01, 0.3), 4.0, 1),  # the robot brakes
+        ((-0.1, 0.3), -4.0, 1),
+        ((0.2, 0.3), 4.0, 0),
+        ((-0.03, 0.02), 8.0, 0),  # wrong matches deny the floor, the path has tilted
+        ((-0.1, -0.01), 8.0, 0),
+        ((-0.1, 0.01), 1.0, 0),
+    ],
+)
+def test_the_floor_is_where_the_map_has_it_only_if_that_is_what_is_seen(share, pitch_deg, expected):
+    known = expectations(MOUNT, pitched(pitch_deg))
+    assert np.degrees(known[1, 0] - known[0, 0]) == pytest.approx(pitch_deg)
+    assert likeliest(np.array(share), known) == expected
+
+
+@pytest.mark.filterwarnings('error')
+def test_where_nothing_is_matched_the_camera_is_as_it_is_mounted():
+    nothing = np.zeros((SMALL_CAMERA.height, SMALL_CAMERA.width), np.float32)
+    expected = expectations(MOUNT, pitched(4.0))
+    found = plane_of_frame(SMALL_CAMERA, 0, nothing, nothing, 1.0, expected).angles_height
+    np.testing.assert_allclose(found, expected[0], atol=1e-6)

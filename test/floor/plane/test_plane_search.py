@@ -1,0 +1,53 @@
+"""What an accelerometer adds to the search for the floor's plane."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from segfloor_ros.floor.plane.plane_fit import Samples, plane_of
+from segfloor_ros.floor.plane.plane_search import PlaneSearch
+from segfloor_ros.measurements import Up
+
+UNKNOWN = np.full(3, np.nan)
+DISPARITY_M = 40.0
+TRUE = np.array([0.1, 0.0, 0.5])
+"""Pitch, roll and height of the camera."""
+
+
+def little_floor(seed: int) -> Samples:
+    """Samples of a far, narrow piece of floor, with an error of disparity that they share."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.1, 0.1, 80), rng.uniform(0.06, 0.12, 80)
+    rays = np.stack([u, v, np.ones(80)], axis=1)
+    disparity = -DISPARITY_M * rays @ plane_of(TRUE)
+    disparity += 0.4 + 3 * u + rng.normal(0, 0.2, 80)
+    return Samples(rays, np.zeros(3), disparity, np.ones(80), DISPARITY_M)
+
+
+def test_with_little_floor_in_view_up_tells_pitch_and_roll() -> None:
+    frames = [little_floor(seed) for seed in range(6)]
+    search = PlaneSearch(UNKNOWN)
+    alone = search.refined(frames, TRUE, np.zeros((0, 3))).angles_height
+    up = plane_of(np.array([*TRUE[:2], 1.0]))
+    search.expect(Up(up, math.radians(0.5)))
+    level = search.refined(frames, TRUE, np.zeros((0, 3))).angles_height
+    error, error_alone = np.abs(level - TRUE), np.abs(alone - TRUE)
+    assert (error[:2] < 0.8 * error_alone[:2]).all()
+    assert np.degrees(error[:2]).max() < 1.0
+
+
+def test_a_floor_that_is_plain_to_see_counts_more_than_what_was_felt() -> None:
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.0, 0.8, 3000)
+    rays = np.stack([u, v, np.ones(3000)], axis=1)
+    disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
+    frame = Samples(rays, np.zeros(3), disparity, np.ones(3000), DISPARITY_M)
+    search = PlaneSearch(UNKNOWN)
+    # The robot starts on a ramp of 4 degrees.
+    ramp = plane_of(np.array([TRUE[0] + math.radians(4.0), 0.0, 1.0]))
+    search.expect(Up(ramp, math.radians(0.5)))
+    found = search.refined([frame] * 4, TRUE, np.zeros((0, 3))).angles_height
+    assert np.degrees(found[:2]) == pytest.approx(np.degrees(TRUE[:2]), abs=0.2)
