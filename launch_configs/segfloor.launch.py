@@ -2,6 +2,8 @@
 driver.
 """
 
+from pathlib import Path
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -10,7 +12,6 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
 STAGES = ('stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
-RESPAWN_DELAY_S = 2.0
 YES, NO = ('true', '1', 'yes', 'on'), ('false', '0', 'no', 'off')
 
 CAMERAS = {
@@ -185,6 +186,9 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     with_rviz = truth('rviz', LaunchConfiguration('rviz').perform(context))
     if with_rviz:
         require('rviz2', 'rviz:=true', context)
+    params_file = LaunchConfiguration('params_file').perform(context)
+    if not Path(params_file).is_file():
+        raise ValueError(f'params_file:={params_file}: no such file')
     tf = [('/tf', 'tf'), ('/tf_static', 'tf_static')] if own_tf else []
     topics, kind = remapped_topics(camera, context)
     files = [in_package(['params', f'camera_{camera}.yaml'])] if camera in CAMERAS else []
@@ -203,7 +207,6 @@ def make_nodes(context: LaunchContext) -> list[Node]:
                 *('-p', f'autostart:={str(autostart).lower()}', *kind, *arguments),
             ],
             respawn=respawn,
-            respawn_delay=RESPAWN_DELAY_S,
             output='screen',
         )
 

@@ -71,11 +71,18 @@ def test_a_saved_map_goes_to_slam_alone(launched) -> None:
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
+def test_a_parameter_file_that_is_not_there_is_an_error(launched, path) -> None:
+    bag = {} if path == SEGFLOOR else {'bag': '/a'}
+    with pytest.raises(ValueError, match=r'params_file:=/nope\.yaml: no such file'):
+        launched(path, params_file='/nope.yaml', **bag)
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_only_launch_is_imported(path) -> None:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             assert node.module is not None
-            assert node.module.split('.')[0] in ('launch', 'launch_ros')
+            assert node.module.split('.')[0] in ('launch', 'launch_ros', 'pathlib')
         assert not isinstance(node, ast.Import)
 
 

@@ -5,6 +5,7 @@ not connect for their qualities of service, or look like one that nobody publish
 from __future__ import annotations
 
 import difflib
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -18,7 +19,7 @@ from segfloor_ros.messages.diagnostics import CONNECTIONS, NEED_LASTS_S, Level
 from segfloor_ros.messages.qos import describe_policies
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
 from segfloor_ros.nodes.shared.inputs import Inputs
-from segfloor_ros.nodes.shared.reporter import PROBLEM_LASTS_S, Reporter
+from segfloor_ros.nodes.shared.reporter import PROBLEM_LASTS_S, SETTLED_S, Reporter
 
 MOST = 3
 
@@ -33,10 +34,7 @@ FALLS_BEHIND_S = 2.0
 KILLED_SEEN_S = 20.0
 """How long Fast DDS shows a process that was killed."""
 
-REPEAT_SILENT_S = 30.0
-
-SILENT_S = 3.0
-"""A topic that nobody publishes for so long is logged."""
+REPEAT_TWIN_S = 30.0
 
 
 def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
@@ -196,15 +194,15 @@ class Connections:
         now_s = time.monotonic()
         self._silent_since_s = {name: self._silent_since_s.get(name, now_s) for name in silent}
         if not silent:
-            self._reporter.health.over('publishers')
+            self._reporter.over('publishers')
             return
-        text = f'nobody publishes {", ".join(silent)}; start the node that does, or remap'
-        if now_s - min(self._silent_since_s.values()) < SILENT_S:
-            self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
-            return
+        what = f'nobody publishes {in_words(silent)}'
         hints = [hint for name in silent if (hint := self._hint(name))]
-        text = '; '.join([text, *hints])
-        self._reporter.diagnose('publishers', text, repeat_s=REPEAT_SILENT_S)
+        text = '; '.join([what, 'start the node that does, or remap', *hints])
+        self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
+        if now_s - min(self._silent_since_s.values()) >= SETTLED_S:
+            line = f'{what}; /diagnostics says what to do'
+            self._reporter.warn(line, 'publishers', repeat_s=math.inf)
 
     def _hint(self, name: str) -> str:
         """Return what is published that looks like a topic, in words; '' where nothing does."""
@@ -229,4 +227,4 @@ class Connections:
                 'on the same topics; stop the other one, or give this one a namespace; one that '
                 f'was killed is seen for up to {KILLED_SEEN_S:g} s'
             )
-            self._reporter.diagnose('twin', text, Level.ERROR, repeat_s=REPEAT_SILENT_S)
+            self._reporter.diagnose('twin', text, Level.ERROR, repeat_s=REPEAT_TWIN_S)

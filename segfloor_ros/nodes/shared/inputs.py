@@ -154,6 +154,7 @@ class Inputs:
     def open(self) -> None:
         """Receive from now on what is wanted."""
         self.is_open = True
+        self._reporter.note_opened()
         self.update()
 
     def update(self) -> None:

@@ -24,6 +24,10 @@ PROBLEM_LASTS_S = 3.0
 
 REPEAT_S = 5.0
 
+SETTLED_S = 10.0
+"""Nodes that are started together are seen one after the other: what is missing is not logged
+before."""
+
 
 class LossCounter:
     """Counts the gaps in the numbers of one topic. A number that does not grow is that of another
@@ -72,6 +76,7 @@ class Reporter:
             DIAGNOSTICS.type, DIAGNOSTICS.name, DIAGNOSTICS.profile
         )
         self.health = Health()
+        self._opened_s = time.monotonic()
         self._losses: dict[str, LossCounter] = {}
         self._silent_until_s: dict[str, float] = {}
 
@@ -95,6 +100,10 @@ class Reporter:
             name, profile = self._node.get_name(), subscription.qos_profile
             text = loss_in_words(topic.name, lost, name, profile)
             self.diagnose(f'loss on {topic.name}', text, Level.ERROR, LOSS_LASTS_S)
+
+    def note_opened(self) -> None:
+        """Note that messages are received from now on."""
+        self._opened_s = time.monotonic()
 
     def restart_loss_counts(self) -> None:
         """What comes from now on is not missed."""
@@ -135,7 +144,8 @@ class Reporter:
             )
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
-            self.warn(text, about=names + crowded)
+            if time.monotonic() - self._opened_s >= SETTLED_S:
+                self.warn(text, about=names + crowded)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def diagnose(
@@ -156,6 +166,11 @@ class Reporter:
         """Log a warning, at most every so many seconds about the same."""
         if self._is_due(about or text, repeat_s):
             self._node.get_logger().warning(text)
+
+    def over(self, about: str) -> None:
+        """Note that a problem is over; when it comes again it is logged again."""
+        self.health.over(about)
+        self._silent_until_s.pop(about, None)
 
     def log_fault(self, where: str, error: Exception) -> None:
         """Log a fault in one line, at most every few seconds; the traceback of an unexpected one

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -100,11 +101,22 @@ def _begin_ros(arguments: Sequence[str]) -> None:
         raise SettingsError(f'ROS does not take the arguments: {text}') from None
 
 
+def _interrupt(number: int, frame: object) -> None:
+    """End the process in order. A second interrupt must not break off what the first has begun."""
+    signal.signal(signal.SIGINT, _ignore)
+    raise KeyboardInterrupt
+
+
+def _ignore(number: int, frame: object) -> None:
+    """Not SIG_IGN: rclpy gives back the handler that it found to Python."""
+
+
 def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     """Run nodes in one executor, like `run_node`."""
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     status = 0
     nodes: Sequence[Node] = ()
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         _share_one_heap()
         prepare_middleware()
@@ -122,11 +134,15 @@ def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     except Exception:
         # An interrupt takes the middleware away under whatever is being done at that moment, and
         # may be heard of a little later than what it broke.
-        time.sleep(INTERRUPT_HEARD_S)
+        with contextlib.suppress(KeyboardInterrupt):
+            time.sleep(INTERRUPT_HEARD_S)
         if rclpy.ok():
             raise
     finally:
+        signal.signal(signal.SIGINT, _ignore)
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
+        # Python gives its own handlers up before it ends.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(status)
