@@ -12,12 +12,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.cloud.settings import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.files import read_yaml
+from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.node_settings import is_node_parameter
@@ -136,9 +134,10 @@ def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
     if not separator or not (dot or stage in ROBOT_PARAMETERS):
         raise SettingsError(f'--set {assignment}: expected stage.parameter=value')
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError):
-        raise SettingsError(f'--set {assignment}: {text} is no value in YAML') from None
+        value = yaml_value(text)
+    except ValueError as error:
+        what = f'{shortened(text)} is no value in YAML: {error}'
+        raise SettingsError(f'--set {key}: {what}') from None
     if not dot:
         return ROBOT_STAGES[0], stage, value
     if stage not in STAGE_SETTINGS:

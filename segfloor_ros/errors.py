@@ -44,6 +44,11 @@ class MapError(SegfloorError):
     """No map could be made, or a map file cannot be read."""
 
 
+def printable(text: str) -> str:
+    """Return a text in one line, with blanks for what no terminal, page or XML file shows."""
+    return ''.join(c if c.isprintable() else ' ' for c in text)
+
+
 @contextmanager
 def os_errors(what: str, advice: str = '') -> Iterator[None]:
     """Turn an error of the operating system into one line: what is wrong, why, what to do. Raises

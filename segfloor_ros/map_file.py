@@ -10,7 +10,6 @@ import io
 import json
 import os
 import zipfile
-import zlib
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,12 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, os_errors
-from segfloor_ros.files import replacing
+from segfloor_ros.files.whole import json_object, read_bytes, replacing
 
 FORMAT = 'segfloor map'
 VERSION = 1
 HEADER = 'header.json'
 COMPRESSION_LEVEL = 3
+
+MAX_BYTES = 1 << 32
+MAX_RATIO, SMALL = 20, 1 << 24
+"""A map unpacks to at most so many times its size, and a small one to so many bytes more."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -55,8 +58,7 @@ def read_map_file(path: Path) -> MapFile:
     """Read a map. Raises InputError, in one line, for a file that is missing, truncated, damaged,
     of another kind or of a newer version.
     """
-    with os_errors(f'{path}: cannot be read'):
-        return from_bytes(path.read_bytes(), str(path))
+    return from_bytes(read_bytes(path, at_most=MAX_BYTES), str(path))
 
 
 def to_bytes(saved: MapFile, compress: bool = True) -> bytes:
@@ -85,30 +87,53 @@ def from_bytes(data: bytes, name: str) -> MapFile:
     """Return the map of a file's bytes; name: of the file, for what is wrong with it."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            header = json.loads(archive.read(HEADER))
-            _check_header(header, name)
-            saved = MapFile(header)
+            _check_sizes(archive, len(data))
+            saved = MapFile(_header(archive, name))
             for member in archive.namelist():
                 if member != HEADER:
                     part, _, array = member.removesuffix('.npy').partition('/')
-                    content = io.BytesIO(archive.read(member))
-                    saved.parts.setdefault(part, {})[array] = np.load(content, allow_pickle=False)
+                    saved.parts.setdefault(part, {})[array] = _array(archive.read(member))
             return saved
-    except KeyError:
-        raise InputError(f'{name}: is no map of segfloor; give a file of --save-map') from None
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError):
+    except InputError:
+        raise
+    except Exception:  # damaged bytes make the library fail in any way, anywhere
         words = 'is truncated or damaged, or no map of segfloor'
         raise InputError(f'{name}: {words}; give a file of --save-map') from None
 
 
-def _check_header(header: Any, name: str) -> None:
-    if not isinstance(header, dict) or header.get('format') != FORMAT:
-        raise KeyError(HEADER)
-    if header.get('version') != VERSION:
+def _check_sizes(archive: zipfile.ZipFile, packed: int) -> None:
+    """Raise ValueError for more than maps hold in so many bytes; members that lie over one another
+    take no more room in the file than one of them.
+    """
+    if sum(member.file_size for member in archive.infolist()) > MAX_RATIO * packed + SMALL:
+        raise ValueError('unpacks to more than a map')
+
+
+def _header(archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
+    """Return the header of a map. Raises InputError for a file that is none."""
+    found = json_object(archive.read(HEADER)) if HEADER in archive.namelist() else None
+    if found is None or found.get('format') != FORMAT:
+        raise InputError(f'{name}: is no map of segfloor; give a file of --save-map')
+    if found.get('version') != VERSION:
         raise InputError(
-            f'{name}: is a map of version {header.get("version")}, this release reads version '
-            f'{VERSION}; take the release that wrote it'
+            f'{name}: is a map of version {str(found.get("version"))[:9]}, this release reads '
+            f'version {VERSION}; take the release that wrote it'
         )
+    return found
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    """Return the array of an `.npy` file of numbers. Raises ValueError where its header asks for
+    more than the file has.
+    """
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        raise ValueError(f'arrays are of version 1.0, not {version}')
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    if is_fortran or dtype.kind not in 'biuf':
+        raise ValueError('arrays are of numbers, row by row')
+    return np.frombuffer(content, dtype, offset=file.tell()).reshape(shape).copy()
 
 
 def _add(archive: zipfile.ZipFile, name: str, content: bytes | memoryview) -> None:

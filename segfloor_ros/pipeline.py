@@ -100,7 +100,7 @@ class KeyframeStages:
             self._labelling.from_arrays(parts['cloud'])
             self.labelled = self._labelling.labelled(loaded.cloud)
             self._mapper.from_arrays(parts['grid'], parts['grid']['stamp_ns'] + loaded.shift_ns)
-        except (KeyError, ValueError, IndexError, TypeError):
+        except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
             raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
         self._is_loaded = True
 

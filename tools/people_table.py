@@ -28,8 +28,8 @@ from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, compare, score_ma
 from segfloor_ros.evaluation.prm import Mask, RoadMapPlan, score_road_maps
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, cell_centres, observable, states
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-from segfloor_ros.evaluation.trajectory_files import read_table
 from segfloor_ros.evaluation.truth import MapTruth, load_truth
+from segfloor_ros.files.tables import read_table
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun

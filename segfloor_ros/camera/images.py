@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from typing import Any
 
 import cv2
@@ -10,12 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
 
-Grey = NDArray[np.uint8] | NDArray[np.uint16]
-"""A grey image (H, W), uint8 or uint16."""
-
-PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
-JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
 # OpenCV names a Bayer pattern by the second pixel of the second row, ROS by the first of the first.
@@ -35,13 +30,6 @@ CHANNELS = {
 
 
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
-
-MAX_PIXELS = 50_000_000
-"""Larger images are refused: a damaged header must not take all memory."""
-
-
-class CorruptImageError(InputError):
-    """The data of one image is damaged; the rest of the recording may be fine."""
 
 
 def grey_image(message: Any, name: str) -> Grey:
@@ -74,30 +62,10 @@ def depth_image(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.floa
     return _unpacked(message, name, 1, np.dtype(DEPTH_TYPES[message.encoding]))[:, :, 0]
 
 
-def decode_file(data: bytes, name: str) -> Grey:
-    """Return the grey image of the bytes of a PNG, JPEG or other image file.
-
-    Raises CorruptImageError, naming it, when it is truncated or damaged, also where a decoder would
-    make up the missing part.
-    """
-    _check_complete(data, name)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise CorruptImageError(f'{name}: the image cannot be decoded')
-    if image.dtype not in (np.uint8, np.uint16):
-        raise CorruptImageError(f'{name}: pixels are {image.dtype}, expected 8 or 16 bits')
-    _check_size(image.shape[1], image.shape[0], name)
-    return image
-
-
 def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the pixels (H, W, channels) of a message; rows may be padded up to its `step`."""
     width, height, step = int(message.width), int(message.height), int(message.step)
-    _check_size(width, height, name)
+    check_size(width, height, name)
     row_bytes = width * channels * dtype.itemsize
     buffer = np.frombuffer(message.data, np.uint8)
     if width <= 0 or height <= 0 or step < row_bytes or buffer.size != step * height:
@@ -109,11 +77,6 @@ def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> N
     sent = dtype.newbyteorder('>' if message.is_bigendian else '<')
     pixels = rows.view(sent).astype(dtype, copy=False)
     return np.asarray(pixels.reshape(height, width, channels))
-
-
-def _check_size(width: int, height: int, name: str) -> None:
-    if width * height > MAX_PIXELS:
-        raise InputError(f'{name}: an image of {width}x{height} pixels is not taken')
 
 
 def to_grey(image: Grey) -> Grey:
@@ -163,30 +126,3 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
         code = cv2.COLOR_RGBA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_RGB2GRAY
         return cv2.cvtColor(pixels, code)
     return to_grey(pixels)
-
-
-def _check_complete(data: bytes, name: str) -> None:
-    if not data:
-        raise CorruptImageError(f'{name}: the image is empty')
-    # Cameras pad their JPEGs with zeros.
-    if data.startswith(JPEG_START) and JPEG_END not in data.rstrip(b'\0')[-64:]:
-        raise CorruptImageError(f'{name}: the JPEG is truncated')
-    if data.startswith(PNG_SIGNATURE):
-        _check_png(data, name)
-
-
-def _check_png(data: bytes, name: str) -> None:
-    """Walk over the chunks (length, type, data, CRC; ISO/IEC 15948) up to the end mark."""
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        length = int.from_bytes(data[position : position + 4], 'big')
-        end = position + 8 + length
-        if end + 4 > len(data):
-            break
-        checksum = int.from_bytes(data[end : end + 4], 'big')
-        if zlib.crc32(data[position + 4 : end]) != checksum:
-            raise CorruptImageError(f'{name}: the PNG is damaged')
-        if data[position + 4 : position + 8] == b'IEND':
-            return
-        position = end + 4
-    raise CorruptImageError(f'{name}: the PNG is truncated')

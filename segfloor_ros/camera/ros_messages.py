@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from segfloor_ros import MAX_PIXELS
 from segfloor_ros.camera.calibration.parameters import EyeCalibration
-from segfloor_ros.camera.images import MAX_PIXELS
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, transform_from_quaternion
 from segfloor_ros.measurements import ImuSample, WheelPose

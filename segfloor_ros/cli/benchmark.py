@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from segfloor_ros.benchmark.chain import Workload
 from segfloor_ros.benchmark.stages import BenchmarkPlan, as_document, parse_sizes, run_benchmark
@@ -27,7 +28,7 @@ def benchmark(
     frames: Annotated[
         int, typer.Option(min=2, help='Generated image pairs for all stages.')
     ] = DEFAULT.frames,
-    seed: Annotated[int, typer.Option(help='Of the generated data.')] = DEFAULT.seed,
+    seed: Annotated[int, typer.Option(min=0, help='Of the generated data.')] = DEFAULT.seed,
     threads: Annotated[
         int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
     ] = DEFAULT.threads,
@@ -98,7 +99,7 @@ def stage_table(workloads: list[Workload]) -> Table:
     """Return the time of every stage as a table."""
     table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
     for workload in workloads:
-        table.add_row(f'[bold]{workload.name}')
+        table.add_row(Text(workload.name, 'bold'))
         for name, stage in workload.stages.items():
             times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
             ratio = f'{stage["p50_ratio"]:.3f}'

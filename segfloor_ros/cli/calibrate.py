@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
+from segfloor_ros.cli.options import finite
 from segfloor_ros.cli.output import console, progress_bar, value_table
 from segfloor_ros.errors import SettingsError
 
@@ -16,7 +18,9 @@ def calibrate(
     folder: Annotated[
         Path, typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.')
     ],
-    square_m: Annotated[float, typer.Option('--square', help='Side of a square in metres.')],
+    square_m: Annotated[
+        float, typer.Option('--square', callback=finite, help='Side of a square in metres.')
+    ],
     board: Annotated[
         str, typer.Option(help='Inner corners along the long and the short side.')
     ] = '9x6',
@@ -26,11 +30,11 @@ def calibrate(
     ] = None,
 ) -> None:
     """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files."""
-    long, _, short = board.partition('x')
-    if not (long.isdigit() and short.isdigit()):
+    sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
+    if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')
     with progress_bar('searching boards', None) as progress:
-        result = calibrate_folder(folder, square_m, (int(long), int(short)), out, progress)
+        result = calibrate_folder(folder, square_m, (int(sides[1]), int(sides[2])), out, progress)
     _print_result(result, out or folder)
 
 

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from segfloor_ros.cli.output import console, figure_table, print_error
 from segfloor_ros.errors import SettingsError, os_errors
@@ -88,7 +89,7 @@ def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:
     continued = {entry.continue_from for entry in suite.entries}
     jobs: dict[str, Job] = {}
     for entry in suite.entries:
-        params = Path(entry.params).read_text() if entry.params else ''
+        params = read_text(Path(entry.params)) if entry.params else ''
         origin = jobs[entry.continue_from].digest() if entry.continue_from else ''
         jobs[entry.name] = Job(entry, params, str(cache), reuse, entry.name in continued, origin)
     return list(jobs.values())
@@ -130,7 +131,7 @@ def _read_outcome(job: Job, out: Path) -> Outcome | None:
     """Return what an earlier check found, None where it did not or with other parameters."""
     folder = out / job.entry.name
     try:
-        record = json.loads((folder / MEASURED).read_text())
+        record = read_json(folder / MEASURED, 'what a check has measured')
         if record['job'] != job.digest():
             return None
         return Outcome(
@@ -172,7 +173,7 @@ def _print_progress(checked: verdicts.Checked, done: int, total: int) -> None:
 def _table(result: verdicts.SuiteResult) -> Table:
     table = figure_table('recording', 'result', *HEADINGS)
     for checked in result.recordings:
-        state = f'[{"green" if checked.holds else "red"}]{checked.state}'
+        state = Text(checked.state, 'green' if checked.holds else 'red')
         values = (checked.measured.get(name) for name in COLUMNS)
         cells = ('' if value is None else number(value) for value in values)
         table.add_row(checked.name, state, *cells)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from segfloor_ros.cli.options import finite
 from segfloor_ros.cli.output import console, figure_table, value_table
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.alignment import find_alignment
@@ -24,8 +25,9 @@ from segfloor_ros.evaluation.map_score import (
 )
 from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
 from segfloor_ros.evaluation.raster import from_frame
-from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS, read_table
+from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS
 from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
+from segfloor_ros.files.tables import number, read_table
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
@@ -57,15 +59,23 @@ def evaluate_map(
         int, typer.Option(min=0, help='Nodes of a road map; 0: one per 1.5 m², 20 to 400.')
     ] = 0,
     min_distance: Annotated[
-        float, typer.Option(min=0.0, help='Between nodes of a road map [m].')
+        float,
+        typer.Option(min=0.0, callback=finite, help='Between nodes of a road map [m].'),
     ] = 0.25,
     repetitions: Annotated[int, typer.Option(min=1, help='Road maps to average.')] = 30,
-    seed: Annotated[int, typer.Option(help='Of the random nodes.')] = 0,
+    seed: Annotated[int, typer.Option(min=0, help='Of the random nodes.')] = 0,
     sight: Annotated[
-        float, typer.Option(min=0.1, help='How far the camera counts as seeing [m].')
+        float,
+        typer.Option(min=0.1, callback=finite, help='How far the camera counts as seeing [m].'),
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
-        float | None, typer.Option(help='Horizontal field of view [deg]; else from the scene.')
+        float | None,
+        typer.Option(
+            min=1.0,
+            max=360.0,
+            callback=finite,
+            help='Horizontal field of view [deg]; else from the scene.',
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -174,7 +184,7 @@ def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> P
     if align == 'found':
         return find_alignment(estimate, truth.grid, truth.start_pose)
     try:
-        x, y, yaw = (float(part) for part in align.split(','))
+        x, y, yaw = (number(part.strip()) for part in align.split(','))
     except ValueError:
         raise SettingsError(
             f'--align {align}: expected none, found or X,Y,YAW in metres and radians'

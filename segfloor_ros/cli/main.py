@@ -19,6 +19,7 @@ from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.cli.simulate import simulate
 from segfloor_ros.errors import MapError, SegfloorError
+from segfloor_ros.files.silence import own_standard_error
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 
 app = typer.Typer(
@@ -70,4 +71,5 @@ def run_app(program: typer.Typer) -> None:
 
 
 if __name__ == '__main__':
+    own_standard_error()
     main()

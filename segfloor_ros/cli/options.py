@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from segfloor_ros.configuration import Configuration, resolve
+from segfloor_ros.errors import SettingsError
+
+
+def finite(parameter: typer.CallbackParam, value: float | None) -> float | None:
+    """Return a number of an option; `nan` is within any bounds. Raises SettingsError."""
+    if value is not None and not math.isfinite(value):
+        raise SettingsError(f'--{parameter.name} {value}: expected a finite number')
+    return value
+
 
 Input = Annotated[
     str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')

@@ -18,11 +18,12 @@ from rich.progress import (
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
+from segfloor_ros.errors import printable
 from segfloor_ros.measurements import RecordedSensor
 from segfloor_ros.results_folder import RunSummary, summary_rows
 
-console = Console()
-error_console = Console(stderr=True, soft_wrap=True)
+console = Console(markup=False)
+error_console = Console(stderr=True, soft_wrap=True, markup=False)
 
 Progress = Callable[..., None]
 """Told how many steps are done and, as `note`, the state in words."""
@@ -35,12 +36,12 @@ Announce = Callable[[str, int], Progress]
 def announcing() -> Iterator[Announce]:
     """Show a progress bar whose task is replaced by the next announced one."""
     columns = (
-        TextColumn('{task.description}'),
+        TextColumn('{task.description}', markup=False),
         BarColumn(),
         TaskProgressColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn('{task.fields[note]}'),
+        TextColumn('{task.fields[note]}', markup=False),
     )
     with ProgressBar(*columns, console=error_console, transient=not sys.stderr.isatty()) as bar:
         task = bar.add_task('starting', total=None, note='')
@@ -100,7 +101,7 @@ def print_summary(title: str, summary: RunSummary) -> None:
 
 def print_error(message: str) -> None:
     """Print one line on standard error."""
-    error_console.print(f'segfloor: {message}', markup=False, highlight=False)
+    error_console.print(f'segfloor: {printable(message)}', highlight=False)
 
 
 def finish_run(input_name: str, out: Path, report: bool) -> None:

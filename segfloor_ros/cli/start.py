@@ -9,6 +9,7 @@ def main() -> None:
     """Run the command line; without its libraries, end with one line and status 2."""
     try:
         from segfloor_ros.cli.main import main as run
+        from segfloor_ros.files.silence import own_standard_error
     except ModuleNotFoundError as error:
         if (error.name or '').startswith('segfloor_ros'):
             raise
@@ -20,4 +21,5 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
+    own_standard_error()
     run()

@@ -8,6 +8,7 @@ import numpy as np
 
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.whole import read_bytes
 
 VERTEX = np.dtype(
     [
@@ -44,10 +45,7 @@ def write_ply(path: Path, points: LabelledPoints) -> None:
 
 def read_ply(path: Path) -> LabelledPoints:
     """Read a file of `write_ply`. Raises InputError naming the file when it is not one."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f'{path}: cannot read the cloud ({error.strerror})') from None
+    content = read_bytes(path)
     head, mark, body = content.partition(b'end_header\n')
     count = len(body) // VERTEX.itemsize
     if not mark or head + mark != _header(count) or len(body) != count * VERTEX.itemsize:

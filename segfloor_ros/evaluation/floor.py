@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import check_same_size, read_mask
+from segfloor_ros.files.yaml_files import read_yaml
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
+OUTLINES = ('floor', 'obstacle', 'unsure')
+FAR_PX = 1 << 15
 UNSURE_PX = 2
 """How far the outlines of floor that are drawn by hand may be off."""
 
@@ -81,13 +83,9 @@ def score_floor_folders(estimate: Path, truth: Path) -> FloorScore:
         raise InputError(f'{estimate} and {truth} have no mask of the same name (%06d.png)')
     counts = np.zeros(5, np.int64)
     for name in common:
-        mask = _read_mask(estimates[name])
-        true = draw_outline(drawn[name], mask.shape) if drawn else _read_mask(files[name])
-        if mask.shape != true.shape:
-            raise InputError(
-                f'{estimates[name]}: is {mask.shape[1]}x{mask.shape[0]}, '
-                f'the true mask {true.shape[1]}x{true.shape[0]}'
-            )
+        mask = read_mask(estimates[name])
+        true = draw_outline(drawn[name], mask.shape) if drawn else read_mask(files[name])
+        check_same_size(mask, true, estimates[name])
         counts += count_pixels(mask, true)
     return FloorScore(len(common), len(truths) - len(common), *(int(value) for value in counts))
 
@@ -96,11 +94,17 @@ def read_outlines(path: Path) -> dict[int, dict[str, Any]]:
     """Return, by frame, the polygons [u, v, u, v, …] that a YAML file has under `frames`: `floor`,
     `obstacle`, `unsure`. Raises InputError where it has none.
     """
+    frames = read_yaml(path, 'frames with outlines').get('frames')
     try:
-        frames = yaml.safe_load(path.read_text())['frames']
-        return {int(index): dict(outline) for index, outline in frames.items()}
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f'{path}: no outlines of floor by frame ({error})') from error
+        found = {int(index): dict(outline) for index, outline in frames.items()}
+        for outline in found.values():
+            for polygon in [p for kind in OUTLINES for p in outline.get(kind, [])]:
+                points = np.array(polygon, np.float64).reshape(-1, 2)
+                if len(points) < 3 or not (np.abs(points) < FAR_PX).all():
+                    raise ValueError(f'{polygon} is no polygon')
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f'{path}: no outlines of floor by frame ({error})') from None
+    return found
 
 
 def draw_outline(outline: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -146,13 +150,6 @@ def _mask_files(folder: Path, inner: str) -> dict[str, Path]:
     if not files:
         raise InputError(f'{folder}: no floor masks (%06d.png) here')
     return files
-
-
-def _read_mask(path: Path) -> NDArray[np.uint8]:
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise InputError(f'{path}: not a readable image')
-    return mask.astype(np.uint8)
 
 
 def _ratio(part: int, whole: int) -> float:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.cloud.ply import read_ply
-from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.configuration import resolve
+from segfloor_ros.evaluation.run_summary import read_summary
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import MapTruth, load_truth
+from segfloor_ros.files.images import check_same_size, read_mask
+from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import load_map
@@ -66,23 +65,21 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
 
     Raises InputError naming the file that is missing or malformed.
     """
-    summary = _read_summary(folder / 'summary.json')
-    settings_text = _read_text(folder / 'settings.yaml')
-    parameters = {
-        name: node['ros__parameters'] for name, node in yaml.safe_load(settings_text).items()
-    }
-    source = open_source(StereoCameraSettings.from_mapping(parameters['stereo_camera']))
+    summary = read_summary(folder / 'summary.json')
+    settings = folder / 'settings.yaml'
+    parameters = resolve(settings)
+    source = open_source(parameters.stereo_camera)
     return ReportData(
         folder=folder,
         name=Path(source.name).name,
         summary=summary,
-        settings_text=settings_text,
-        floor_settings=FloorSegmentationSettings.from_mapping(parameters['floor_segmentation']),
+        settings_text=read_text(settings),
+        floor_settings=parameters.floor_segmentation,
         camera=source.camera,
         mount=Mount(
             summary['camera_height_m'],
             summary['camera_pitch_rad'],
-            summary.get('camera_roll_rad', 0.0),
+            summary['camera_roll_rad'],
         ),
         grid=load_map(folder / 'map.yaml'),
         trajectory=read_trajectory(folder / 'trajectory.txt')[1],
@@ -97,7 +94,7 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
 
 def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFrame]:
     """Return some frames that have a mask, evenly over the drive."""
-    files = sorted(folder.glob('*.png')) if folder.is_dir() else []
+    files = sorted(folder.glob('[0-9]' * 6 + '.png')) if folder.is_dir() else []
     chosen = np.unique(np.linspace(0, len(files) - 1, STRIP_LENGTH).round().astype(int))
     wanted = {int(files[i].stem): files[i] for i in chosen} if files else {}
     strip: list[MaskedFrame] = []
@@ -105,21 +102,7 @@ def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFr
         if len(strip) == len(wanted):
             break
         if frame.index in wanted:
-            mask = cv2.imread(str(wanted[frame.index]), cv2.IMREAD_GRAYSCALE)
-            strip.append(MaskedFrame(frame, mask.astype(np.uint8)))
+            mask = read_mask(wanted[frame.index])
+            check_same_size(mask, frame.left, wanted[frame.index])
+            strip.append(MaskedFrame(frame, mask))
     return strip
-
-
-def _read_summary(path: Path) -> dict[str, Any]:
-    try:
-        summary = json.loads(_read_text(path))
-    except ValueError:
-        raise InputError(f'{path}: not valid JSON') from None
-    if 'stages' not in summary or 'camera_height_m' not in summary:
-        raise InputError(f'{path}: not the summary of a run')
-    return summary
-
-
-def _read_text(path: Path) -> str:
-    with os_errors(f'{path}: cannot be read', '; is this a run?'):
-        return path.read_text()

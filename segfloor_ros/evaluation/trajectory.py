@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
+from segfloor_ros.files.whole import read_json
 from segfloor_ros.geometry import Array, invert, make_transform
 
 MAX_STAMP_DIFFERENCE_S = 0.02
@@ -196,10 +196,10 @@ def _frames_of_run(folder: Path) -> int:
     path = folder / 'summary.json'
     if not path.is_file():
         return 0
-    try:
-        return int(json.loads(path.read_text())['frames'])
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f'{path}: does not say how many frames there were') from None
+    frames = read_json(path, 'the summary of a run').get('frames')
+    if type(frames) is not int or not 0 < frames < 1 << 32:
+        raise InputError(f'{path}: does not say how many frames there were')
+    return frames
 
 
 def _file_in(path: Path, name: str) -> Path:

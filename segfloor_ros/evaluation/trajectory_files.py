@@ -4,32 +4,19 @@ beside them.
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.tables import read_table
 from segfloor_ros.geometry import Array
 
 TUM_COLUMNS = 8
 KITTI_COLUMNS = 12
-
-
-def read_table(path: Path) -> Array:
-    """Return the numbers of a text file (rows, columns). Raises InputError when it has none."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore', UserWarning)
-            table = np.loadtxt(path, ndmin=2)
-    except OSError:
-        raise InputError(f'{path}: cannot be read; is the path right?') from None
-    except ValueError as error:
-        raise InputError(f'{path}: not a table of numbers ({error})') from None
-    if not table.size:
-        raise InputError(f'{path}: is empty')
-    return table
+FARTHEST = 1e10
+"""Times in seconds and positions in metres are not beyond this."""
 
 
 def read_trajectory(path: Path) -> tuple[Array, Array]:
@@ -38,22 +25,27 @@ def read_trajectory(path: Path) -> tuple[Array, Array]:
     KITTI poses take their times from times.txt in the same folder. Raises InputError.
     """
     table = read_table(path)
-    if not np.isfinite(table).all():
-        raise InputError(f'{path}: has values that are not finite')
     if table.shape[1] == TUM_COLUMNS:
-        return _from_tum(table, path)
+        return _checked(*_from_tum(table, path), path)
     if table.shape[1] == KITTI_COLUMNS:
-        return _times_beside(path, len(table)), _from_kitti(table)
+        return _checked(_times_beside(path, len(table)), _from_kitti(table, path), path)
     raise InputError(
         f'{path}: has {table.shape[1]} columns; a TUM trajectory has 8 (t x y z qx qy qz qw), '
         'KITTI poses have 12'
     )
 
 
-def _from_tum(table: Array, path: Path) -> tuple[Array, Array]:
-    times = table[:, 0]
+def _checked(times: Array, poses: Array, path: Path) -> tuple[Array, Array]:
+    for name, values in (('times', times), ('positions', poses[:, :3, 3])):
+        if np.abs(values).max() > FARTHEST:
+            raise InputError(f'{path}: has {name} up to {np.abs(values).max():.3g}')
     if (np.diff(times) <= 0).any():
         raise InputError(f'{path}: time stamps must increase from row to row')
+    return times, poses
+
+
+def _from_tum(table: Array, path: Path) -> tuple[Array, Array]:
+    times = table[:, 0]
     norms = np.linalg.norm(table[:, 4:], axis=1)
     if (np.abs(norms - 1) > 1e-2).any():
         row = int(np.argmax(np.abs(norms - 1))) + 1
@@ -64,9 +56,13 @@ def _from_tum(table: Array, path: Path) -> tuple[Array, Array]:
     return times, poses
 
 
-def _from_kitti(table: Array) -> Array:
+def _from_kitti(table: Array, path: Path) -> Array:
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3] = table.reshape(-1, 3, 4)
+    R = np.clip(poses[:, :3, :3], -2.0, 2.0)
+    error = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    if (error > 1e-2).any():
+        raise InputError(f'{path}, row {np.argmax(error) + 1}: holds no rotation')
     return poses
 
 

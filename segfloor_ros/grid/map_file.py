@@ -6,13 +6,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.files import read_yaml, replacing
+from segfloor_ros.files.images import read_picture
+from segfloor_ros.files.whole import replacing
+from segfloor_ros.files.yaml_files import read_yaml
 from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 OCCUPIED_THRESH = 0.65
@@ -47,10 +48,7 @@ def load_map(path: Path) -> OccupancyGrid:
     """
     description = _read_description(path)
     image_path = path.parent / description['image']
-    image = cv2.imread(str(image_path), cv2.IMREAD_UNCHANGED) if image_path.is_file() else None
-    if image is None or image.dtype != np.uint8:
-        raise InputError(f'{image_path}: the image of {path.name} is missing or no 8-bit image')
-    grey, opaque = _grey_and_opaque(image)
+    grey, opaque = _grey_and_opaque(read_picture(image_path))
     cells = _cells(grey, opaque, description)
     x, y, _ = description['origin']
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), description['resolution'], (x, y))

@@ -10,10 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from segfloor_ros.errors import InputError
-from segfloor_ros.files import read_yaml
+from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.floor_plan import is_map_file, scene_of_map
@@ -129,5 +127,9 @@ def assigned(values: dict[str, Any], assignments: Iterable[str]) -> dict[str, An
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
                 raise InputError(f'--set {assignment}: {group} has no named values')
-        inner[name] = yaml.safe_load(text)
+        try:
+            inner[name] = yaml_value(text)
+        except ValueError as error:
+            what = f'{shortened(text)} is no value in YAML: {error}'
+            raise InputError(f'--set {key}: {what}') from None
     return result

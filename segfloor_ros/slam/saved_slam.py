@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.errors import CalibrationError, InputError, MapError
 from segfloor_ros.geometry import invert, transform_points
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.slam.results import KeyframePath, SparseCloud
@@ -17,6 +18,7 @@ PART = 'slam'
 BEFORE_ALL_NS = -1_000_000_000
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
+PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
 LOST_IDS = 1_000_000
 """More than a drive gives to points after its map was kept for the last time: who goes on with that
 map does not give them again."""
@@ -61,7 +63,9 @@ def load_slam(
     """
     try:
         check_camera(saved, camera, name)
-        mount, arrays = Mount(**saved.header['mount']), saved.parts[PART]
+        mount, arrays = _mount(saved), saved.parts[PART]
+        if not all(np.isfinite(arrays[column]).all() for column in PLACES):
+            raise ValueError('places that are nowhere')
         stamp_ns = arrays['keyframe_stamp_ns']
         shift_ns = 0 if ends_ns is None else ends_ns - int(stamp_ns[-1])
         T_world_odom = np.array(saved.header['T_world_odom']) if ends_ns is None else None
@@ -72,7 +76,7 @@ def load_slam(
         }
         slam.load(moved, mount, localize, T_world_odom)
         return loaded_map(saved, shift_ns)
-    except (KeyError, ValueError, IndexError, TypeError):
+    except (ArithmeticError, LookupError, ValueError, TypeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
 
 
@@ -80,7 +84,7 @@ def saved_camera(saved: MapFile, name: str) -> StereoCamera:
     """Return the camera that a map was made with. Raises InputError, by the file's name."""
     try:
         return StereoCamera(**saved.header['camera'])
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, CalibrationError):
         raise InputError(f'{name}: does not tell its camera; save it anew') from None
 
 
@@ -92,11 +96,19 @@ def check_camera(saved: MapFile, camera: StereoCamera, name: str) -> None:
 
 def loaded_map(saved: MapFile, shift_ns: int) -> LoadedMap:
     """Return what a saved map holds for the stages behind SLAM."""
-    T_map_world, arrays = Mount(**saved.header['mount']).T_base_left, saved.parts[PART]
+    T_map_world, arrays = _mount(saved).T_base_left, saved.parts[PART]
     T_map_base = T_map_world @ invert(arrays['keyframe_T_camera_world']) @ invert(T_map_world)
     xyz = transform_points(T_map_world, arrays['point_xyz_world']).astype(np.float32)
     path = KeyframePath(arrays['keyframe_stamp_ns'] + shift_ns, T_map_base)
     return LoadedMap(path, SparseCloud(arrays['point_stable_id'], xyz), shift_ns)
+
+
+def _mount(saved: MapFile) -> Mount:
+    """Return the mount that a map was made with. Raises KeyError, TypeError or ValueError."""
+    values = saved.header['mount']
+    if not all(type(value) in (int, float) and math.isfinite(value) for value in values.values()):
+        raise ValueError('a mount of no numbers')
+    return Mount(**values)
 
 
 def new_keyframes(path: KeyframePath) -> KeyframePath:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import SegfloorError
+from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.files.yaml_files import Key, MarkedYaml, read_marked_yaml
 from segfloor_ros.settings import suggestion
-from segfloor_ros.suite.marked_yaml import Key, MarkedYaml, read_marked_yaml
 from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
 from segfloor_ros.suite.result_files import find_recordings, is_url
 
@@ -63,7 +63,7 @@ class Suite:
 
 def read_suite(path: Path) -> Suite:
     """Read a suite. Raises SettingsError naming the file, the line and what is wrong."""
-    document = read_marked_yaml(path)
+    document = read_marked_yaml(path, SettingsError)
     values = _mapping(document, (), document.values, SUITE_KEYS)
     defaults = _mapping(document, ('defaults',), values.get('defaults') or {}, SHARED_KEYS)
     recordings = values.get('recordings')

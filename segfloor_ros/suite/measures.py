@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
+from segfloor_ros.evaluation.run_summary import read_summary
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import Pose2d, load_truth
 from segfloor_ros.grid.map_file import load_map
@@ -80,7 +80,7 @@ def measure_run(
     known = float((states(grid) != UNKNOWN).sum())
     measured = {'known_area_m2': known * grid.resolution_m**2}
     if (run / 'summary.json').is_file():
-        measured.update(_of_summary(json.loads((run / 'summary.json').read_text()), reference_ms))
+        measured.update(_of_summary(read_summary(run / 'summary.json'), reference_ms))
     if (run / 'trajectory.txt').is_file():
         measured['return_m'] = _return_m(run / 'trajectory.txt')
     if truth is not None:

@@ -18,7 +18,9 @@ from junitparser import Attr, Error, Failure, IntAttr, JUnitXml, Skipped, TestCa
 from junitparser.junitparser import SystemErr, SystemOut
 
 from segfloor_ros import __version__
+from segfloor_ros.errors import InputError, printable
 from segfloor_ros.evaluation.report import REPORT_NAME, html_page
+from segfloor_ros.files.images import read_mask
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
 from segfloor_ros.suite.measures import MEASURES, Bound, number
 from segfloor_ros.suite.verdicts import Checked, SuiteResult
@@ -41,7 +43,7 @@ def write_page(result: SuiteResult, folder: Path) -> Path:
     head = ''.join(f'<th>{_heading(name)}</th>' for name in names)
     rows = ''.join(_row(checked, folder) for checked in result.recordings)
     failed = ''.join(
-        f'<li class="bad">{html.escape(complaint)}</li>'
+        f'<li class="bad">{html.escape(printable(complaint))}</li>'
         for checked in result.recordings
         for complaint in checked.complaints
     )
@@ -49,7 +51,9 @@ def write_page(result: SuiteResult, folder: Path) -> Path:
     path = folder / PAGE
     about = f'{kept} of {len(result.recordings)} recordings are as they should be'
     table = f'<h2>Recordings</h2><table><tr>{head}</tr>{rows}</table>'
-    path.write_text(html_page(result.name, about, complaints + table, MARKS), encoding='utf-8')
+    path.write_text(
+        html_page(printable(result.name), about, complaints + table, MARKS), encoding='utf-8'
+    )
     return path
 
 
@@ -78,8 +82,9 @@ def _heading(name: str) -> str:
 
 def _thumbnail(path: Path) -> str:
     """Return a small picture of what is known in a map, '' where there is none."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    if image is None:
+    try:
+        image = read_mask(path)
+    except InputError:
         return ''
     left, top, width, height = cv2.boundingRect((image != UNKNOWN_PIXEL).astype(np.uint8))
     image = image[top : top + height, left : left + width] if width and height else image
@@ -99,14 +104,16 @@ class _Suite(TestSuite):
 
 def write_junit(result: SuiteResult, path: Path) -> None:
     """Write a test case for each recording's map and for each of its bounds."""
-    suite = _Suite(result.name)
+    suite = _Suite(printable(result.name))
     suite.id, suite.package = 0, 'segfloor'
     suite.hostname = socket.gethostname()
     now = datetime.datetime.now(tz=datetime.timezone.utc)
     suite.timestamp = now.strftime('%Y-%m-%dT%H:%M:%S')
     suite.add_property('segfloor_ros', __version__)
-    suite.add_testcases([case for c in result.recordings for case in _cases(result.name, c)])
-    complaints = [line for checked in result.recordings for line in checked.complaints]
+    suite.add_testcases([case for c in result.recordings for case in _cases(suite.name, c)])
+    complaints = [
+        line for checked in result.recordings for line in map(printable, checked.complaints)
+    ]
     for element, text in ((SystemOut(), ''), (SystemErr(), '\n'.join(complaints))):
         element.text = text
         suite.append(element)
@@ -118,7 +125,7 @@ def write_junit(result: SuiteResult, path: Path) -> None:
 def _cases(suite: str, checked: Checked) -> list[TestCase]:
     mapped = TestCase('map', f'{suite}.{checked.name}', round(checked.seconds, 3))
     if checked.problem:
-        mapped.result = [Error(checked.problem, 'no map')]
+        mapped.result = [Error(printable(checked.problem), 'no map')]
     cases = [mapped]
     for verdict in checked.verdicts:
         case = TestCase(_case_name(verdict.bound), f'{suite}.{checked.name}', 0.0)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.files.tables import number
+from segfloor_ros.files.whole import read_json
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
 from segfloor_ros.suite.measures import Verdict, bounds_of_baseline
@@ -77,12 +79,10 @@ def write_baseline(result: SuiteResult, path: Path) -> None:
 def read_baseline(path: Path) -> Baseline:
     """Read what `write_baseline` wrote. Raises InputError."""
     try:
-        recordings = json.loads(path.read_text())['recordings']
+        recordings = read_json(path, 'a baseline')['recordings']
         return {
-            name: {key: float(value) for key, value in measures.items()}
+            name: {key: number(str(value)) for key, value in measures.items()}
             for name, measures in recordings.items()
         }
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read ({error.strerror})') from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, AttributeError):
         raise InputError(f'{path}: not a baseline; write one with --write-baseline') from None

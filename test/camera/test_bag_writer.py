@@ -91,7 +91,7 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
     source = opened(folder)
     (folder / 'image_0' / '000002.png').unlink()
     out = tmp_path / 'out' / 'drive.mcap'
-    with pytest.raises(InputError, match=r'000002.png: cannot read the image'):
+    with pytest.raises(InputError, match=r'000002.png: cannot be read'):
         convert(source, out)
     assert list(out.parent.iterdir()) == []
 

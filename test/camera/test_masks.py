@@ -38,7 +38,7 @@ def test_a_mask_of_another_size_is_named(drive, tmp_path):
 def test_a_file_that_is_no_image_is_named(drive, tmp_path):
     write_mask(tmp_path / 'masks', 0, np.zeros((HEIGHT, WIDTH), np.uint8))
     (tmp_path / 'masks' / '000001.png').write_bytes(b'nothing')
-    with pytest.raises(InputError, match=r'000001\.png: is no image'):
+    with pytest.raises(InputError, match=r'000001\.png: the image cannot be decoded'):
         list(opened(drive, masks=str(tmp_path / 'masks')).frames())
 
 

@@ -43,5 +43,5 @@ def test_broken_files_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / 'c.ply').write_bytes(whole[:-1])
     with pytest.raises(InputError, match=r'c\.ply'):
         read_ply(tmp_path / 'c.ply')
-    with pytest.raises(InputError, match=r'gone\.ply: cannot read'):
+    with pytest.raises(InputError, match=r'gone\.ply: cannot be read'):
         read_ply(tmp_path / 'gone.ply')

@@ -56,7 +56,7 @@ def test_bad_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match='no floor masks'):
         score_floor_folders(tmp_path / 'missing', tmp_path / 'a')
     (tmp_path / 'a' / '000000.png').write_bytes(b'not a picture')
-    with pytest.raises(InputError, match='not a readable image'):
+    with pytest.raises(InputError, match='cannot be decoded'):
         score_floor_folders(tmp_path / 'a', tmp_path / 'c')
 
 

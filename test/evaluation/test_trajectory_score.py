@@ -126,10 +126,10 @@ def test_kitti_and_tum_agree(tmp_path):
     [
         ('', 'empty'),
         ('1 2 3\n', 'has 3 columns'),
-        ('a b c d e f g h\n', 'not a table of numbers'),
+        ('a b c d e f g h\n', 'line 1: a: not a finite number'),
         ('0 0 0 0 0 0 0 1\n0 1 0 0 0 0 0 1\n', 'must increase'),
         ('0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 0\n', 'row 2: the quaternion'),
-        ('0 nan 0 0 0 0 0 1\n', 'not finite'),
+        ('0 nan 0 0 0 0 0 1\n', 'line 1: nan: not a finite number'),
     ],
 )
 def test_malformed_files_name_what_is_wrong(tmp_path, content, message):

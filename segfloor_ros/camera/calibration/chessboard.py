@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.images import CorruptImageError
-from segfloor_ros.camera.sources.files import read_grey
 from segfloor_ros.camera.sources.image_folders import find_image_pairs
-from segfloor_ros.errors import CalibrationError, InputError
+from segfloor_ros.errors import CalibrationError, InputError, os_errors
+from segfloor_ros.files.images import CorruptImageError, read_grey
 from segfloor_ros.geometry import Array, make_transform
 
 MIN_PAIRS = 5
@@ -69,15 +68,16 @@ def calibrate_folder(
     pairs searched. Zhang, A flexible new technique for camera calibration, TPAMI 2000; both
     eyes and their relative pose are refined together. Raises InputError or CalibrationError.
     """
-    if square_m <= 0 or min(board) < 2:
+    if not 0 < square_m < 100 or min(board) < 3:
         raise InputError(f'a board of {board[0]}x{board[1]} corners and {square_m} m is impossible')
     left, right = find_image_pairs(folder)
     views = _find_boards(folder, left, right, board, on_progress)
     calibration, rms_px = _solve(views, board, square_m, str(folder))
     target = folder if out is None else out
-    target.mkdir(parents=True, exist_ok=True)
-    write_ros_calibration(target / 'left.yaml', calibration.left, 'left')
-    write_ros_calibration(target / 'right.yaml', calibration.right, 'right')
+    with os_errors(f'{target}: cannot be written', '; choose another --out'):
+        target.mkdir(parents=True, exist_ok=True)
+        write_ros_calibration(target / 'left.yaml', calibration.left, 'left')
+        write_ros_calibration(target / 'right.yaml', calibration.right, 'right')
     error_px = epipolar_rms_px(calibration, views.left, views.right)
     return CalibrationResult(calibration, rms_px, error_px, len(views.left), len(left))
 
@@ -178,6 +178,8 @@ def find_corners(
         return None
     if image.dtype != np.uint8:
         image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    if min(image.shape) < 2 * max(board):
+        return None  # OpenCV refuses images of a few pixels
     found, corners = cv2.findChessboardCorners(image, board)
     if not found:
         return None

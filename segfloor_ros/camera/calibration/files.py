@@ -14,6 +14,8 @@ import yaml
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
+from segfloor_ros.files.tables import number, read_lines
+from segfloor_ros.files.yaml_files import read_yaml
 from segfloor_ros.geometry import Array, invert
 
 FILE_NAMES = (
@@ -33,7 +35,7 @@ def read_calibration(left: Path, right: Path) -> StereoCalibration:
 
     Raises CalibrationError naming the file when one is missing, incomplete or impossible.
     """
-    documents = _read_yaml(left), _read_yaml(right)
+    documents = _read(left), _read(right)
     if all('T_BS' in document for document in documents):
         return _from_euroc(left, right, *documents)
     return StereoCalibration(_ros_eye(documents[0], str(left)), _ros_eye(documents[1], str(right)))
@@ -52,7 +54,7 @@ def read_kitti_calibration(
 def read_kitti_eye(path: Path, width: int, height: int, camera: int) -> EyeCalibration:
     """Read the projection of one camera of a KITTI odometry `calib.txt`."""
     rows = {}
-    for line in _read_text(path).splitlines():
+    for _, line in read_lines(_present(path), CalibrationError):
         name, colon, numbers = line.partition(':')
         if colon:
             rows[name.strip()] = numbers.split()
@@ -65,7 +67,7 @@ def read_kitti_eye(path: Path, width: int, height: int, camera: int) -> EyeCalib
 
 def read_eye_calibration(path: Path) -> EyeCalibration:
     """Read one ROS camera calibration file. Raises CalibrationError."""
-    return _ros_eye(_read_yaml(path), str(path))
+    return _ros_eye(_read(path), str(path))
 
 
 def read_body_pose(path: Path) -> Array:
@@ -73,7 +75,7 @@ def read_body_pose(path: Path) -> Array:
 
     Raises CalibrationError.
     """
-    return _body_pose(_read_yaml(path), path)
+    return _body_pose(_read(path), path)
 
 
 def _body_pose(document: Mapping[str, Any], path: Path) -> Array:
@@ -150,28 +152,17 @@ def _euroc_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:
     return EyeCalibration(int(width), int(height), K, D, np.eye(3), P, model, origin)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except FileNotFoundError:
+def _read(path: Path) -> Mapping[str, Any]:
+    return read_yaml(_present(path), 'a calibration: names and values', CalibrationError)
+
+
+def _present(path: Path) -> Path:
+    if not path.exists():
         raise CalibrationError(
             f'{path}: the calibration is missing; put it there, or give '
             'stereo_camera.left_calibration and stereo_camera.right_calibration'
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f'{path}: cannot read the calibration ({error})') from None
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    # OpenCV and EuRoC files begin with `%YAML:1.0`, which is not a directive YAML knows.
-    lines = [line for line in _read_text(path).splitlines() if not line.startswith('%YAML')]
-    try:
-        document = yaml.safe_load('\n'.join(lines))
-    except yaml.YAMLError:
-        raise CalibrationError(f'{path}: not a valid YAML calibration file') from None
-    if not isinstance(document, dict):
-        raise CalibrationError(f'{path}: holds no calibration')
-    return document
+        )
+    return path
 
 
 def _matrix(value: Any, count: int | None, where: str) -> Array:
@@ -179,10 +170,11 @@ def _matrix(value: Any, count: int | None, where: str) -> Array:
 
 
 def _numbers(value: Any, count: int | None, where: str) -> Array:
+    """Return a list of numbers, or of lists of them, or a text of numbers, as one array (N,)."""
     try:
-        numbers = np.array(value, np.float64).ravel()
+        numbers = np.array([number(str(v)) for v in np.ravel(value).tolist()], np.float64)
     except (TypeError, ValueError):
-        raise CalibrationError(f'{where}: expected numbers') from None
+        raise CalibrationError(f'{where}: expected finite numbers') from None
     if count is not None and numbers.size != count:
         raise CalibrationError(f'{where}: expected {count} numbers, found {numbers.size}')
     return numbers

@@ -21,9 +21,10 @@ from segfloor_ros.camera.sources import bag_topics
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
 from segfloor_ros.camera.sources.bag_sensors import bag_sensors
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, rate_of
-from segfloor_ros.camera.sources.sensor_files import DEPTH
+from segfloor_ros.camera.sources.sensor_files import DEPTH, check_shared_clock
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
 from segfloor_ros.errors import CalibrationError, InputError
+from segfloor_ros.files.tables import checked_ns
 from segfloor_ros.measurements import RecordedSensor
 
 STAMPS_FOR_RATE = 20
@@ -48,10 +49,14 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
             calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
         first = islice(bag.messages([topics.left]), STAMPS_FOR_RATE)
-        rate_hz = rate_of(sorted(stamp_ns(message) for _, message in first))
+        stamps = sorted(_stamp_ns(message, f'{path}, {topics.left}') for _, message in first)
+        rate_hz = rate_of(stamps)
         if topics.is_rectified:
             calibration = calibration.rectified()
         sensors = bag_sensors(path, bag, topics.left, calibration.left.R, settings)
+        if stamps:
+            # The end is not known before all images are read; half of them may be missing.
+            check_shared_clock(sensors, [stamps[0], stamps[0] + round(2e9 * count / rate_hz)])
         if depth is not None:
             messages = bag.topics[depth.right].num_messages
             sensors.append(RecordedSensor(DEPTH, depth.right, messages, topics is depth))
@@ -79,7 +84,8 @@ def _entries(
     def pairs(bag: BagFile) -> Iterator[tuple[Stamped[Any], Stamped[Any]]]:
         sides = {topics.left: 0, topics.right: 1}
         for topic, message in bag.messages(list(sides)):
-            yield from pairing.add(sides[topic], stamp_ns(message), message)
+            stamp = _stamp_ns(message, f'{path}, {topic}')
+            yield from pairing.add(sides[topic], stamp, message)
         yield from pairing.finish()
 
     def load(left: Any, right: Any) -> tuple[Grey, NDArray[Any]]:
@@ -95,6 +101,15 @@ def _entries(
             yield PairEntry(index, left.stamp_ns, partial(load, left.item, right.item))
     source.skipped_frames += max(pairing.duplicates)
     pairing.report()
+
+
+def _stamp_ns(message: Any, where: str) -> int:
+    try:
+        return checked_ns(stamp_ns(message), f'{stamp_ns(message)} ns')
+    except ValueError as error:
+        raise InputError(
+            f'{where}: an image has the stamp {stamp_ns(message)} ns {error}'
+        ) from None
 
 
 def _read_calibration(
@@ -119,5 +134,4 @@ def _eye(path: Path, bag: BagFile, image: str, topic: str, setting: str) -> EyeC
         raise CalibrationError(
             f'{path}: no CameraInfo beside {image}; record it too, or give {setting}'
         )
-    _, info = next(bag.messages([topic]))
-    return eye_calibration(info, f'{path}, {topic}')
+    return eye_calibration(bag.first(topic), f'{path}, {topic}')

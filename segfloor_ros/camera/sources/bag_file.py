@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.whole import check_file
+from segfloor_ros.files.yaml_files import read_yaml
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}
@@ -58,6 +60,14 @@ class BagFile:
         with _read_errors(self.path):
             yield from self.read(topics)
 
+    def first(self, topic: str) -> Any:
+        """Return the first message on a topic. Raises InputError where there is none, whatever the
+        bag says of their number.
+        """
+        for _, message in self.messages([topic]):
+            return message
+        raise InputError(f'{self.path}: no message on {topic}; record it again')
+
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is a bag file or a folder with one."""
@@ -82,8 +92,15 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
             for connection, _, data in reader.messages(connections):
                 yield connection.topic, decode(data, connection.msgtype)
 
-        topics = {n: Topic(info.msgtype or '', info.msgcount) for n, info in reader.topics.items()}
+        with _read_errors(path):
+            topics = {n: _topic(path, n, info) for n, info in reader.topics.items()}
         yield BagFile(path, topics, read)
+
+
+def _topic(path: Path, name: str, info: Any) -> Topic:
+    if not (isinstance(info.msgcount, int) and 0 <= info.msgcount < 1 << 32):
+        raise ValueError(f'{name} has {info.msgcount} messages')
+    return Topic(str(info.msgtype or ''), info.msgcount)
 
 
 @contextmanager
@@ -125,12 +142,20 @@ def _read_errors(path: Path) -> Iterator[None]:
 
 
 def _bag_path(path: Path) -> Path:
-    if not path.is_dir() or (path / 'metadata.yaml').exists():
+    if not path.is_dir():
+        check_file(path)
         return path
     files = _files_in(path)
+    if (path / 'metadata.yaml').exists():
+        # Libraries read this file without bounds.
+        read_yaml(path / 'metadata.yaml', 'rosbag2_bagfile_information')
+        for file in files:
+            check_file(file)
+        return path
     if len(files) != 1:
         names = ', '.join(file.name for file in files)
         raise InputError(f'{path}: holds {len(files)} bags ({names}); name one of them')
+    check_file(files[0])
     return files[0]
 
 

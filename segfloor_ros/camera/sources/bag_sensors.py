@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def bag_sensors(
                 wheels,
                 bag.topics[wheels].num_messages,
                 WHEEL_ODOMETRY not in ignored,
-                lambda: list(_wheel_poses(path, wheels)),
+                cache(lambda: list(_wheel_poses(path, wheels))),
             )
         )
     imu = _imu_topic(path, bag, settings.imu_topic)
@@ -63,7 +64,7 @@ def bag_sensors(
                 where,
                 bag.topics[imu].num_messages,
                 used,
-                lambda: _imu_samples(path, imu, T_left_imu),
+                cache(lambda: _imu_samples(path, imu, T_left_imu)),
             )
         )
     return found
@@ -78,7 +79,7 @@ def _wheel_topic(path: Path, bag: BagFile, given: str) -> str:
         published_by_slam = f'{topic.rpartition("/")[0]}/keyframe/odometry' in topics
         if published_by_slam or any(word in topic.lower() for word in NOT_WHEELS):
             continue
-        _, first = next(bag.messages([topic]))
+        first = bag.first(topic)
         if first.header.frame_id.strip('/') not in GLOBAL_FRAMES:
             candidates.append(topic)
     return min(candidates, key=lambda t: ('wheel' not in t, 'filtered' in t, t), default='')
@@ -90,7 +91,7 @@ def _imu_topic(path: Path, bag: BagFile, given: str) -> str:
         return given
     complete = []
     for topic in topics:
-        _, first = next(bag.messages([topic]))
+        first = bag.first(topic)
         if ros_messages.measures_motion(first):
             complete.append(topic)
     return max(complete, key=lambda t: (bag.topics[t].num_messages, t), default='')
@@ -110,7 +111,7 @@ def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
     """
     frames = []
     for topic in (left_topic, imu_topic):
-        _, first = next(bag.messages([topic]))
+        first = bag.first(topic)
         frames.append(first.header.frame_id.strip('/'))
     if frames[0] == frames[1]:
         return np.eye(4)

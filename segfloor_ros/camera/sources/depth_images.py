@@ -17,10 +17,12 @@ from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import files
-from segfloor_ros.camera.sources.pairing import Stamped, nanoseconds
+from segfloor_ros.camera.sources.pairing import Stamped
 from segfloor_ros.camera.sources.sensor_files import DEPTH, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import read_grey
+from segfloor_ros.files.tables import nanoseconds
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import RecordedSensor
 
@@ -55,7 +57,7 @@ def _depth_source(
     calibration = depth_calibration(left)
 
     def read_depth(path: Path) -> NDArray[Any]:
-        return disparity_of_depth(files.read_grey(path), calibration.camera, metres_per_unit)
+        return disparity_of_depth(read_grey(path), calibration.camera, metres_per_unit)
 
     found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
     others = [sensor for sensor in sensors if sensor.name != DEPTH]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from segfloor_ros.camera.sources.pairing import Stamped
 from segfloor_ros.camera.sources.sensor_files import IMU, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.tables import whole_nanoseconds
 from segfloor_ros.geometry import invert, make_transform
 from segfloor_ros.measurements import RecordedSensor
 
@@ -72,16 +75,23 @@ def _read_index(camera: Path) -> list[Stamped[Path]]:
         raise InputError(f'{camera / "data"}: no such folder; a stereo pair is cam0 and cam1')
     index = camera / INDEX
     if not index.exists():
-        images = [path for path in files.images_in(camera / 'data') if path.stem.isdigit()]
-        return [Stamped(int(path.stem), path) for path in images]
+        return [*_named_by_stamp(files.images_in(camera / 'data'))]
     return files.read_index(index, partial(_entry, camera / 'data'))
 
 
 def _entry(folder: Path, line: str, where: str) -> Stamped[Path]:
     stamp, _, name = line.partition(',')
-    if not stamp.strip().isdigit():
-        raise InputError(f'{where}: expected a stamp in ns and a file name')
+    try:
+        stamp_ns = whole_nanoseconds(stamp.strip())
+    except ValueError as error:
+        raise InputError(f'{where}: expected a stamp in ns and a file name ({error})') from None
     image = folder / (name.strip() or f'{stamp.strip()}.png')
     if not image.exists():
         raise InputError(f'{where}: {image} does not exist; complete the copy, or remove the line')
-    return Stamped(int(stamp), image)
+    return Stamped(stamp_ns, image)
+
+
+def _named_by_stamp(images: Iterable[Path]) -> Iterator[Stamped[Path]]:
+    for path in images:
+        with contextlib.suppress(ValueError):
+            yield Stamped(whole_nanoseconds(path.stem), path)

@@ -12,11 +12,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.images import CorruptImageError, Grey, decode_file
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, check_forward, rate_of
 from segfloor_ros.camera.sources.sensor_files import check_shared_clock
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
-from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
+from segfloor_ros.files.tables import read_lines
 from segfloor_ros.measurements import RecordedSensor
 
 IMAGE_SUFFIXES = {'.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff', '.webp'}
@@ -70,25 +71,12 @@ def file_pair_source(
     return source
 
 
-def read_grey(path: Path) -> Grey:
-    """Return the grey image (H, W), uint8 or uint16, of a file.
-
-    Raises CorruptImageError naming the file when it is truncated or damaged, InputError when it
-    cannot be read.
-    """
-    with os_errors(f'{path}: cannot read the image'):
-        return decode_file(path.read_bytes(), str(path))
-
-
 def read_index(index: Path, parse: Callable[[str, str], Stamped[Path]]) -> list[Stamped[Path]]:
     """Return the images that the lines of a file name, those with `#` in front left out. parse:
     gets the line and what to call it. Raises InputError, also for stamps that go backwards.
     """
     entries: list[Stamped[Path]] = []
-    for number, line in enumerate(index.read_text(errors='replace').splitlines(), 1):
-        if not line.strip() or line.lstrip().startswith('#'):
-            continue
-        where = f'{index}, line {number}'
+    for where, line in read_lines(index):
         entry = parse(line, where)
         check_forward(where, [e.stamp_ns for e in entries[-1:]], entry.stamp_ns)
         entries.append(entry)
@@ -136,7 +124,7 @@ def images_in(folder: Path) -> list[Path]:
 def natural_key(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that reads runs of digits as numbers."""
     parts = re.split(r'(\d+)', path.name.casefold())
-    return [(int(part), '') if part.isdigit() else (0, part) for part in parts]
+    return [(int(part), '') if part.isdecimal() else (0, part) for part in parts]
 
 
 def check_equal_numbers(name: str, left: Sequence[Path], right: Sequence[Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from segfloor_ros.camera.sources.sensor_files import folder_sensors
 from segfloor_ros.camera.sources.sides import is_side, side_pairs
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.tables import whole_nanoseconds
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
 NANOSECOND_DIGITS = 16
@@ -118,6 +120,7 @@ def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
             stamps = read_times(folder / name)
             check_times(folder / name, stamps, left)
             return stamps
-    if all(path.stem.isdigit() and len(path.stem) >= NANOSECOND_DIGITS for path in left):
-        return [int(path.stem) for path in left]
+    if all(len(path.stem) >= NANOSECOND_DIGITS for path in left):
+        with contextlib.suppress(ValueError):
+            return [whole_nanoseconds(path.stem) for path in left]
     return stamps_of_rate(len(left), rate_hz)

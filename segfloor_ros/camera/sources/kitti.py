@@ -76,7 +76,7 @@ def _indices_and_stamps(
     if not times.exists():
         return indices, stamps_of_rate(len(left), rate_hz)
     stamps = read_times(times)
-    numbers = [int(path.stem) for path in left if path.stem.isdigit()]
+    numbers = [int(path.stem) for path in left if path.stem.isdecimal()]
     if len(numbers) == len(left) and numbers[-1] < len(stamps):
         return numbers, [stamps[number] for number in numbers]
     check_times(times, stamps, left)

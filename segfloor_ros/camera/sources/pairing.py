@@ -6,7 +6,6 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.tables import nanoseconds, read_lines
 
 T = TypeVar('T')
 
@@ -26,14 +26,12 @@ def read_times(path: Path) -> list[int]:
     Raises InputError naming the line where one is no number or earlier than the one before.
     """
     stamps: list[int] = []
-    for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
-        if not line.strip():
-            continue
+    for where, line in read_lines(path):
         try:
             stamp_ns = nanoseconds(line.split()[0])
-        except ValueError:
-            raise InputError(f'{path}, line {number}: expected a time in seconds') from None
-        check_forward(f'{path}, line {number}', stamps[-1:], stamp_ns)
+        except ValueError as error:
+            raise InputError(f'{where}: expected a time in seconds ({error})') from None
+        check_forward(where, stamps[-1:], stamp_ns)
         stamps.append(stamp_ns)
     return stamps
 
@@ -45,14 +43,6 @@ def check_times(path: Path, stamps: Sequence[int], images: Sequence[Path]) -> No
             f'{path}: {len(stamps)} times for {len(images)} pairs of images; it needs one line '
             'for each, or remove it to read the images at stereo_camera.rate_hz'
         )
-
-
-def nanoseconds(seconds: str) -> int:
-    """Return a time in seconds, as text, in ns, exactly. Raises ValueError."""
-    try:
-        return int(Decimal(seconds).scaleb(9).to_integral_value())
-    except (InvalidOperation, OverflowError):
-        raise ValueError(f'{seconds}: not a time in seconds') from None
 
 
 def check_forward(where: str, last_ns: Sequence[int], stamp_ns: int) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import read_body_pose
-from segfloor_ros.camera.sources.pairing import nanoseconds
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.tables import nanoseconds, number, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 
@@ -52,9 +52,7 @@ def _sensor(
     name: str, path: Path, read: Callable[[Path], Sequence[Measurement]], used: bool
 ) -> RecordedSensor:
     if not used:
-        lines = path.read_text(errors='replace').splitlines()
-        count = sum(1 for line in lines if line.strip() and not line.startswith('#'))
-        return RecordedSensor(name, str(path), count, False)
+        return RecordedSensor(name, str(path), sum(1 for _ in read_lines(path)), False)
     measurements = read(path)
     return RecordedSensor(name, str(path), len(measurements), True, lambda: measurements)
 
@@ -84,7 +82,7 @@ def read_imu(path: Path, T_left_imu: Array | None = None) -> list[ImuSample]:
 
     Raises InputError naming file and line, or CalibrationError.
     """
-    table, stamps_ns = _read_table(path, 7, IMU_COLUMNS, int)
+    table, stamps_ns = _read_table(path, 7, IMU_COLUMNS, whole_nanoseconds)
     check_gravity(str(path), table[:, 3:6])
     beside = path.with_suffix('.yaml')
     T = np.eye(4) if T_left_imu is None else T_left_imu
@@ -132,17 +130,15 @@ def _read_table(
     of several lines with the same stamp the first counts.
     """
     rows: dict[int, list[float]] = {}
-    for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
-        if not line.strip() or line.lstrip().startswith('#'):
-            continue
+    for where, line in read_lines(path):
         words = line.replace(',', ' ').split()
         try:
-            values = [float(word) for word in words[1:columns]]
+            values = [number(word) for word in words[1:columns]]
             stamp_ns = read_stamp(words[0])
-        except ValueError:
-            values = []
-        if len(values) != columns - 1 or not np.isfinite(values).all():
-            raise InputError(f'{path}, line {number}: expected {expected}')
+        except ValueError as error:
+            raise InputError(f'{where}: expected {expected} ({error})') from None
+        if len(values) != columns - 1:
+            raise InputError(f'{where}: expected {expected}')
         rows.setdefault(stamp_ns, values)
     if not rows:
         raise InputError(f'{path}: holds no measurement; expected {expected}')

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import is_disparity
-from segfloor_ros.camera.images import CorruptImageError, EightBitScale, Grey
+from segfloor_ros.camera.images import EightBitScale
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import CorruptImageError, Grey, read_mask
 from segfloor_ros.measurements import DEPTH, RecordedSensor
 
 DEFAULT_RATE_HZ = 10.0
@@ -54,13 +54,11 @@ class MaskFolder:
         path = self._folder / f'{index:06d}.png'
         if not path.exists():
             return None
-        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise InputError(f'{path}: is no image; masks are PNG files, 255 = moving')
+        mask = read_mask(path)
         if mask.shape != self._shape:
             found, expected = (f'{shape[1]}x{shape[0]}' for shape in (mask.shape, self._shape))
             raise InputError(f'{path}: is {found}, but the images are {expected}')
-        return np.asarray(mask, np.uint8)
+        return mask
 
 
 @dataclass(frozen=True)

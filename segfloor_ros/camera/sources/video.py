@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,10 +16,13 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import find_calibration
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.images import Grey, to_grey
+from segfloor_ros.camera.images import to_grey
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import Grey
+from segfloor_ros.files.silence import silent_libraries
+from segfloor_ros.files.whole import check_file
 
 VIDEO_SUFFIXES = {'.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.mpg', '.mpeg', '.mjpeg'}
 
@@ -30,7 +34,7 @@ def is_video(path: Path) -> bool:
 
 def is_device(name: str) -> bool:
     """Whether `name` is a camera device: its number, or /dev/video with its number."""
-    return name.removeprefix('/dev/video').isdigit()
+    return re.fullmatch('(/dev/video)?[0-9]{1,3}', name) is not None
 
 
 def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
@@ -38,6 +42,7 @@ def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
 
     Raises InputError or CalibrationError.
     """
+    check_file(path)
     calibration = find_calibration(str(path), (path.parent,), settings)
     return _video_source(str(path), calibration, settings, is_live=False)
 
@@ -59,7 +64,8 @@ def _video_source(
     def entries(source: StereoSource) -> Iterator[PairEntry]:
         with _opened(name, size, is_live) as video:
             for index in count():
-                ok, image = video.read()
+                with silent_libraries():
+                    ok, image = video.read()
                 if not ok:
                     return
                 stamp_ns = time.time_ns() if is_live else round(index * 1e9 / source.rate_hz)
@@ -74,7 +80,8 @@ def _video_source(
 
 @contextmanager
 def _opened(name: str, size: tuple[int, int], is_live: bool) -> Iterator[cv2.VideoCapture]:
-    video = cv2.VideoCapture(int(name.removeprefix('/dev/video')) if is_live else name)
+    with silent_libraries():
+        video = cv2.VideoCapture(int(name.removeprefix('/dev/video')) if is_live else name)
     try:
         if not video.isOpened():
             what = 'the device' if is_live else 'the video'

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
-import yaml
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -20,6 +18,7 @@ from rclpy.parameter import Parameter
 
 from segfloor_ros.configuration import ROS_PARAMETERS
 from segfloor_ros.errors import SettingsError
+from segfloor_ros.files.yaml_files import yaml_value
 from segfloor_ros.node_settings import NODE_SETTINGS, NodeSettings, is_node_parameter
 from segfloor_ros.settings import SettingSpec, suggestion
 
@@ -125,9 +124,5 @@ def command_line_parameters(arguments: Sequence[str]) -> dict[str, str]:
 
 
 def _parsed(text: str, spec: SettingSpec) -> Any:
-    value = yaml.safe_load(text)
-    if spec.type is float and isinstance(value, str):
-        # YAML 1.1 takes 1e-3 for text, rcl for a number.
-        with contextlib.suppress(ValueError):
-            return float(value)
+    value = yaml_value(text)
     return '' if value is None and spec.type is str else value
