@@ -106,3 +106,53 @@ def test_arrays_are_joined_and_split():
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match='5 rows'):
         split(one, lengths + 1)
+
+
+def with_member(name, content):
+    buffer = io.BytesIO(to_bytes(some_map()))
+    with zipfile.ZipFile(buffer, 'a', zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, content)
+    return buffer.getvalue()
+
+
+def npy(header, data=b''):
+    text = f'{header}\n'.encode()
+    return b'\x93NUMPY\x01\x00' + len(text).to_bytes(2, 'little') + text + data
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        npy("{'descr': '<f8', 'fortran_order': False, 'shape': (9895604649984,)}"),
+        npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", bytes(8)),
+        npy('(' * 5000),
+        b'hello',
+        bytes(1 << 28),
+    ],
+    ids=['72 TiB', 'objects', 'a deep header', 'no array', 'a zip bomb'],
+)
+def test_an_array_of_more_than_the_file_has_is_refused(content):
+    with pytest.raises(InputError, match=r'my\.map: is truncated or damaged'):
+        from_bytes(with_member('slam/bad.npy', content), 'my.map')
+
+
+def test_every_wrong_byte_of_the_directory_is_one_line():
+    """The list of members has no checksum: libraries stumble over it in many ways."""
+    data = to_bytes(some_map())
+    refused = 0
+    for at in range(data.find(b'PK\x01\x02'), len(data)):
+        damaged = bytearray(data)
+        damaged[at] ^= 0xFF
+        try:
+            from_bytes(bytes(damaged), 'my.map')
+        except InputError as error:
+            refused += str(error).startswith('my.map: is ')
+    assert refused > 100
+
+
+def test_a_deep_header_is_one_line():
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, 'w') as file:
+        file.writestr('header.json', '[' * 100_000)
+    with pytest.raises(InputError, match=r'x\.map: is no map'):
+        from_bytes(buffer.getvalue(), 'x.map')

@@ -9,18 +9,20 @@ import signal
 import sys
 from collections.abc import Generator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 from rich.text import Text
 
 from segfloor_ros.cli.output import console, figure_table, print_error
-from segfloor_ros.errors import SettingsError, os_errors
+from segfloor_ros.errors import InputError, SettingsError, os_errors
+from segfloor_ros.evaluation.truth import Pose2d
+from segfloor_ros.files.whole import read_json, read_text
 from segfloor_ros.suite import verdicts
 from segfloor_ros.suite.description import Suite, read_suite
 from segfloor_ros.suite.job import Job, Outcome, package_digest
-from segfloor_ros.suite.measures import number
+from segfloor_ros.suite.measures import known_measures, number
 from segfloor_ros.suite.result_files import MEASURED, pack, unpack
 from segfloor_ros.suite.workers import outcomes
 
@@ -136,14 +138,21 @@ def _read_outcome(job: Job, out: Path) -> Outcome | None:
             return None
         return Outcome(
             job.entry.name,
-            record['measured'],
+            known_measures(record['measured']),
             archive=pack(folder) if job.is_continued else b'',
-            start_pose=record['start_pose'] and tuple(record['start_pose']),
-            seconds=record['seconds'],
+            start_pose=_pose(record['start_pose']),
+            seconds=float(record['seconds']),
             reused=True,
         )
-    except (OSError, ValueError, KeyError):
+    except (InputError, OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
+
+
+def _pose(values: Any) -> Pose2d | None:
+    if values is None:
+        return None
+    x, y, yaw = (float(value) for value in values)
+    return x, y, yaw
 
 
 def _finish(

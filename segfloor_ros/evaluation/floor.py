@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,7 +95,7 @@ def read_outlines(path: Path) -> dict[int, dict[str, Any]]:
     """Return, by frame, the polygons [u, v, u, v, …] that a YAML file has under `frames`: `floor`,
     `obstacle`, `unsure`. Raises InputError where it has none.
     """
-    frames = read_yaml(path, 'frames with outlines').get('frames')
+    frames: Any = read_yaml(path, 'frames with outlines').get('frames')
     try:
         found = {int(index): dict(outline) for index, outline in frames.items()}
         for outline in found.values():

@@ -17,6 +17,7 @@ from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
 from segfloor_ros.evaluation.run_summary import read_summary
 from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import Pose2d, load_truth
+from segfloor_ros.files.tables import number as finite_number
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.occupancy import OccupancyGrid
 
@@ -88,6 +89,11 @@ def measure_run(
     if reference_map is not None:
         measured['agreement_percent'] = 100 * agreement(grid, load_map(reference_map))
     return {name: round(value, 6) for name, value in measured.items() if np.isfinite(value)}
+
+
+def known_measures(values: Any) -> dict[str, float]:
+    """Return measures by name as a file has them. Raises AttributeError or ValueError."""
+    return {name: finite_number(str(value)) for name, value in values.items()}
 
 
 def start_pose_of(truth: Path | None) -> Pose2d | None:

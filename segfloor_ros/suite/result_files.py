@@ -16,11 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from segfloor_ros.errors import InputError, without_credentials
+from segfloor_ros.files.whole import read_bytes, read_json
+from segfloor_ros.suite.measures import known_measures
 
 MEASURED = 'measured.json'
 ARCHIVE = 'results.tar'
 
 CHUNK = 1 << 20
+MAX_ARCHIVE = 1 << 32
 
 WILDCARDS = '*?['
 
@@ -60,8 +63,9 @@ class Cache:
         """Return measures and archive, None where there are none."""
         entry = self._folder / key
         try:
-            return json.loads((entry / MEASURED).read_text()), (entry / ARCHIVE).read_bytes()
-        except (OSError, ValueError):
+            measured = known_measures(read_json(entry / MEASURED, 'measures'))
+            return measured, read_bytes(entry / ARCHIVE, at_most=MAX_ARCHIVE)
+        except (InputError, ValueError):
             return None
 
     def put(self, key: str, measured: dict[str, float], archive: bytes) -> None:

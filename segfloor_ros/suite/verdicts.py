@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from segfloor_ros.errors import InputError, os_errors
-from segfloor_ros.files.tables import number
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
-from segfloor_ros.suite.measures import Verdict, bounds_of_baseline
+from segfloor_ros.suite.measures import Verdict, bounds_of_baseline, known_measures
 
 FORMAT = 1
 Baseline = Mapping[str, Mapping[str, float]]
@@ -80,9 +79,6 @@ def read_baseline(path: Path) -> Baseline:
     """Read what `write_baseline` wrote. Raises InputError."""
     try:
         recordings = read_json(path, 'a baseline')['recordings']
-        return {
-            name: {key: number(str(value)) for key, value in measures.items()}
-            for name, measures in recordings.items()
-        }
+        return {name: known_measures(measures) for name, measures in recordings.items()}
     except (ValueError, KeyError, AttributeError):
         raise InputError(f'{path}: not a baseline; write one with --write-baseline') from None
