@@ -90,9 +90,15 @@ def disparity_at(disparity: Disparity, camera_depth: float, uv_px: Array) -> tup
     middle = np.nanmedian(near, axis=1) if len(near) else np.zeros(0)
     spread = np.nanmax(near, axis=1) - np.nanmin(near, axis=1) if len(near) else np.zeros(0)
     found[whole] = np.where(spread < SAME_SURFACE_SHARE * middle, middle, np.nan)
-    depth_m = camera_depth / found
-    sigma = camera_depth * np.hypot(SIGMA_PER_M, SIGMA_M / depth_m**2)
-    return found, sigma
+    return found, measured_sigma_px(camera_depth, found)
+
+
+def measured_sigma_px(camera_depth: float, disparity_px: Array) -> Array:
+    """Return the error (N,), one sigma, of the disparities (N,) of a depth camera. camera_depth:
+    disparity times depth.
+    """
+    sigma: Array = np.hypot(camera_depth * SIGMA_PER_M, SIGMA_M * disparity_px**2 / camera_depth)
+    return sigma
 
 
 def shrunk(disparity: Disparity, size: tuple[int, int]) -> Disparity:

@@ -15,11 +15,12 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
+    NOISE_PX,
     TwoScaleMatcher,
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.photometric import compare
+from segfloor_ros.floor.disparity.photometric import compare, compare_measured
 from segfloor_ros.floor.disparity.profile import (
     BINS_PER_PX,
     FloorLine,
@@ -137,10 +138,15 @@ class FloorSegmentation:
             counted = self._v_disparity(view, below, texture > 2 * enough)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
-            compared = compare(view, profile, left_rows, right_rows, below, noise)
+            if measured is None:
+                compared = compare(view, profile, left_rows, right_rows, below, noise)
+            else:
+                compared = compare_measured(view, profile, below, NOISE_PX)
         with measure('evidence'):
             slope = row_slope(left[columns])
-            evidence = self._evidence(view, profile, below, slope, texture, enough, compared)
+            evidence = self._evidence(
+                view, profile, below, slope, texture, enough, compared, measured is not None
+            )
             seen = evidence.mask
             clear_hidden(seen, moving, columns)
         with measure('filling'):
@@ -164,10 +170,13 @@ class FloorSegmentation:
         texture: NDArray[np.float32],
         enough: float,
         compared: Comparison,
+        measured: bool,
     ) -> Evidence:
         """Return what the pixels (R, W) of the view say by themselves, cut back to edges."""
         settings = self._settings
-        table = HeightTable.of(view.line, profile, self._matcher.num_disparities, settings)
+        constant = self._camera.disparity_times_depth if measured else None
+        most = self._matcher.num_disparities
+        table = HeightTable.of(view.line, profile, most, settings, constant)
         evidence = judge(view, profile, below, texture > enough, compared, table, settings)
         seen = trim_to_edges(evidence.mask, slope, _TEXTURE_WINDOW_PX // 2 + 3)
         return Evidence(seen, evidence.above & (texture >= _LEAST_SHARE * enough))
@@ -190,7 +199,7 @@ class FloorSegmentation:
             profile_px=profile.at_rows(rows).astype(np.float64),
             scan=scan,
             min_disparity_px=0.0,
-            max_disparity_px=float(self._matcher.num_disparities),
+            max_disparity_px=max(float(self._matcher.num_disparities), float(disparity.max())),
             v_disparity=counted,
         )
 

@@ -19,6 +19,7 @@ from floor_scenes import (
     wall,
 )
 
+from segfloor_ros.camera.depth import disparity_of_depth
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
@@ -389,3 +390,19 @@ def test_what_moves_is_no_obstacle_and_the_floor_it_hides_is_unknown():
     # The mask is found in every other column.
     inside = cv2.erode(moving, np.ones((3, 3), np.uint8)) > 0
     assert (unseen.mask[inside] != FLOOR).all()
+
+
+@pytest.mark.parametrize('near_m', [0.15, 0.002])
+def test_measured_depth_may_be_nearer_than_any_floor(near_m):
+    scene = Scene([floor_patch(), wall(4.0)])
+    left, _, floor, depth = scene.render()
+    near = np.zeros(depth.shape, bool)
+    near[-120:, 200:300] = True
+    measured = np.where(near, near_m, depth).astype(np.float32)
+    disparity = disparity_of_depth(measured, scene.camera)
+    observation = FloorSegmentation(scene.camera, SETTINGS).process(left, disparity, scene.mount)
+    assert np.mean(observation.mask[near] == NOT_FLOOR) > 0.95
+    precision, recall = shares(observation, floor & ~near, depth)
+    assert precision > 0.99
+    assert recall > 0.95
+    assert observation.max_disparity_px >= observation.disparity_px.max()

@@ -84,6 +84,9 @@ def filtered_v_disparity(
     camera = view.camera
     # Half of the columns tell as much.
     disparity = np.ascontiguousarray(disparity[:, ::2])
+    # What is nearer than any floor counts as if it were right before it: measured depth has no end.
+    nearest = np.float32(num_disparities)
+    disparity = np.minimum(disparity, nearest)
     bins = (disparity + np.float32(0.5)).astype(np.intp)
     num = num_disparities + 1
     limit = obstacle_rows(

@@ -30,6 +30,8 @@ _WIDE_MARGIN_GREY = 0.05
 _WIDE_SHARE = 0.65
 _MARGIN_PX = 4.0
 """So near to the right image's border interpolation is unsure."""
+_SIGMAS = 2.0
+"""What is measured so far from the floor, in sigmas, contradicts it."""
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
@@ -73,6 +75,18 @@ def compare(
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
     return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
+
+
+def compare_measured(
+    view: FloorView, profile: FloorProfile, disparity: NDArray[np.float32], noise_px: float
+) -> Comparison:
+    """Compare the floor with disparities (R, W) that a depth camera measured, 0 for none: there is
+    no right image to look at. noise_px: of the disparities, one sigma.
+    """
+    floor_px = profile.at_pixels(view.derolled)
+    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(_SIGMAS * noise_px))
+    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:

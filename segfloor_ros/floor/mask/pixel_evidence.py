@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.depth import measured_sigma_px
 from segfloor_ros.floor.disparity.matching import NOISE_PX, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.mask.view import FloorView
@@ -60,13 +61,15 @@ class HeightTable:
         profile: FloorProfile,
         num_disparities: int,
         settings: FloorSegmentationSettings,
+        measured: float | None = None,
     ) -> HeightTable:
-        """Return the table of a profile."""
+        """Return the table of a profile. measured: disparity times depth of a depth camera."""
         disparity = np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
         disparity[0] = np.nan
         scale = line.metres_per_row / disparity
+        noise_px = NOISE_PX if measured is None else measured_sigma_px(measured, disparity)
         # One pixel of disparity is this much height: the camera's height over the disparity.
-        noise_m = NOISE_PX * line.metres_per_row / line.slope / disparity
+        noise_m = noise_px * line.metres_per_row / line.slope / disparity
         row = profile.row_of_disparity(disparity)
         tables = (
             row,
@@ -100,7 +103,9 @@ def judge(
     textured: where a disparity means something; compared: what the images say of the floor. A
     disparity makes floor only where the images agree, and denies it only where they do.
     """
-    index = (disparity * np.float32(SUBPIXEL)).astype(np.int32)
+    # What is nearer than the table goes is no lower than what is as near as that.
+    last = np.float32(len(table.row) - 1)
+    index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
     height = table.offset.take(index) - table.scale.take(index) * view.derolled
     up = table.up.take(index)
     above = height > up
