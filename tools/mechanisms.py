@@ -64,33 +64,33 @@ def _with_any_contact(
 
 SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'deblocking': Mechanism({'camera.rectification.deblocked': _first}),
-    'fusion of points': Mechanism({'slam.mapping.fuse_duplicates': _none}),
-    'triangulation by motion': Mechanism({'slam.mapping.LocalMapper._partners': lambda *_: []}),
-    'place keyframes in the local map': Mechanism({'slam.local_map.views_near': _no_rows}),
-    'alignment of patches': Mechanism({'slam.tracking.align_pixels': _none}),
-    'following between keyframes': Mechanism({'slam.following.Follower.follow': _none}),
+    'deblocking': Mechanism({'camera.calibration.rectification.deblocked': _first}),
+    'fusion of points': Mechanism({'slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
+    'triangulation by motion': Mechanism({'slam.mapping.keyframe_mapping.LocalMapper._partners': lambda *_: []}),
+    'place keyframes in the local map': Mechanism({'slam.tracking.local_map.views_near': _no_rows}),
+    'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
+    'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
     'disparity offset': Mechanism(settings={'disparity_offset_sigma_px': 0.0}),
-    'depth check of matches': Mechanism({'slam.mapping.LocalMapper._contradicted': _no_rows}),
-    'bad adjustments left out': Mechanism({'slam.mapping.MIN_KEPT_RATIO': 0.0}),
-    'known views': Mechanism({'slam.places.KNOWN_SHARE': 2.0}),
-    'retiring of keyframes': Mechanism({'slam.mapping.retire_redundant': _none}),
-    'keyframes where few points are found': Mechanism({'slam.keyframe_policy.FEW_FOUND': 0.0}),
-    'loops': Mechanism({'slam.back_end.BackEnd._close_loop': lambda *_: False}),
+    'depth check of matches': Mechanism({'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}),
+    'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MIN_KEPT_RATIO': 0.0}),
+    'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
+    'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
+    'keyframes where few points are found': Mechanism({'slam.mapping.keyframe_policy.FEW_FOUND': 0.0}),
+    'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
-        {'slam.relocalisation.FRAMES_IN_A_ROW': 1, 'slam.relocalisation.MIN_AGREEMENT': 0.0}
+        {'slam.places.relocalisation.FRAMES_IN_A_ROW': 1, 'slam.places.relocalisation.MIN_AGREEMENT': 0.0}
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions told apart': Mechanism(
-        {'slam.consensus.differ': lambda a, b: False, 'slam.consensus.KNOWN_NOISE': 1e9}
+        {'slam.tracking.consensus.differ': lambda a, b: False, 'slam.tracking.consensus.KNOWN_NOISE': 1e9}
     ),
-    'motion so far': Mechanism({'slam.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
+    'motion so far': Mechanism({'slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
     'images weighed against wheels': Mechanism(
-        {'slam.front_end.FrontEnd._weighed': lambda self, track, images: track}
+        {'slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
     ),
     'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
-    'scene flow': Mechanism({'slam.scene_flow.SceneFlow._earlier': lambda *_: []}),
-    'points seen through': Mechanism({'slam.sparse_map.GONE_AFTER': 1 << 30}),
+    'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
+    'points seen through': Mechanism({'slam.map.sparse_map.GONE_AFTER': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""
@@ -98,11 +98,11 @@ SLAM: dict[str, Mechanism] = {
 FLOOR: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
     'memory': Mechanism(
-        {'floor.remembered_floor.FloorMemory.fill': lambda self, view, mask, *_: mask}
+        {'floor.mask.remembered_floor.FloorMemory.fill': lambda self, view, mask, *_: mask}
     ),
-    'slope ahead': Mechanism({'floor.frame_plane._slope_ahead': _none}),
-    'a slope needs texture': Mechanism({'floor.frame_plane._TEXTURED_SHARE': 0.0}),
-    'a bend needs a measurement': Mechanism({'floor.profile._LINE_ITERATIONS': -1}),
+    'slope ahead': Mechanism({'floor.plane.frame_plane._slope_ahead': _none}),
+    'a slope needs texture': Mechanism({'floor.plane.frame_plane._TEXTURED_SHARE': 0.0}),
+    'a bend needs a measurement': Mechanism({'floor.disparity.profile._LINE_ITERATIONS': -1}),
     'level expectation': Mechanism(
         {
             'floor.segmentation.expectations': lambda mount, _: np.array(
@@ -112,10 +112,10 @@ FLOOR: dict[str, Mechanism] = {
     ),
     'guard at the right border': Mechanism({'floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
-        {'floor.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
+        {'floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'floor.filling.fill_to_contact': _with_any_contact}
+        {'floor.mask.filling.fill_to_contact': _with_any_contact}
     ),
     'feet of blank faces': Mechanism(
         {'floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}
@@ -136,10 +136,10 @@ FLOOR: dict[str, Mechanism] = {
     ),
     'trimming to edges': Mechanism({'floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(
-        {'floor.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
+        {'floor.mask.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
     ),
     'boards known by their ends': Mechanism(
-        {'floor.overhead._with_boards': lambda disparity, known, telling: telling}
+        {'floor.mask.overhead._with_boards': lambda disparity, known, telling: telling}
     ),
 }
 """What makes the masks and the floor scan."""
@@ -163,7 +163,7 @@ GRID: dict[str, Mechanism] = {
 """What makes the map of masks, scans and points."""
 
 RECORDED: dict[str, Mechanism] = {
-    'mirror': Mechanism({'floor.mount.MountEstimator._mirror': _none}),
+    'mirror': Mechanism({'floor.plane.mount.MountEstimator._mirror': _none}),
     'deblocking': SLAM['deblocking'],
 }
 """What changes the images or the mount, and so SLAM as well."""
