@@ -19,8 +19,7 @@ from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.node_settings import is_node_parameter
-from segfloor_ros.robot import RobotSettings
-from segfloor_ros.settings import StageSettings, suggestion
+from segfloor_ros.settings import RobotSettings, StageSettings, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 # Parameters of every ROS node: allowed in a parameter file, no concern of the stages.

@@ -19,8 +19,8 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.map_file import Arrays, MapFile
 from segfloor_ros.slam.results import (
     FrameResult,

@@ -21,12 +21,10 @@ import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud.labels import LabelledPoints
-from segfloor_ros.cloud.ply import write_ply
+from segfloor_ros.cloud.labels import LabelledPoints, write_ply
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, os_errors
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.trajectory import Trajectory, write_tum
 
 OUTPUT_NAMES = (

@@ -3,6 +3,8 @@
 A stage declares its settings once, with `setting(...)` fields carrying description, unit and
 range. The ROS parameters (names, descriptors, ranges), the checks of YAML files and of the
 command line, and the tables in docs/ are all derived from that declaration.
+
+The robot: what it drives over and under. Declared once for all stages that judge heights.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import difflib
 import math
 import typing
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from segfloor_ros.errors import SettingsError
@@ -144,3 +147,32 @@ def suggestion(name: str, known: list[str]) -> str:
     """Return `: did you mean X?`, or the list of known names when nothing is near."""
     near = difflib.get_close_matches(name, known, n=1)
     return f': did you mean {near[0]}?' if near else ': known are ' + ', '.join(sorted(known))
+
+
+@dataclass(frozen=True)
+class RobotSettings(StageSettings):
+    """Base of the settings of the stages that must know the robot, the same one in all of them."""
+
+    robot_height_m: float = setting(
+        1.0,
+        'The robot passes under what hangs higher than this above the floor.',
+        within=(0.05, 10.0),
+        live=True,
+    )
+    step_height_m: float = setting(
+        0.03,
+        'The robot drives over what is lower than this; what stands higher is an obstacle.',
+        within=(0.005, 0.5),
+        live=True,
+    )
+    drop_height_m: float = setting(
+        0.04,
+        'What lies deeper than this below the floor is not floor.',
+        within=(0.005, 0.5),
+        live=True,
+    )
+
+    @property
+    def robot(self) -> dict[str, float]:
+        """The robot alone: height, step and drop in metres by name."""
+        return {spec.name: getattr(self, spec.name) for spec in RobotSettings.specs()}

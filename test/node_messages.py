@@ -8,7 +8,7 @@ import numpy as np
 
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.messages.clouds import features_message, labelled_message, sparse_cloud_message
 from segfloor_ros.messages.floor import scan_message
 from segfloor_ros.messages.images import image_message

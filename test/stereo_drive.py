@@ -11,7 +11,7 @@ from stereo_room import CAMERA, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.pipeline import Pipeline
 
 RATE_HZ = 10.0

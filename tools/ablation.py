@@ -29,15 +29,15 @@ from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.evaluation.map_score import MapScore, score_map
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.slam.results import Keyframe
 from segfloor_ros.stages import make_slam
+from segfloor_ros.trajectory import read_trajectory
 from tools.driving import noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
 from tools.mechanisms import GRID, NOTHING, RECORDED, SLAM

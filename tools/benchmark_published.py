@@ -16,8 +16,14 @@ import typer
 from rich.table import Table
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark.chain import MeasuredStages, Workload
-from segfloor_ros.benchmark.stages import JSON_VERSION, Progress, machine, run_apart
+from segfloor_ros.benchmark.stages import (
+    JSON_VERSION,
+    MeasuredStages,
+    Progress,
+    Workload,
+    machine,
+    run_apart,
+)
 from segfloor_ros.cli import options
 from segfloor_ros.cli.benchmark import stage_table, workload_table, write_json
 from segfloor_ros.cli.main import run_command
@@ -25,10 +31,9 @@ from segfloor_ros.cli.output import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import MapError
 from segfloor_ros.evaluation.map_score import MapScore, compare, save_overlay, score_map
-from segfloor_ros.evaluation.prm import RoadMapPlan, RoadMapScore
+from segfloor_ros.evaluation.raster import RoadMapPlan, RoadMapScore
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene import Scene

@@ -16,8 +16,8 @@ from segfloor_ros.cli import options
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.output import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.trajectory import read_trajectory
 from tools.driving import open_recording, recordings
 from tools.endless_drive import write_endless_drive
 from tools.slam_drives import DRIVES, DriveResult, measure_drive

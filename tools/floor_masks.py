@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.cli.output import Announce
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert, transform_points
@@ -21,6 +20,7 @@ from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOption
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.simulation import FrameTruth
+from segfloor_ros.trajectory import read_trajectory
 from tools.driving import open_recording
 
 SUN = ('ceiling.height_m=0', 'lighting.ambient=0.45', 'lighting.sun=0.9')

@@ -66,23 +66,35 @@ SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
     'deblocking': Mechanism({'camera.calibration.rectification.deblocked': _first}),
     'fusion of points': Mechanism({'slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
-    'triangulation by motion': Mechanism({'slam.mapping.keyframe_mapping.LocalMapper._partners': lambda *_: []}),
+    'triangulation by motion': Mechanism(
+        {'slam.mapping.keyframe_mapping.LocalMapper._partners': lambda *_: []}
+    ),
     'place keyframes in the local map': Mechanism({'slam.tracking.local_map.views_near': _no_rows}),
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
     'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
     'disparity offset': Mechanism(settings={'disparity_offset_sigma_px': 0.0}),
-    'depth check of matches': Mechanism({'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}),
+    'depth check of matches': Mechanism(
+        {'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}
+    ),
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MIN_KEPT_RATIO': 0.0}),
     'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
-    'keyframes where few points are found': Mechanism({'slam.mapping.keyframe_policy.FEW_FOUND': 0.0}),
+    'keyframes where few points are found': Mechanism(
+        {'slam.mapping.keyframe_policy.FEW_FOUND': 0.0}
+    ),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
-        {'slam.places.relocalisation.FRAMES_IN_A_ROW': 1, 'slam.places.relocalisation.MIN_AGREEMENT': 0.0}
+        {
+            'slam.places.relocalisation.FRAMES_IN_A_ROW': 1,
+            'slam.places.relocalisation.MIN_AGREEMENT': 0.0,
+        }
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions told apart': Mechanism(
-        {'slam.tracking.consensus.differ': lambda a, b: False, 'slam.tracking.consensus.KNOWN_NOISE': 1e9}
+        {
+            'slam.tracking.consensus.differ': lambda a, b: False,
+            'slam.tracking.consensus.KNOWN_NOISE': 1e9,
+        }
     ),
     'motion so far': Mechanism({'slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
     'images weighed against wheels': Mechanism(
@@ -136,7 +148,11 @@ FLOOR: dict[str, Mechanism] = {
     ),
     'trimming to edges': Mechanism({'floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(
-        {'floor.mask.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
+        {
+            'floor.mask.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros(
+                (2, 0), np.float32
+            )
+        }
     ),
     'boards known by their ends': Mechanism(
         {'floor.mask.overhead._with_boards': lambda disparity, known, telling: telling}

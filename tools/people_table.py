@@ -25,8 +25,16 @@ import typer
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, compare, score_map
-from segfloor_ros.evaluation.prm import Mask, RoadMapPlan, score_road_maps
-from segfloor_ros.evaluation.raster import FREE, OCCUPIED, cell_centres, observable, states
+from segfloor_ros.evaluation.raster import (
+    FREE,
+    OCCUPIED,
+    Mask,
+    RoadMapPlan,
+    cell_centres,
+    observable,
+    score_road_maps,
+    states,
+)
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.evaluation.truth import MapTruth, load_truth
 from segfloor_ros.files.tables import read_table

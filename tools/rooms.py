@@ -16,10 +16,9 @@ import typer
 import yaml
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.occupancy import FREE
+from segfloor_ros.grid.map_file import FREE
 from segfloor_ros.simulation.scene_file import scene_from_mapping
-from segfloor_ros.simulation.solids import floors, obstacles
-from segfloor_ros.simulation.truth_map import true_map
+from segfloor_ros.simulation.solids import floors, obstacles, true_map
 
 FLOORS = ('tiles', 'wood', 'carpet', 'concrete', 'granite', 'marble')
 WALLS = ('rough_plaster', 'bricks', 'concrete', 'plaster')

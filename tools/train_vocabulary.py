@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
-from segfloor_ros.slam.places import vocabulary
-from segfloor_ros.slam.places.vocabulary import BRANCHES, LEVELS
+from segfloor_ros.slam.places import place_recognition as vocabulary
+from segfloor_ros.slam.places.place_recognition import BRANCHES, LEVELS
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import FeatureExtractor
 

@@ -24,19 +24,18 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.map_score import compare, score_cells
 from segfloor_ros.evaluation.raster import FREE, cell_centres, from_frame, states
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import MapTruth, load_truth
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.fold import EvidenceFolder
-from segfloor_ros.grid.history import EvidenceHistory
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
+from segfloor_ros.grid.mapper import EvidenceHistory
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.solids import floors, obstacles
-from segfloor_ros.simulation.truth_map import true_map
+from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import KeyframeFeatures
+from segfloor_ros.trajectory import read_trajectory
 from tools.ablation import print_row
 from tools.mechanisms import FLOOR, GRID, NOTHING
 

@@ -10,8 +10,13 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.benchmark.chain import Workload
-from segfloor_ros.benchmark.stages import BenchmarkPlan, as_document, parse_sizes, run_benchmark
+from segfloor_ros.benchmark.stages import (
+    BenchmarkPlan,
+    Workload,
+    as_document,
+    parse_sizes,
+    run_benchmark,
+)
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options
 from segfloor_ros.cli.output import announcing, console, figure_table, progress_bar

@@ -23,13 +23,11 @@ from segfloor_ros.evaluation.map_score import (
     save_overlay,
     score_map,
 )
-from segfloor_ros.evaluation.prm import RoadMapPlan, Spread
-from segfloor_ros.evaluation.raster import from_frame
-from segfloor_ros.evaluation.trajectory_files import TUM_COLUMNS
+from segfloor_ros.evaluation.raster import RoadMapPlan, Spread, from_frame
 from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
 from segfloor_ros.files.tables import number, read_table
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.trajectory import TUM_COLUMNS
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from segfloor_ros.robot import RobotSettings
-from segfloor_ros.settings import setting
+from segfloor_ros.settings import RobotSettings, setting
 
 
 @dataclass(frozen=True)

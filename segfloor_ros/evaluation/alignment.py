@@ -18,7 +18,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation import raster
 from segfloor_ros.evaluation.truth import Pose2d
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 
 COARSE_CELL_M = 0.1
 COARSE_HEADINGS = 120

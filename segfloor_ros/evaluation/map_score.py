@@ -10,10 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import os_errors
-from segfloor_ros.evaluation.prm import RoadMapPlan, RoadMapScore, score_road_maps
-from segfloor_ros.evaluation.raster import FREE, OCCUPIED, Mask, observable, resample, states
+from segfloor_ros.evaluation.raster import (
+    FREE,
+    OCCUPIED,
+    Mask,
+    RoadMapPlan,
+    RoadMapScore,
+    observable,
+    resample,
+    score_road_maps,
+    states,
+)
 from segfloor_ros.evaluation.truth import MapTruth, Pose2d
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 
 DEFAULT_RANGE_M = 5.0
 DEFAULT_TOLERANCE_M = 0.1

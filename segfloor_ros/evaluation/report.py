@@ -11,13 +11,14 @@ import cv2
 
 from segfloor_ros.errors import os_errors
 from segfloor_ros.evaluation.map_score import MapScore, compare, draw_overlay, score_map
-from segfloor_ros.evaluation.report_data import ReportData, read_run
 from segfloor_ros.evaluation.report_pictures import (
+    ReportData,
     cloud_picture,
     floor_pictures,
     map_picture,
     memory_picture,
     moving_pictures,
+    read_run,
     v_disparity_picture,
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory

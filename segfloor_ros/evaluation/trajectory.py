@@ -12,9 +12,9 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.geometry import Array, invert, make_transform
+from segfloor_ros.trajectory import read_trajectory
 
 MAX_STAMP_DIFFERENCE_S = 0.02
 RPE_STEP_M = 1.0

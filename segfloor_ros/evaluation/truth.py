@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.files.tables import read_table
 from segfloor_ros.files.yaml_files import read_yaml
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.trajectory import read_trajectory
 
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""

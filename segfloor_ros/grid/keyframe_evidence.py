@@ -1,10 +1,14 @@
-"""What one keyframe says about the floor around it, compact and in the keyframe's base frame."""
+"""What one keyframe says about the floor around it, compact and in the keyframe's base frame.
+
+The evidence of keyframes as arrays, for a file, and back.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,7 @@ from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
 from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.results import KeyframeFeatures
 
 _LEAST_DEEP_M = 0.03
@@ -25,6 +30,16 @@ _SURE_SHARE = 0.4
 """An obstacle is placed within its cell where this share of a cell's side is one sigma."""
 _FREE_ERROR_M = 0.12
 """Where the end of the floor is less certain than this, one sigma, it is not mapped by default."""
+
+NUMBERS = {
+    'first_rad': float,
+    'step_rad': float,
+    'sure_range_m': float,
+    'num_rays': int,
+    'num_contacts': int,
+}
+LENGTHS = {'fan_m': 'fan_count', 'thickness_m': 'thickness_count', 'positions_m': 'position_count'}
+"""The arrays of a keyframe, and what holds their lengths."""
 
 
 @dataclass(frozen=True)
@@ -215,3 +230,25 @@ def _scan_at(scan: FloorScan, points: Array) -> tuple[Array, Array]:
         return scanned, np.full(len(points), np.inf)
     standing = scan.obstacle_m[index]
     return scanned, np.where(inside & np.isfinite(standing), standing, np.inf)
+
+
+def evidence_to_arrays(evidence: list[KeyframeEvidence]) -> Arrays:
+    """Return the evidence of keyframes (K) as arrays."""
+    numbers = [[float(getattr(e, name)) for name in NUMBERS] for e in evidence]
+    arrays: Arrays = {'numbers': np.array(numbers, np.float64).reshape(-1, len(NUMBERS))}
+    for name, lengths in LENGTHS.items():
+        empty = np.zeros((0, 2) if name == 'positions_m' else 0, np.float16)
+        arrays[name], arrays[lengths] = joined([getattr(e, name).T for e in evidence], empty)
+    return arrays
+
+
+def evidence_from_arrays(arrays: Arrays) -> list[KeyframeEvidence]:
+    """Return what `evidence_to_arrays` took. Raises KeyError or ValueError for other arrays."""
+    parts = [split(arrays[name], arrays[lengths]) for name, lengths in LENGTHS.items()]
+    evidence = []
+    for row, *of_one in zip(arrays['numbers'].tolist(), *parts, strict=True):
+        values: dict[str, Any] = {n: NUMBERS[n](v) for n, v in zip(NUMBERS, row, strict=True)}
+        for name, array in zip(LENGTHS, of_one, strict=True):
+            values[name] = np.ascontiguousarray(array.T)
+        evidence.append(KeyframeEvidence(**values))
+    return evidence

@@ -1,8 +1,12 @@
-"""Map files as map_server and Nav2 read them: an image and a YAML file beside it."""
+"""Map files as map_server and Nav2 read them: an image and a YAML file beside it.
+
+The occupancy grid as data.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +18,15 @@ from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.files.images import read_picture
 from segfloor_ros.files.whole import replacing
 from segfloor_ros.files.yaml_files import read_yaml
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 OCCUPIED_THRESH = 0.65
 FREE_THRESH = 0.196
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 MODES = ('trinary', 'scale', 'raw')
+
+FREE = 0
+OCCUPIED = 100
+UNKNOWN = -1
 
 
 def save_map(grid: OccupancyGrid, path: Path) -> None:
@@ -134,3 +141,17 @@ def _cells(
     if values['mode'] == 'scale':
         cells = np.where(opaque, cells, UNKNOWN)
     return cells.astype(np.int8)
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """A 2D map as in nav_msgs/OccupancyGrid.
+
+    cells: (rows, columns) int8, row 0 is the lowest y and column 0 the lowest x; 0 free to 100
+    occupied, -1 unknown. resolution_m: side of a cell. origin_xy_m: the outer corner of cell (0, 0)
+    in frame `map`.
+    """
+
+    cells: NDArray[np.int8]
+    resolution_m: float
+    origin_xy_m: tuple[float, float]

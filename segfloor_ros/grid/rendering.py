@@ -15,7 +15,7 @@ from segfloor_ros.grid.log_odds import (
     LogOddsRaster,
     steps,
 )
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.grid.settings import OccupancyGridSettings
 
 _NOTHING, _UNREACHED, _REACHED, _STANDING = range(4)

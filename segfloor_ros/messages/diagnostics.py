@@ -1,10 +1,16 @@
-"""Status messages on `/diagnostics`."""
+"""Status messages on `/diagnostics`.
+
+How a node fares: rates and delays of its inputs, what was lost, and what is wrong in words.
+"""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from statistics import median
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -27,6 +33,10 @@ NEED_LASTS_S = 5.0
 RECORDING = 'recording'
 """Kind of the status of the camera that says that its recording has ended."""
 
+RECENT = 50
+STALE_DELAY_S = 3600.0
+"""A stamp this old is that of a recording; its age tells nothing."""
+
 
 class Level(enum.Enum):
     """How serious a status is."""
@@ -35,6 +45,9 @@ class Level(enum.Enum):
     WARN = DiagnosticStatus.WARN
     ERROR = DiagnosticStatus.ERROR
     STALE = DiagnosticStatus.STALE
+
+
+ORDER = (Level.OK, Level.WARN, Level.ERROR)
 
 
 @dataclass(frozen=True)
@@ -80,3 +93,115 @@ def statuses(message: DiagnosticArray) -> Iterator[Status]:
         values = {pair.key: pair.value for pair in status.values}
         level = Level(status.level)
         yield Status(to_ns(message.header.stamp), status.name, level, status.message, values)
+
+
+@dataclass
+class InputMeter:
+    """Counts the messages of one topic. delays_s: age of the recent ones on arrival.
+    longest_wait_s: that one of them waited in the queue since the last summary.
+    """
+
+    count: int = 0
+    counted_before: int = 0
+    lost: int = 0
+    longest_wait_s: float = 0.0
+    delays_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that is wrong, until a time if it is not found again."""
+
+    level: Level
+    text: str
+    until_s: float
+
+
+class Health:
+    """Gathers what a node tells about itself. Not for several threads."""
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._inputs: dict[str, InputMeter] = {}
+        self._problems: dict[str, Problem] = {}
+        self._counts = {'processed': 0, 'failed': 0, 'dropped': 0, 'skipped': 0}
+        self._milliseconds: deque[float] = deque(maxlen=RECENT)
+        self._state = ''
+        self._measured_s = clock_s()
+
+    def received(self, topic: str, delay_s: float | None, waited_s: float = 0.0) -> None:
+        """Count a message; delay_s: age of its stamp, None where it has none. waited_s: since it
+        came, in the queue.
+        """
+        meter = self._inputs.setdefault(topic, InputMeter())
+        meter.count += 1
+        meter.longest_wait_s = max(meter.longest_wait_s, waited_s)
+        if delay_s is not None and abs(delay_s) < STALE_DELAY_S:
+            meter.delays_s.append(delay_s)
+
+    def lost(self, topic: str, count: int) -> None:
+        """Count messages that never came."""
+        self._inputs.setdefault(topic, InputMeter()).lost += count
+
+    def longest_wait(self) -> tuple[str, float]:
+        """Return the topic whose messages waited longest since the last summary, and how long in
+        s.
+        """
+        waits = {topic: meter.longest_wait_s for topic, meter in self._inputs.items()}
+        topic = max(waits, key=lambda name: waits[name], default='')
+        return topic, waits.get(topic, 0.0)
+
+    def count(self, what: str) -> None:
+        """Note that something `failed`, was `dropped`, because a part of it did not come, or was
+        `skipped`, because newer things waited.
+        """
+        self._counts[what] += 1
+
+    def processed(self, milliseconds: float, state: str) -> None:
+        """Note that something was processed, and the words for how it is."""
+        self._counts['processed'] += 1
+        self._milliseconds.append(milliseconds)
+        self._state = state
+
+    def waits(self, state: str) -> None:
+        """Note the words for what is waited for with something that is not processed yet."""
+        self._state = state
+
+    def found(self, about: str, level: Level, text: str, lasts_s: float) -> None:
+        """Note a problem; it is over when it is not found again for a while."""
+        self._problems[about] = Problem(level, text, self._clock_s() + lasts_s)
+
+    def over(self, about: str) -> None:
+        """Note that a problem is over."""
+        self._problems.pop(about, None)
+
+    def summary(self, state: str) -> tuple[Level, str, dict[str, str]]:
+        """Return level, words and values for the time since the last summary. state: of the node,
+        in words.
+        """
+        now_s = self._clock_s()
+        self._problems = {k: p for k, p in self._problems.items() if p.until_s > now_s}
+        problems = sorted(self._problems.values(), key=lambda p: -ORDER.index(p.level))
+        level = problems[0].level if problems else Level.OK
+        words = '; '.join(p.text for p in problems) or self._state or 'waiting for messages'
+        values = {'state': state, **{name: str(count) for name, count in self._counts.items()}}
+        if self._state:
+            values['last'] = self._state
+        if self._milliseconds:
+            values['processing_ms'] = f'{median(self._milliseconds):.1f}'
+        values.update(self._input_values(max(now_s - self._measured_s, HEALTH_PERIOD_S / 10)))
+        self._measured_s = now_s
+        return level, words, values
+
+    def _input_values(self, duration_s: float) -> dict[str, str]:
+        values = {}
+        for topic, meter in self._inputs.items():
+            rate_hz = (meter.count - meter.counted_before) / duration_s
+            meter.counted_before = meter.count
+            values[f'rate_hz {topic}'] = f'{rate_hz:.1f}'
+            values[f'queue_s {topic}'] = f'{meter.longest_wait_s:.3f}'
+            values[f'lost {topic}'] = str(meter.lost)
+            meter.longest_wait_s = 0.0
+            if meter.delays_s:
+                values[f'delay_s {topic}'] = f'{median(meter.delays_s):.3f}'
+        return values

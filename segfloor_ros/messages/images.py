@@ -1,4 +1,7 @@
-"""Images as messages."""
+"""Images as messages.
+
+Calibrations as messages.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import depth_image, grey_image
+from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.headers import make_header
 
@@ -70,3 +75,39 @@ def right_image(message: Image, topic: str) -> NDArray[Any]:
     if message.encoding != '32FC1':
         return grey8_image(message, topic)
     return depth_image(message, topic)
+
+
+def camera_info_message(stamp_ns: int, frame_id: str, eye: EyeCalibration) -> CameraInfo:
+    """Return the calibration of one eye; both eyes carry the left optical frame (REP-104: the
+    right one's offset stands in P[3]).
+    """
+    return CameraInfo(
+        header=make_header(stamp_ns, frame_id),
+        width=int(eye.width),
+        height=int(eye.height),
+        distortion_model=eye.distortion_model,
+        d=array.array('d', np.asarray(eye.D, np.float64).tobytes()),
+        k=np.asarray(eye.K, np.float64).ravel(),
+        r=np.asarray(eye.R, np.float64).ravel(),
+        p=np.asarray(eye.P, np.float64).ravel(),
+    )
+
+
+def same_calibration(a: CameraInfo, b: CameraInfo) -> bool:
+    """Return whether two messages hold the same calibration."""
+    sizes = ((a.width, a.height), (b.width, b.height))
+    return (
+        sizes[0] == sizes[1]
+        and a.distortion_model == b.distortion_model
+        and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ('d', 'k', 'r', 'p'))
+    )
+
+
+def rectified_calibration(camera: StereoCamera) -> StereoCalibration:
+    """Return the calibration of rectified images of a camera."""
+    P = np.zeros((3, 4))
+    P[:, :3] = camera.K
+    left = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    P[0, 3] = -camera.disparity_times_depth
+    right = EyeCalibration.of_rectified(camera.width, camera.height, P)
+    return StereoCalibration(left, right)

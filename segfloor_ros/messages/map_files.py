@@ -11,7 +11,7 @@ from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.map_file import FORMAT, MapFile, from_bytes, to_bytes
 from segfloor_ros.messages.headers import make_header, to_ns, to_time
 

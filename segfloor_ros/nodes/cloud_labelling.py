@@ -24,7 +24,7 @@ from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin
 from segfloor_ros.nodes.shared.map_part import MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
-from segfloor_ros.robot import RobotSettings
+from segfloor_ros.settings import RobotSettings
 from segfloor_ros.slam.results import SparseCloud
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'

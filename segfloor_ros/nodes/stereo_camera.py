@@ -21,13 +21,11 @@ from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import MAX_LAG_S, Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.headers import stamp_of, to_time
-from segfloor_ros.messages.images import compressed_message, image_message
-from segfloor_ros.messages.poses import transform_message
+from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
+from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
-from segfloor_ros.messages.sensors import imu_message, wheel_message
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.nodes.shared.pacing import ChainPace, ClockPace

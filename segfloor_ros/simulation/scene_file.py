@@ -1,4 +1,8 @@
-"""A scene by name, by file (YAML with the fields of `scene.Scene`), or from a floor plan."""
+"""A scene by name, by file (YAML with the fields of `scene.Scene`), or from a floor plan.
+
+A scene from a map_server floor plan: walls extruded from its occupied cells, and a tour through
+its free space for a robot of some width.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,48 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
-from segfloor_ros.simulation.floor_plan import is_map_file, scene_of_map
 from segfloor_ros.simulation.scene import Scene
 
 EXPECTED = 'names and values, e.g. `walls:`'
+
+WALL_HEIGHT_M = 2.5
+FURNITURE_HEIGHTS_M = (0.4, 0.8, 1.2, 1.8)
+WALL_TEXTURES = ('rough_plaster', 'bricks', 'concrete', 'books', 'goods')
+FURNITURE_TEXTURES = ('wood', 'granite', 'goods', 'metal')
+TEXTURE_PATCH_M = 5.0
+"""Long walls change their look about this often."""
+
+WALL_EXTENT_M = 2.5
+"""Connected obstacles at least this large are walls, up to the ceiling; smaller ones furniture."""
+
+DEFAULT_SEED = 1
+
+Cells = NDArray[np.int64]
+
+Mask = NDArray[np.bool_]
+
+CLEARANCE_M = 0.45
+
+COMFORT_M = 1.2
+"""Nearer to an obstacle than this the way counts longer, up to three times at the clearance."""
+
+PLANNING_CELL_M = 0.15
+
+SEEN_RADIUS_M = 4.0
+
+MAX_TOUR_M = 60.0
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -133,3 +171,192 @@ def assigned(values: dict[str, Any], assignments: Iterable[str]) -> dict[str, An
             what = f'{shortened(text)} is no value in YAML: {error}'
             raise InputError(f'--set {key}: {what}') from None
     return result
+
+
+def is_map_file(values: dict[str, Any]) -> bool:
+    """Return whether the values of a YAML file are those of a map_server map."""
+    return 'image' in values and 'resolution' in values
+
+
+def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
+    """Return a scene's values: boxes for the occupied cells and, unless `overrides` has waypoints,
+    a tour through the free space. Raises InputError naming the file.
+    """
+    grid = load_map(file)
+    occupied = grid.cells == OCCUPIED
+    if not occupied.any():
+        raise InputError(f'{file}: the map has no occupied cell to build walls from')
+    seed = int(overrides.get('seed', DEFAULT_SEED))
+    waypoints = overrides.get('path', {}).get('waypoints')
+    if waypoints is None:
+        waypoints = plan_tour(grid.cells == FREE, grid.resolution_m, grid.origin_xy_m).tolist()
+    return {
+        'description': f'Floor plan {file.name}, walls extruded, a tour through its free space.',
+        'seed': seed,
+        'floor': {'texture': 'tiles'},
+        'boxes': _boxes(grid, occupied, seed),
+        'resolution_m': grid.resolution_m,
+        'raster_phase': 0.0,
+        'path': {'waypoints': waypoints},
+    }
+
+
+def merged_rectangles(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return rectangles (N, 4) = first row, last row + 1, first column, last column + 1 that cover
+    the mask without overlap: runs along the rows, equal runs of adjacent rows joined.
+    """
+    edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    rows, starts = np.nonzero(edges == 1)
+    _, ends = np.nonzero(edges == -1)
+    order = np.lexsort((rows, ends, starts))
+    rows, starts, ends = rows[order], starts[order], ends[order]
+    continues = (np.diff(rows) == 1) & (np.diff(starts) == 0) & (np.diff(ends) == 0)
+    first = np.concatenate([[0], np.nonzero(~continues)[0] + 1])
+    last = np.concatenate([first[1:] - 1, [len(rows) - 1]])
+    return np.stack([rows[first], rows[last] + 1, starts[first], ends[first]], axis=1)
+
+
+def _boxes(grid: OccupancyGrid, occupied: NDArray[np.bool_], seed: int) -> list[dict[str, Any]]:
+    """Return one box per merged rectangle; connected obstacles share their height."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        occupied.astype(np.uint8), connectivity=8
+    )
+    rng = np.random.default_rng([seed, 5])
+    extent_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * grid.resolution_m
+    is_wall = extent_m >= WALL_EXTENT_M
+    height_m = np.where(is_wall, WALL_HEIGHT_M, rng.choice(FURNITURE_HEIGHTS_M, count))
+    boxes = []
+    for rectangle in merged_rectangles(occupied):
+        label = int(labels[rectangle[0], rectangle[2]])
+        bottom, top, left, right = (float(value) * grid.resolution_m for value in rectangle)
+        x, y = grid.origin_xy_m
+        texture = FURNITURE_TEXTURES[label % len(FURNITURE_TEXTURES)]
+        if is_wall[label]:
+            texture = _wall_texture(rectangle[[0, 2]] * grid.resolution_m, seed)
+        boxes.append(
+            {
+                'at': [x + (left + right) / 2, y + (bottom + top) / 2],
+                'size': [right - left, top - bottom, float(height_m[label])],
+                'texture': texture,
+            }
+        )
+    return boxes
+
+
+def _wall_texture(place_m: Array, seed: int) -> str:
+    """Return the look of a wall by its place."""
+    patch = (place_m // TEXTURE_PATCH_M).astype(np.int64)
+    chosen = np.random.default_rng([seed, 6, *patch]).integers(len(WALL_TEXTURES))
+    return WALL_TEXTURES[int(chosen)]
+
+
+def plan_tour(free: Mask, resolution_m: float, origin_xy_m: tuple[float, float]) -> Array:
+    """Return waypoints (N, 2) in metres: from the widest place on to the nearest part not yet seen,
+    again and again, and back to the start. free: (rows, columns), row 0 at the lowest y.
+
+    Raises InputError where no place is wide enough.
+    """
+    room_m = cv2.distanceTransform(
+        np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )[1:-1, 1:-1] * resolution_m  # fmt: skip
+    stride = max(1, round(PLANNING_CELL_M / resolution_m))
+    places = _reachable(room_m[stride // 2 :: stride, stride // 2 :: stride])
+    cells = np.argwhere(places)
+    coarse_room_m = room_m[stride // 2 :: stride, stride // 2 :: stride][places]
+    graph = _graph(places, coarse_room_m, stride * resolution_m)
+    visits = _tour(graph, cells, coarse_room_m, stride * resolution_m)
+    fine = cells[visits] * stride + stride // 2
+    corners = _pulled_straight(room_m >= CLEARANCE_M - resolution_m, fine)
+    return np.array(origin_xy_m) + (corners[:, ::-1] + 0.5) * resolution_m
+
+
+def _reachable(room_m: Array) -> Mask:
+    """Return the largest connected part that is wide enough."""
+    wide = (room_m >= CLEARANCE_M).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=4)
+    if len(stats) < 2:
+        raise InputError(f'the map has no place with {CLEARANCE_M} m of room around it to drive')
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+
+
+def _graph(places: Mask, room_m: Array, cell_m: float) -> csr_array:
+    """Return the symmetric graph of steps between neighbouring places, weighted by their length and
+    by how tight it is there.
+    """
+    index = np.full(np.array(places.shape) + 2, -1, np.int32)
+    index[1:-1, 1:-1][places] = np.arange(places.sum())
+    tightness = np.clip((COMFORT_M - room_m) / (COMFORT_M - CLEARANCE_M), 0, 1)
+    here = index[1:-1, 1:-1][places]
+    rows, columns, weights = [], [], []
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        shifted = index[1 + dy : index.shape[0] - 1 + dy, 1 + dx : index.shape[1] - 1 + dx][places]
+        linked = shifted >= 0
+        cost = np.hypot(dy, dx) * cell_m * (1 + 2 * tightness[linked])
+        rows += [here[linked], shifted[linked]]
+        columns += [shifted[linked], here[linked]]
+        weights += [cost, cost]
+    size = int(places.sum())
+    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    return coo_array(entries, shape=(size, size)).tocsr()
+
+
+def _tour(graph: csr_array, cells: Cells, room_m: Array, cell_m: float) -> Cells:
+    """Return the places visited in order."""
+    start = here = int(np.argmax(room_m))
+    seen = _within(cells, cells[start], cell_m)
+    visits, length_m = [start], 0.0
+    while length_m < MAX_TOUR_M and not seen.all():
+        costs, previous = _ways_from(graph, here)
+        costs = np.where(seen | ~np.isfinite(costs), np.inf, costs)
+        if not np.isfinite(costs).any():
+            break
+        way = _way(previous, int(np.argmin(costs)))
+        for place in way:
+            seen |= _within(cells, cells[place], cell_m)
+        visits += way
+        length_m += float(np.hypot(*np.diff(cells[[here, *way]], axis=0).T).sum()) * cell_m
+        here = visits[-1]
+    _, previous = _ways_from(graph, here)
+    return np.array(visits + _way(previous, start))
+
+
+def _ways_from(graph: csr_array, start: int) -> tuple[Array, NDArray[np.int32]]:
+    """Return the cost of the best way to every place, and the place before it on that way."""
+    costs, previous = dijkstra(graph, indices=[start], return_predecessors=True)
+    return costs[0], previous[0]
+
+
+def _way(previous: NDArray[np.int32], goal: int) -> list[int]:
+    """Return the places after the start up to the goal."""
+    way: list[int] = []
+    while previous[goal] >= 0:
+        way.append(goal)
+        goal = int(previous[goal])
+    return way[::-1]
+
+
+def _within(cells: Cells, place: Cells, cell_m: float) -> Mask:
+    return np.asarray(np.hypot(*(cells - place).T) * cell_m <= SEEN_RADIUS_M)
+
+
+def _pulled_straight(wide: Mask, cells: Cells) -> Cells:
+    """Drop the cells between which the straight line is wide enough; turning points stay."""
+    corners, index = [0], 0
+    while index < len(cells) - 1:
+        ahead = index + 1
+        while ahead + 1 < len(cells) and _line_is_wide(wide, cells[index], cells[ahead + 1]):
+            ahead += 1
+            if np.hypot(*(cells[ahead] - cells[index])) < np.hypot(
+                *(cells[ahead - 1] - cells[index])
+            ):
+                ahead -= 1
+                break
+        corners.append(ahead)
+        index = ahead
+    return cells[corners]
+
+
+def _line_is_wide(wide: Mask, start: Cells, end: Cells) -> bool:
+    steps = int(2 * np.hypot(*(end - start))) + 2
+    line = np.round(np.linspace(start, end, steps)).astype(np.int64)
+    return bool(wide[line[:, 0], line[:, 1]].all())

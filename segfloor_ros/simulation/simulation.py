@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.occupancy import OCCUPIED, OccupancyGrid
-from segfloor_ros.simulation import sensors
+from segfloor_ros.grid.map_file import OCCUPIED, OccupancyGrid
+from segfloor_ros.simulation import rig as sensors
 from segfloor_ros.simulation.drive import Drive, plan_drive
 from segfloor_ros.simulation.renderer import WorldRenderer
 from segfloor_ros.simulation.rig import (
@@ -23,8 +23,7 @@ from segfloor_ros.simulation.rig import (
     rectified_camera,
 )
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.solids import floors, obstacles
-from segfloor_ros.simulation.truth_map import true_map
+from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.simulation.world import CAMERAS, build_world
 
 BLUR_SAMPLES = 6

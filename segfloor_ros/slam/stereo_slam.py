@@ -17,7 +17,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement, Up
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.snapshot import HeldResults, in_joined_map, take_snapshot
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd

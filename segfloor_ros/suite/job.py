@@ -21,12 +21,12 @@ from typing import Any
 
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError, without_credentials
-from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.evaluation.truth import Pose2d
 from segfloor_ros.processes import end_with_parent
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import measure_run, start_pose_of
 from segfloor_ros.suite.result_files import Cache, digest_of, local_copy, pack, unpack
+from segfloor_ros.timing import ReferenceWorkload
 
 STOP_S = 15.0
 """For a program to end that was told to; a replay ends its nodes first."""

@@ -15,11 +15,10 @@ from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
 from segfloor_ros.evaluation.run_summary import read_summary
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.evaluation.truth import Pose2d, load_truth
 from segfloor_ros.files.tables import number as finite_number
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.trajectory import read_trajectory
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 

@@ -10,17 +10,22 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from segfloor_ros.benchmark.chain import MeasuredStages, UpdateTimes
 from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, CorridorImages, floor_mask
-from segfloor_ros.benchmark.stages import BenchmarkPlan, measure_map, run_apart
+from segfloor_ros.benchmark.stages import (
+    BenchmarkPlan,
+    MeasuredStages,
+    UpdateTimes,
+    measure_map,
+    run_apart,
+)
 from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, sample_states, states
-from segfloor_ros.evaluation.reference_workload import ReferenceWorkload
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert, transform_points
 from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.timing import ReferenceWorkload
 
 CONFIGURATION = resolve()
 CHAIN_FRAMES = 12

@@ -11,8 +11,7 @@ from command_line import segfloor, segfloor_process
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 FRAMES = 16

@@ -18,16 +18,17 @@ from segfloor_ros.evaluation.map_score import (
     score_cells,
     score_map,
 )
-from segfloor_ros.evaluation.prm import (
+from segfloor_ros.evaluation.raster import (
     RoadMapPlan,
     candidate_edges,
     edges_are_free,
+    observable,
+    resample,
     sample_nodes,
     score_road_maps,
 )
-from segfloor_ros.evaluation.raster import observable, resample
 from segfloor_ros.evaluation.truth import MapTruth
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 
 FEW = RoadMapPlan(nodes=20, repetitions=5)
 

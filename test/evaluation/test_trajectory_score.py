@@ -11,8 +11,8 @@ from segfloor_ros.evaluation.trajectory import (
     save_trajectory_plot,
     score_trajectory,
 )
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import se3_exp
+from segfloor_ros.trajectory import read_trajectory
 
 
 def drive(count=101, step_m=0.1) -> np.ndarray:

@@ -10,8 +10,8 @@ import pytest
 
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.occupancy import OccupancyGrid
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 FIELD_OF_VIEW_RAD = np.pi / 2

@@ -3,7 +3,7 @@
 import numpy as np
 
 from segfloor_ros.grid.log_odds import FREE_FROM, OCCUPIED_FROM, ZERO, LogOddsRaster, steps
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.grid.settings import OccupancyGridSettings
 

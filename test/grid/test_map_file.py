@@ -6,8 +6,7 @@ import pytest
 import yaml
 
 from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.grid.map_file import load_map, save_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map, save_map
 
 # Three rows, four columns, no symmetry: a transposed, flipped or turned copy differs.
 CELLS = np.array([[0, 100, 0, -1], [100, 0, 0, 0], [-1, -1, 100, 0]], np.int8)

@@ -13,9 +13,8 @@ from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.messages import clouds, floor, images, map_files, poses
-from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import (
     Level,
     Status,
@@ -23,6 +22,7 @@ from segfloor_ros.messages.diagnostics import (
     statuses,
 )
 from segfloor_ros.messages.headers import to_ns, to_time
+from segfloor_ros.messages.images import camera_info_message, rectified_calibration
 from segfloor_ros.messages.map_files import map_start_message, map_start_ns
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 

@@ -19,10 +19,8 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.camera.calibration.rectification import rows_apart_px
 from segfloor_ros.floor.plane.mount_check import MountCheck
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
-from segfloor_ros.messages.diagnostics import HEALTH, Level
-from segfloor_ros.messages.health import Health
-from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
+from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.poses import odometry_message, transform_message
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode

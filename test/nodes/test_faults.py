@@ -15,10 +15,9 @@ from std_srvs.srv import Trigger
 from stereo_drive import room_drive
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.messages.camera_info import camera_info_message
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.images import camera_info_message, image_message
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import FLOOR, SLAM, TOPICS
 

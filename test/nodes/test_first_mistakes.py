@@ -16,10 +16,14 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, Level
 from segfloor_ros.messages.headers import to_time
-from segfloor_ros.messages.images import compressed_message, image_message
+from segfloor_ros.messages.images import (
+    camera_info_message,
+    compressed_message,
+    image_message,
+    rectified_calibration,
+)
 from segfloor_ros.messages.topics import TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.shared.connections import likeness

@@ -17,11 +17,10 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli.main import main
 from segfloor_ros.cli.replay_nodes import unconnected
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import FREE
+from segfloor_ros.grid.map_file import FREE, load_map
 from segfloor_ros.map_file import read_map_file
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
+from segfloor_ros.trajectory import read_trajectory
 
 FRAMES, DAMAGED = 20, 7
 SAME_FILES = (

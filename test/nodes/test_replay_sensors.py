@@ -13,8 +13,8 @@ from stereo_room import MOUNT, depth_of_room
 from test_replay import segfloor
 
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.evaluation.trajectory_files import read_trajectory
 from segfloor_ros.geometry import quaternion_xyzw
+from segfloor_ros.trajectory import read_trajectory
 
 FRAMES, BLIND = 16, range(8, 11)
 GRAVITY_M_S2 = 9.81

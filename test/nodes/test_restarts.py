@@ -17,7 +17,7 @@ from stereo_drive import room_drive, write_kitti
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.cloud.labels import UNKNOWN, LabelledPoints
 from segfloor_ros.geometry import invert
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.diagnostics import Level, Status

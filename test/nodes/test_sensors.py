@@ -18,8 +18,7 @@ from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, right_image
-from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.sensors import imu_message, wheel_message
+from segfloor_ros.messages.poses import imu_message, pose_array, wheel_message
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam.sensor_input import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.slam.stereo_input import DISCOVERY_S

@@ -35,14 +35,19 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
 from segfloor_ros.messages.clouds import (
     labelled_arrays,
     sparse_cloud_arrays,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.images import compressed_message, grey8_image, image_message
+from segfloor_ros.messages.images import (
+    camera_info_message,
+    compressed_message,
+    grey8_image,
+    image_message,
+    rectified_calibration,
+)
 from segfloor_ros.messages.poses import (
     path_arrays,
     pose_array,

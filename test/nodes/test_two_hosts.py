@@ -13,8 +13,7 @@ import pytest
 import thin_link
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.grid.occupancy import OccupancyGrid
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.messages.topics import CAMERA, FLOOR, NODES, SLAM
 
 TEST = Path(__file__).resolve().parents[1]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from segfloor_ros.simulation.drive import plan_drive
-from segfloor_ros.simulation.rig import RigMotion
-from segfloor_ros.simulation.scene import CameraRig, DepthSensor, Imu, Route, Scene, Sensors, Wheels
-from segfloor_ros.simulation.sensors import (
+from segfloor_ros.simulation.rig import (
+    RigMotion,
     depth_reading_mm,
     imu_readings,
     smooth_motion,
     wheel_readings,
 )
+from segfloor_ros.simulation.scene import CameraRig, DepthSensor, Imu, Route, Scene, Sensors, Wheels
 
 STRAIGHT = Route(((0.0, 0.0), (3.0, 0.0)), speed_m_s=0.5)
 CORNER = Route(((0.0, 0.0), (2.0, 0.0), (2.0, 2.0)))

@@ -6,20 +6,27 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.grid.map_file import load_map, save_map
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.simulation.floor_plan import CLEARANCE_M, merged_rectangles, plan_tour
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 from segfloor_ros.simulation.movers import is_moving, part_poses
 from segfloor_ros.simulation.scene import Person, Scene
 from segfloor_ros.simulation.scene_file import (
+    CLEARANCE_M,
+    merged_rectangles,
     open_scene,
+    plan_tour,
     read_scene_values,
     scene_from_mapping,
     shipped_scenes,
 )
-from segfloor_ros.simulation.solids import block, cylinder, floors, obstacles
+from segfloor_ros.simulation.solids import (
+    block,
+    cylinder,
+    floor_height_m,
+    floors,
+    obstacles,
+    true_map,
+)
 from segfloor_ros.simulation.textures import GENERATORS, make_texture
-from segfloor_ros.simulation.truth_map import floor_height_m, true_map
 from segfloor_ros.simulation.world import caps, merge, sides
 
 PATH = {'waypoints': [[0.5, 0.5], [1.5, 0.5]]}

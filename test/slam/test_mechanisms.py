@@ -17,8 +17,7 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.consensus import Consensus
 from segfloor_ros.slam.tracking.features import FeatureExtractor
 from segfloor_ros.slam.tracking.images import Images
-from segfloor_ros.slam.tracking.local_map import LocalMap
-from segfloor_ros.slam.tracking.map_tracking import Tracker
+from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 
 SETTINGS = StereoSlamSettings(num_features=600)
 

@@ -7,8 +7,7 @@ import pytest
 from junitparser import JUnitXml
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, save_map
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
 from segfloor_ros.suite.measures import (

@@ -12,8 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.diagnostics import HEALTH, Level, Status, status_message
-from segfloor_ros.messages.health import Health
+from segfloor_ros.messages.diagnostics import HEALTH, Health, Level, Status, status_message
 from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import DIAGNOSTICS, Topic
 from segfloor_ros.timing import rss_mb

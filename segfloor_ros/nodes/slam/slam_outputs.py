@@ -14,8 +14,7 @@ from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.messages import clouds, poses
-from segfloor_ros.messages.camera_info import camera_info_message, rectified_calibration
-from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.map_files import map_start_message
 from segfloor_ros.messages.topics import MAP_START, MOVING_MASK
 from segfloor_ros.node_settings import StereoSlamNodeSettings

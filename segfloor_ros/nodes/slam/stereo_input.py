@@ -21,7 +21,7 @@ from segfloor_ros.camera.images import EightBitScale, depth_image, grey_image
 from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages import qos
-from segfloor_ros.messages.camera_info import same_calibration
+from segfloor_ros.messages.images import same_calibration
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.connections import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.map_file import Arrays, joined, split
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord, LoopEdge, Retirement
+from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Retirement
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT

@@ -17,7 +17,7 @@ import numpy as np
 
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.moving.motion_search import turned
 from segfloor_ros.slam.results import (

@@ -11,8 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord, LoopEdge, Retirement
-from segfloor_ros.slam.map.point_rows import GrowingArray, PointRows
+from segfloor_ros.slam.map.records import (
+    GrowingArray,
+    KeyframeRecord,
+    LoopEdge,
+    PointRows,
+    Retirement,
+)
 from segfloor_ros.slam.results import NO_POINT
 
 GONE_AFTER = 3  # keyframes that have seen through a point since it was last found

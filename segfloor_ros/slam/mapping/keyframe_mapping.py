@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.measurements import Up
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust

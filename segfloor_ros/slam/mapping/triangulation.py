@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, PYRAMID_SCALE, hamming, one_to_one

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.moving.scene_flow import (
     TOLERANCE_PX,

@@ -4,20 +4,22 @@ not it has seen their points lately.
 A place that is seen again is recognised by them, as long as the path has drifted by no more than
 what patches are searched within, and needs few keyframes and no points again: the map follows the
 space covered, not the time driven.
+
+When a frame becomes a keyframe: B and (A1 or A2 or A3) of the ORB-SLAM2 / OpenVSLAM design.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.keyframe_policy import novelty
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 REACH_RATIO = 0.5
@@ -46,6 +48,20 @@ it up to date.
 COVERED_SHARE = 0.95
 COLUMNS, ROWS = 8, 6
 DEPTH_FACTORS = (0.5, 1.0, 2.0)
+
+SEEN_BY_SEVERAL = 2
+"""Keyframes that must observe a point for it to count as reliable."""
+
+TRACKED_RATIO = 0.25
+"""Condition A3 as published: a keyframe is due when fewer of the reliable points are tracked."""
+
+MIN_TRACKED = 15
+"""Condition B as published: with fewer points the pose is too poor to make points from."""
+
+MUCH_NEW, FEW_FOUND = 2.5, 0.5
+"""Novelty, and share of the points that are found again, at which condition A2 does not count
+frames any more: the next frame finds fewer still.
+"""
 
 
 def views_near(
@@ -128,3 +144,47 @@ def covered_share(
         uv = camera.project(np.where(front[:, None], local, (0.0, 0.0, 1.0)))[:, :2]
         covered |= front & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
     return float(covered.mean())
+
+
+@dataclass(frozen=True)
+class View:
+    """What the policy looks at.
+
+    frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
+    points that several keyframes see, of the keyframe that shares most with this view. novelty: how
+    far the view is from known ones, in units of what makes it new. mapper_idle: whether the mapper
+    could take a keyframe at once. found_share: of the points that were looked for.
+    """
+
+    frames_since: int
+    num_tracked: int
+    num_reliable: int
+    novelty: float
+    mapper_idle: bool = True
+    found_share: float = 1.0
+
+
+def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
+    """Decide by the published conditions; A1 and A2 also ask for a view that is new, so that a
+    robot that stands still adds nothing.
+    """
+    new_view = view.novelty > 1
+    due = view.frames_since >= settings.keyframe_min_frames
+    due |= view.novelty > MUCH_NEW or view.found_share < FEW_FOUND
+    a1 = view.frames_since >= settings.keyframe_max_frames and new_view
+    a2 = view.mapper_idle and due and new_view
+    a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable
+    b = view.num_tracked > MIN_TRACKED
+    return b and (a1 or a2 or a3)
+
+
+def novelty(T_known_now: Array, median_depth_m: float, settings: StereoSlamSettings) -> float:
+    """Return the motion (4, 4) from a known view in units of what makes a view new.
+    median_depth_m: of what is seen.
+    """
+    moved = float(np.linalg.norm(T_known_now[:3, 3]))
+    turned = rotation_angle(T_known_now[:3, :3])
+    return max(
+        moved / (settings.keyframe_motion_ratio * median_depth_m),
+        turned / settings.keyframe_turn_rad,
+    )

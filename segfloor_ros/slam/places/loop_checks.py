@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord, Match
+from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT

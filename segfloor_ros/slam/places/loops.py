@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord, Match
+from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import views_near
 from segfloor_ros.slam.places.loop_checks import (

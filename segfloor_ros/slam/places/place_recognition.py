@@ -7,11 +7,17 @@ where it should be, all over the image.
 
 The index of places: which keyframes hold the words of a view (Nister and Stewenius, Scalable
 Recognition with a Vocabulary Tree, CVPR 2006: inverted files and tf-idf).
+
+Visual words: a tree of binary descriptors, found by hierarchical clustering (Galvez-Lopez and
+Tardos, Bags of Binary Words for Fast Place Recognition, IEEE T-RO 2012, section III).
+
+The shipped tree was made by `tools/train_vocabulary.py` from rendered drives alone.
 """
 
 from __future__ import annotations
 
 from array import array
+from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +26,10 @@ from scipy.spatial import cKDTree
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.map_file import Arrays, joined, split
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.vocabulary import NUM_WORDS, Vocabulary
 from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker
 
@@ -41,6 +46,11 @@ MIN_EXPECTED = 8
 MIN_CELLS_SHARE = 0.6
 """Share of the parts of the image that must show what is expected there: a poster or a shelf that
 stands elsewhere too fills only some."""
+
+FILE = 'vocabulary.npy'
+BRANCHES = 30
+LEVELS = 3
+NUM_WORDS = BRANCHES**LEVELS
 
 
 class PlaceRecognition:
@@ -208,3 +218,31 @@ class PlaceIndex:
             return np.zeros(count)
         held = np.bincount(np.concatenate(found), np.repeat(weight, holders), minlength=count)
         return held[:count] / weight.sum()
+
+
+class Vocabulary:
+    """A tree with `BRANCHES` children at each node. nodes: (N, 32) uint8, level by level; the
+    children of node i of a level are the nodes i * BRANCHES, ... of the next.
+    """
+
+    def __init__(self, nodes: NDArray[np.uint8]) -> None:
+        ends = np.cumsum([BRANCHES**level for level in range(1, LEVELS + 1)])
+        if nodes.shape != (ends[-1], 32):
+            raise ValueError(f'a vocabulary has {ends[-1]} nodes of 32 bytes, not {nodes.shape}')
+        self._levels = [
+            level.reshape(-1, BRANCHES, 32) for level in np.split(nodes, ends[:-1].tolist())
+        ]
+
+    @staticmethod
+    def load() -> Vocabulary:
+        """Read the shipped vocabulary."""
+        with (resources.files('segfloor_ros.slam.places') / FILE).open('rb') as file:
+            return Vocabulary(np.load(file, allow_pickle=False))
+
+    def words(self, descriptor: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Return the word (N,) of each descriptor (N, 32), in [0, NUM_WORDS)."""
+        node = np.zeros(len(descriptor), np.intp)
+        for children in self._levels:
+            distance = hamming(descriptor[:, None], children[node])
+            node = node * BRANCHES + distance.argmin(axis=1)
+        return node.astype(np.int32)

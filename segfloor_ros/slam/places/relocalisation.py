@@ -1,18 +1,34 @@
-"""Relocalisation: where in the whole map a camera is that does not know."""
+"""Relocalisation: where in the whole map a camera is that does not know.
+
+A known map that the camera is not found in: the drive maps on its own until it recognises it.
+
+It was saved by another drive, or made by this one before it got lost. The two maps are kept apart.
+Several keyframes in a row must see the known map and agree on where it lies; then the drive's own
+map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle
+from segfloor_ros.map_file import Arrays
+from segfloor_ros.slam.map.map_arrays import fill_map, map_to_arrays, moved
+from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.known_views import views_near
+from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain, drift, median_depth_m
+from segfloor_ros.slam.places.loop_closing import fuse_latest, merge_pairs
 from segfloor_ros.slam.places.place_recognition import BEST_KEYFRAMES, PlaceRecognition
-from segfloor_ros.slam.results import Track
+from segfloor_ros.slam.results import NO_POINT, Track
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.map_tracking import Tracker
 
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone do not tell for sure."""
@@ -35,6 +51,14 @@ VIEW_REACH_M = 2.0
 """A view shows a place also from so far before or behind where a keyframe stands."""
 
 MAX_VIEW_TURN_RAD = 1.0
+
+NEIGHBOURS = 20
+MAX_MISSES = 1
+TIMES_A_LOOP = 2
+"""No drift tells where the known map can be: so many times the sightings of a loop are asked for.
+With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
+be no further away than it can have driven, too.
+"""
 
 
 class Relocaliser:
@@ -149,3 +173,122 @@ def _follows(found: Track, T_camera_world: Array | None) -> bool:
 
 def _apart(a: Track, b: Track) -> bool:
     return not is_within(a.T_camera_world @ invert(b.T_camera_world), SAME_M, SAME_RAD)
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A keyframe of the drive's own map that sees the known one. own_ids, known_ids: (N,) stable
+    ids of points that both have.
+    """
+
+    match: Match
+    own_ids: NDArray[np.int32]
+    known_ids: NDArray[np.int32]
+
+
+class KnownMap:
+    """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        tracker: Tracker,
+        own: SparseMap,
+        arrays: Arrays,
+        of_drive: bool,
+    ) -> None:
+        self._own = own
+        self._of_drive = of_drive
+        self._camera = camera
+        self._map = SparseMap()
+        fill_map(self._map, arrays)
+        self._places = PlaceRecognition(camera, tracker, self._map)
+        self._places.from_arrays(arrays)
+        self._relocaliser = Relocaliser(self._map, self._places)
+        self._checks = LoopChecks(camera, own, self._map)
+        self._sightings: list[Sighting] = []
+        self._misses = 0
+
+    def recognise(
+        self, keyframe: KeyframeRecord, images: Images, offset_px: float, mount: Mount | None
+    ) -> bool:
+        """Whether enough keyframes in a row see the known map, this one the last of them."""
+        match = self._look(keyframe, images, offset_px)
+        if match is not None and self._is_possible(keyframe, match, mount):
+            self._sightings.append(self._sighting(keyframe, match))
+            self._misses = 0
+        else:
+            self._misses += 1
+            if self._misses > MAX_MISSES:
+                self._sightings = []
+        matches = [sighting.match for sighting in self._sightings]
+        return are_certain(self._own, matches, TIMES_A_LOOP)
+
+    def _is_possible(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> bool:
+        if self._of_drive and not self._checks.is_within_reach(match):
+            return False
+        return not self._checks.objection(keyframe, match, mount)
+
+    def is_seen(self, images: Images, features: Features, offset_px: float) -> bool:
+        """Whether enough frames in a row see the known map, this one the last of them."""
+        found = self._relocaliser.find_surely(images, features, offset_px, None, None)
+        return found is not None
+
+    def _look(self, keyframe: KeyframeRecord, images: Images, offset_px: float) -> Match | None:
+        """Look for the view where the keyframes before saw it, else in the whole known map."""
+        features = keyframe.features
+        if self._sightings:
+            pose = keyframe.T_camera_world @ drift(self._own, self._sightings[-1].match)
+            depth_m = median_depth_m(self._own, keyframe)
+            around = self._map.points_of(views_near(self._map, pose, depth_m, NEIGHBOURS))
+            track = self._places.confirm(images, features, around, pose, offset_px)
+        else:
+            track = self._relocaliser.find(images, features, offset_px)
+        if track is None or track.observed is None:
+            return None
+        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
+        ids = track.observed.point_id[rows]
+        order, _ = self._map.covisible(ids)
+        stable_ids = self._map.stable_id[ids]
+        return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable_ids)
+
+    def _sighting(self, keyframe: KeyframeRecord, match: Match) -> Sighting:
+        own = keyframe.point_id[match.rows]
+        both = own != NO_POINT
+        return Sighting(match, self._own.stable_id[own[both]].copy(), match.stable_ids[both])
+
+    def join(self, own_words: Arrays) -> Arrays:
+        """Bring the drive's own map into the known one, of which it becomes a part, with the same
+        ids and stamps. Returns the words of all keyframes.
+        """
+        latest = self._sightings[-1].match
+        T_known_own = invert(drift(self._own, latest))
+        before = len(self._map.keyframes)
+        arrays = moved(map_to_arrays(self._own), T_known_own)
+        known = self.to_arrays()
+        self.restore(known)
+        fill_map(self._own, arrays)
+        for sighting in self._sightings:
+            match, i = sighting.match, before + sighting.match.keyframe
+            place = self._own.keyframes[match.place]
+            T_i_j = match.T_camera_world @ place.T_world_camera
+            self._own.loops.append(LoopEdge(i, match.place, T_i_j))
+            merge_pairs(self._own, self._rows(sighting.own_ids), self._rows(sighting.known_ids))
+        fuse_latest(self._camera, self._own, before + latest.keyframe)
+        return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
+
+    def to_arrays(self) -> Arrays:
+        """Return the known map and the words of its keyframes."""
+        return map_to_arrays(self._map) | self._places.to_arrays()
+
+    def restore(self, known: Arrays) -> None:
+        """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
+        self._own.reset()
+        fill_map(self._own, known)
+
+    def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
+        """Return the rows (N,) of points in the joined map, -1 for those that are gone."""
+        rows = np.searchsorted(self._own.stable_id, stable_ids)
+        rows = np.minimum(rows, len(self._own.stable_id) - 1)
+        there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
+        return np.where(there, rows, -1)

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, adjoint, invert, make_transform
 from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
-from segfloor_ros.slam.sensors.gravity import Gravity
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
-from segfloor_ros.slam.sensors.inertial_odometry import InertialOdometry
+from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
     Stretch,
     WheelCalibrator,

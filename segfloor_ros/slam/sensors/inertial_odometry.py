@@ -1,13 +1,21 @@
-"""How the camera moves as an accelerometer feels it, where images and wheels tell nothing."""
+"""How the camera moves as an accelerometer feels it, where images and wheels tell nothing.
+
+Where up is, as an accelerometer feels it.
+
+What is felt is integrated twice between three poses that the images tell (preintegration; Forster
+et al., On-Manifold Preintegration, IEEE T-RO 2017). The speeds drop out, as in the alignment of Qin
+et al., VINS-Mono, IEEE T-RO 2018, section V-B: no acceleration of the robot is taken for gravity.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
-from segfloor_ros.geometry import Array
-from segfloor_ros.slam.sensors.gravity import GRAVITY_M_S2, Gravity
+from segfloor_ros.geometry import Array, rotation_angle
+from segfloor_ros.measurements import Up
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 
 SIGMA_SEEN_M = 0.003
@@ -22,6 +30,27 @@ SIGMA_FELT = 0.01
 
 FIRST_ERROR_SIGMA_M_S2, ERROR_DRIFT = 0.1, 0.01
 """Error of what is felt once gravity is taken off, m/s², and its drift, m/s² per root second."""
+
+STEP_NS, MAX_STEP_NS = 500_000_000, 1_000_000_000
+"""Time between two of the poses: errors of millimetres in their place are little then, and little
+is lost where the images fail."""
+
+MAX_TURN_RAD = 0.5
+"""Turn between two of the poses: in a fast one the IMU feels its own circle."""
+
+SIGMA_LIFT_M_S2 = 0.08
+"""Error of what is found of three poses: of their places and of the camera's shaking."""
+
+SIGMA_BIAS_M_S2 = 0.2
+"""Bias of a cheap accelerometer."""
+
+SIGMA_ANY_M_S2 = 100.0
+OUTLIER_CHI2 = 16.27
+"""The 99.9 % quantile of the chi-squared distribution with three degrees of freedom."""
+
+MIN_MEASURED = 3
+GRAVITY_M_S2, MAX_OFF_M_S2 = 9.81, 1.0
+"""An accelerometer that feels another gravity measures something else, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -116,3 +145,108 @@ class InertialOdometry:
         noise = np.diag([grown**2 * s**3 / 3, grown**2 * s, error_variance])
         noise[0, 1] = noise[1, 0] = grown**2 * s**2 / 2
         return F @ before.mean + (mean - before.mean), F @ P @ F.T + noise
+
+
+class Gravity:
+    """Tells where up is in the world, and how the camera stands to it.
+
+    The lift L in world axes and the bias b in the camera's are what the measurements y = L + R b
+    fit best (recursive least squares): they come apart where the camera turns.
+    """
+
+    def __init__(self, gyroscope: Gyroscope) -> None:
+        self._gyroscope = gyroscope
+        self._poses: deque[tuple[int, Array]] = deque(maxlen=3)
+        self._latest: tuple[Array, Array] | None = None
+        self._measured = 0
+        self._state: Array = np.zeros(6)
+        sigma = np.repeat([SIGMA_ANY_M_S2, SIGMA_BIAS_M_S2], 3)
+        self._covariance: Array = np.diag(sigma**2)
+
+    @property
+    def up_world(self) -> Up | None:
+        """Up in the world, None before enough is known."""
+        return _up(self._state[:3], self._covariance[:3, :3]) if self._is_known else None
+
+    @property
+    def _is_known(self) -> bool:
+        off_m_s2 = abs(float(np.linalg.norm(self._state[:3])) - GRAVITY_M_S2)
+        return self._measured >= MIN_MEASURED and off_m_s2 < MAX_OFF_M_S2
+
+    def lift(self, R_world_camera: Array) -> Array | None:
+        """Return what is felt at rest (3,), in axes of the world; None before enough is known."""
+        return _design(R_world_camera) @ self._state if self._is_known else None
+
+    def up_camera(self, T_odom_camera: Array) -> Up | None:
+        """Return up in the camera's axes as the latest measurement has it, which is given out once.
+        sigma_rad: of its difference to `up_world`.
+        """
+        latest, self._latest = self._latest, None
+        if latest is None or not self._is_known:
+            return None
+        lift_odom, R_world_odom = latest
+        R_camera_odom = T_odom_camera[:3, :3].T
+        H = _design(R_world_odom @ R_camera_odom.T)
+        covariance = H @ self._covariance @ H.T + SIGMA_LIFT_M_S2**2 * np.eye(3)
+        return _up(R_camera_odom @ lift_odom - self._state[3:], covariance)
+
+    def see(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
+        """Take in the pose of a frame that images or wheels tell."""
+        if self._poses and stamp_ns - self._poses[-1][0] < STEP_NS:
+            return
+        if self._poses and stamp_ns - self._poses[-1][0] > MAX_STEP_NS:
+            self.stop()
+        self._poses.append((stamp_ns, T_odom_camera))
+        lift_odom = self._lift()
+        if lift_odom is None:
+            return
+        R_world_camera = R_world_odom @ self._poses[1][1][:3, :3]
+        if self._learn(R_world_odom @ lift_odom, _design(R_world_camera)):
+            self._latest = lift_odom, R_world_odom
+
+    def stop(self) -> None:
+        """Note that there is a frame without a pose."""
+        self._poses.clear()
+
+    def _lift(self) -> Array | None:
+        """Return what carries the camera against gravity (3,), in axes of odom, from the last three
+        poses; None where they are too few or the IMU tells too little.
+        """
+        if len(self._poses) < 3:
+            return None
+        (t0, T0), (t1, T1), (t2, T2) = self._poses
+        first, then = self._gyroscope.felt(t0, t1), self._gyroscope.felt(t1, t2)
+        if first is None or then is None:
+            return None
+        if max(rotation_angle(one.turn) for one in (first, then)) > MAX_TURN_RAD:
+            return None
+        a, b = (t1 - t0) * 1e-9, (t2 - t1) * 1e-9
+        R0, R1 = T0[:3, :3], T1[:3, :3]
+        p0, p1, p2 = (T[:3, 3] for T in (T0, T1, T2))
+        moved = (p2 - p1) - (b / a) * (p1 - p0)
+        felt = R1 @ then.way + R0 @ (b * first.speed - (b / a) * first.way)
+        return np.asarray((felt - moved) / (b * (a + b) / 2))
+
+    def _learn(self, lift: Array, H: Array) -> bool:
+        """Take in a measurement of L + R b; returns whether it agrees with those before."""
+        P, noise = self._covariance, SIGMA_LIFT_M_S2**2 * np.eye(3)
+        error, S = lift - H @ self._state, H @ self._covariance @ H.T + noise
+        if float(error @ np.linalg.solve(S, error)) > OUTLIER_CHI2:
+            return False
+        gain = P @ H.T @ np.linalg.inv(S)
+        self._state = self._state + gain @ error
+        self._covariance = P - gain @ S @ gain.T
+        self._measured += 1
+        return True
+
+
+def _design(R_world_camera: Array) -> Array:
+    return np.hstack([np.eye(3), R_world_camera])
+
+
+def _up(lift: Array, covariance: Array) -> Up:
+    length = float(np.linalg.norm(lift))
+    direction = lift / length
+    across = np.eye(3) - np.outer(direction, direction)
+    variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    return Up(direction, float(np.sqrt(variance)) / length)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
 from segfloor_ros.measurements import Up
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.mapping.normal_equations import System
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 

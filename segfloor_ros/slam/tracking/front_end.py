@@ -10,7 +10,7 @@ import numpy as np
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.places.relocalisation import Relocaliser, is_within
@@ -31,8 +31,7 @@ from segfloor_ros.slam.tracking.images import (
     is_inside,
     join,
 )
-from segfloor_ros.slam.tracking.local_map import LocalMap
-from segfloor_ros.slam.tracking.map_tracking import Tracker
+from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import MAX_BLIND_SIGMA_M, CameraMotion, sigma_m
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.mapping.keyframe_policy import View, is_keyframe, novelty
+from segfloor_ros.slam.places.known_views import View, is_keyframe, novelty
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.images import FrozenCheck, image_fault
 

@@ -11,7 +11,7 @@ from segfloor_ros.geometry import invert, se3_exp
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, adjust
 from segfloor_ros.slam.mapping.level_ground import SIGMA, LevelGround
-from segfloor_ros.slam.places.pose_graph import PoseGraph, optimise
+from segfloor_ros.slam.places.loop_closing import PoseGraph, optimise
 
 T_BASE_LEFT = MOUNT.T_base_left
 GROUND = LevelGround(T_BASE_LEFT)

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import invert, make_transform, transform_points
-from segfloor_ros.slam.map.keyframe_record import KeyframeRecord
+from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.triangulation import fundamental_matrix, triangulate_between

@@ -8,7 +8,7 @@ from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.map.keyframe_record import Match
+from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
-from segfloor_ros.slam.map.keyframe_record import Match
+from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.places.loop_closing import move_keyframes
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam

@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from segfloor_ros.slam.places.place_recognition import PlaceIndex
-from segfloor_ros.slam.places.vocabulary import BRANCHES, NUM_WORDS, Vocabulary
+from segfloor_ros.slam.places.place_recognition import BRANCHES, NUM_WORDS, PlaceIndex, Vocabulary
 
 RNG = np.random.default_rng(3)
 

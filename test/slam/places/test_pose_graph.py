@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp, se3_log, se3_logs
-from segfloor_ros.slam.places.pose_graph import PoseGraph, optimise
+from segfloor_ros.slam.places.loop_closing import PoseGraph, optimise
 
 COUNT = 60
 

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import ImuSample, Up
-from segfloor_ros.slam.sensors.gravity import Gravity
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
+from segfloor_ros.slam.sensors.inertial_odometry import Gravity
 from segfloor_ros.slam.sensors.motion_links import Level, with_factors
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
