@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
+import tempfile
+import threading
 import time
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,17 +19,22 @@ from segfloor_ros import results_folder
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import MapError, SettingsError
+from segfloor_ros.errors import MapError, SegfloorError, SettingsError
+from segfloor_ros.files.results import check_writable
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
+from segfloor_ros.map_file import MapFile, is_map_file, read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath
+from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.timing import MemoryLog
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar('T')
 
 ProgressListener = Callable[[int, str], None]
 """Told after every frame: how many are done, and the state in words."""
@@ -51,8 +61,8 @@ class MapOptions:
             raise SettingsError('--localize needs the map to localize in: --load-map FILE')
         if self.localize and self.save is not None:
             raise SettingsError('--localize adds nothing to the map: leave --save-map out')
-        if self.save is not None and self.save.is_dir():
-            raise SettingsError(f'--save-map {self.save}: is a folder; give the name of a file')
+        if self.save is not None:
+            check_writable(self.save, '--save-map', is_map_file)
 
     def read(self, camera: StereoCamera) -> MapFile | None:
         """Return the map to go on with, None where there is none. Raises InputError, also for a map
@@ -63,6 +73,23 @@ class MapOptions:
         saved = read_map_file(self.load)
         check_camera(saved, camera, str(self.load))
         return saved
+
+    def write(self, write: Callable[[Path], object], interrupted: bool) -> str:
+        """Have the map saved; returns where it is, in words, where that is elsewhere: what is
+        interrupted does not replace an older map, and what cannot be written there is written to
+        the folder for temporary files. Raises SegfloorError where that cannot be either.
+        """
+        assert self.save is not None
+        path = self.save
+        if interrupted and path.exists():
+            path = path.with_name(f'{path.name}.interrupted')
+        try:
+            write(path)
+        except SegfloorError as error:
+            path = Path(tempfile.mkdtemp(prefix='segfloor-map-')) / path.name
+            write(path)
+            return f'{error}; the map is in {path}'
+        return '' if path == self.save else f'{self.save}: stays as it was; the map is in {path}'
 
     def why_not_found(self, name: str, frames: int) -> str:
         """Return why there is no map where one was loaded."""
@@ -85,7 +112,10 @@ def no_floor(name: str, frames: int) -> str:
 
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
-    needs.
+    needs. interrupted: ends the drive after the frame at which it is set.
+
+    note: what there is to say about the map that was to be saved. broken_off: why the recording
+    could not be read to its end.
     """
 
     def __init__(
@@ -96,6 +126,7 @@ class LockstepRun:
         save_masks: SaveMasks = SaveMasks.keyframes,
         save_debug: bool = False,
         map_options: MapOptions = NO_MAPS,
+        interrupted: threading.Event | None = None,
     ) -> None:
         self._source = source
         self._configuration = configuration
@@ -107,35 +138,38 @@ class LockstepRun:
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
         self.note = ''
+        self.broken_off: SegfloorError | None = None
+        self._interrupted = interrupted or threading.Event()
         self._map_options = map_options
         loaded = map_options.read(source.camera)
         if loaded is not None:
             self._pipeline.load(loaded, str(map_options.load), map_options.localize)
-        self._unmasked: list[StereoFrame] = []
+        self._unmasked: dict[int, StereoFrame] = {}
         self._results: list[FrameResult] = []
+        self._failed_frames = 0
         self._frames = 0
         self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
     def execute(self, on_progress: ProgressListener | None = None) -> results_folder.RunResult:
-        """Process every frame and return the result; an interrupt (Ctrl-C) ends the run early
-        and keeps the map.
+        """Process every frame and return the result; an interrupt or a recording that breaks off
+        ends the run early and keeps the map.
 
-        Raises MapError when no map came of it.
+        Raises MapError when no map came of it, or what the recording broke off with.
         """
         start = time.perf_counter()
         try:
             self._process_frames(on_progress)
-            for result in self._pipeline.slam.finish():
+            for result in self._attempt(self._frames, self._pipeline.slam.finish) or []:
                 self._note(result)
             grid = self._pipeline.finish()
         finally:
             self._pipeline.close()
         wall_s = time.perf_counter() - start
+        self._results.sort(key=lambda result: result.index)
         stages = self._pipeline.keyframe_stages
         mount, labelled, poses = self._pipeline.mount, stages.labelled, self._tracked_poses()
         if grid is None or mount is None or labelled is None or not poses:
-            raise MapError(self._why_no_map())
-        self._save_map()
+            raise self.broken_off or MapError(self._why_no_map())
         path = self._path
         return results_folder.RunResult(
             grid,
@@ -147,8 +181,14 @@ class LockstepRun:
             self._configuration,
         )
 
-    def _save_map(self) -> None:
-        """Save the map; one that the drive has not recognised is not overwritten with its own."""
+    @property
+    def _is_cut_short(self) -> bool:
+        return self._interrupted.is_set() or self.broken_off is not None
+
+    def save_map(self) -> None:
+        """Save the map, after `execute`; one that the drive has not recognised is not overwritten
+        with its own. Raises InputError where it cannot be written anywhere.
+        """
         save, load = self._map_options.save, self._map_options.load
         if save is None:
             return
@@ -159,7 +199,9 @@ class LockstepRun:
                 'another name to keep the map of this drive'
             )
             return
-        write_map_file(save, self._pipeline.save())
+        saved = self._pipeline.save()
+        write = partial(write_map_file, saved=saved)
+        self.note = self._map_options.write(write, self._is_cut_short)
 
     def _tracked_poses(self) -> list[TrackedPose]:
         return [
@@ -174,35 +216,54 @@ class LockstepRun:
         ]
 
     def _process_frames(self, on_progress: ProgressListener | None) -> None:
+        measurements = MeasurementLog(self._source.sensors)
         try:
-            measurements = MeasurementLog(self._source.sensors)
             for frame in self._source.frames():
                 self._frames += 1
                 slam = self._pipeline.slam
                 for measurement in measurements.until(frame.stamp_ns + slam.sensors.lag_ns):
                     slam.add(measurement)
                 if self._save_masks is SaveMasks.all:
-                    self._unmasked.append(frame)
-                for result in self._pipeline.process(frame):
+                    self._unmasked[frame.index] = frame
+                results = self._attempt(frame.index, partial(self._pipeline.process, frame))
+                for result in [lost_frame(frame)] if results is None else results:
                     self._note(result)
                 if on_progress is not None:
                     state = self._results[-1].state if self._results else 'looking for the floor'
                     on_progress(self._frames, state)
-        except KeyboardInterrupt:
-            return
+                if self._interrupted.is_set():
+                    return
+        except SegfloorError as error:
+            if not self._frames:
+                raise
+            self.broken_off = error
+
+    def _attempt(self, index: int, step: Callable[[], T]) -> T | None:
+        """Return what a step returns, None where it fails at what a frame shows: that one is lost,
+        the drive goes on.
+        """
+        try:
+            return step()
+        except SegfloorError:
+            raise
+        except Exception as error:
+            self._failed_frames += 1
+            logger.warning('frame %d failed: %s: %s', index, type(error).__name__, error)
+            logger.debug('where it failed:', exc_info=error)
+            return None
 
     def _note(self, result: FrameResult) -> None:
         if self._save_masks is SaveMasks.all:
-            self._mask_frame(self._unmasked.pop(0), result)
+            frame = self._unmasked.pop(result.index)
+            self._attempt(frame.index, partial(self._mask_frame, frame, result))
         if result.keyframe is not None:
             self._path = new_keyframes(result.keyframe.path)
             result = dataclasses.replace(result, keyframe=None)
         self._results.append(result)
 
     def _mask_frame(self, frame: StereoFrame, result: FrameResult) -> None:
-        if result.keyframe is not None:
+        if result.keyframe is not None or self._pipeline.mount is None:
             return
-        assert self._pipeline.mount is not None
         T_map_base = result.T_map_odom @ result.T_odom_base if result.tracked else None
         floor = self._other_frames.process(
             frame.left, frame.right, self._pipeline.mount, T_map_base
@@ -229,6 +290,8 @@ class LockstepRun:
             return self._map_options.why_not_found(name, self._frames)
         if self._pipeline.mount is None:
             return no_floor(name, self._frames)
+        if self._pipeline.fault:
+            return f'{name}: no keyframe came to the map: {self._pipeline.fault}'
         return f'{name}: none of {self._frames} frames could be tracked, so there is no map'
 
     def _sensors_used(self) -> dict[str, int]:
@@ -269,6 +332,9 @@ class LockstepRun:
             blind_frames=sum(result.blind for result in self._results),
             moving_frames=sum(_shows_motion(result) for result in self._results),
             sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],
+            failed_frames=self._failed_frames,
+            failed_keyframes=self._pipeline.failed_keyframes,
+            interrupted=self._is_cut_short,
             stages=self._pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, os_errors
-from segfloor_ros.files.whole import json_object, read_bytes, replacing
+from segfloor_ros.files.results import replacing
+from segfloor_ros.files.whole import json_object, read_bytes
 
 FORMAT = 'segfloor map'
 VERSION = 1
@@ -59,6 +60,16 @@ def read_map_file(path: Path) -> MapFile:
     of another kind or of a newer version.
     """
     return from_bytes(read_bytes(path, at_most=MAX_BYTES), str(path))
+
+
+def is_map_file(path: Path) -> bool:
+    """Whether a file is a map, of whatever version."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(HEADER) as header:
+            found = json_object(header.read(SMALL))
+    except Exception:  # as in `from_bytes`
+        return False
+    return found is not None and found.get('format') == FORMAT
 
 
 def to_bytes(saved: MapFile, compress: bool = True) -> bytes:

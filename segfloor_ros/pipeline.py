@@ -4,6 +4,7 @@ the same bytes.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,6 +33,8 @@ from segfloor_ros.slam.results import (
 from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, save_slam
 from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
+
+logger = logging.getLogger(__name__)
 
 MAX_PENDING_KEYFRAMES = 4
 
@@ -112,7 +115,9 @@ class KeyframeStages:
 class Pipeline:
     """SLAM on the calling thread, the other stages on one worker, in the order of the keyframes.
 
-    Nothing flows back from the worker to SLAM, so the result does not depend on timing.
+    Nothing flows back from the worker to SLAM, so the result does not depend on timing. A keyframe
+    at which a stage fails does not reach the map, the others do. failed_keyframes: how many did
+    not; fault: of the last of them, in words.
     """
 
     def __init__(
@@ -125,6 +130,7 @@ class Pipeline:
         self._camera = camera
         self.slam = make_slam(camera, configuration.stereo_slam, times=self.times)
         self.keyframe_stages = KeyframeStages(camera, configuration, self.times)
+        self.failed_keyframes, self.fault = 0, ''
         self._on_keyframe = on_keyframe
         self._worker = ThreadPoolExecutor(1, 'keyframes')
         self._pending: deque[Future[None]] = deque()
@@ -175,6 +181,12 @@ class Pipeline:
 
     def _process_keyframe(self, keyframe: Keyframe) -> None:
         assert self.mount is not None
-        floor = self.keyframe_stages.process(keyframe, self.mount)
-        if self._on_keyframe is not None:
-            self._on_keyframe(keyframe, floor)
+        try:
+            floor = self.keyframe_stages.process(keyframe, self.mount)
+            if self._on_keyframe is not None:
+                self._on_keyframe(keyframe, floor)
+        except Exception as error:
+            self.failed_keyframes += 1
+            self.fault = f'{type(error).__name__}: {error}'
+            logger.warning('keyframe %d failed: %s', keyframe.frame_index, self.fault)
+            logger.debug('where it failed:', exc_info=error)

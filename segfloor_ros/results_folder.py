@@ -1,17 +1,17 @@
 """The results folder of a run: maps, trajectories, cloud, masks, summary and settings.
 
-Everything is written to a hidden folder beside the target and moved in at the end, so that a
-run that fails leaves nothing half-written.
+Everything is written to a hidden folder beside the target and moved into place at the end, so that
+a run that fails leaves nothing half-written; a result that cannot be written there goes elsewhere.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +23,29 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labels import LabelledPoints, write_ply
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.files.results import (
+    check_target,
+    folder_in_the_making,
+    move_into_place,
+    own_files,
+)
+from segfloor_ros.files.whole import read_json
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.trajectory import Trajectory, write_tum
 
+PICTURES = ('floor_masks', 'moving_masks', 'floor_debug')
 OUTPUT_NAMES = (
+    *PICTURES,
     'map.pgm',
     'map.yaml',
     'trajectory.txt',
     'keyframes.txt',
     'camera_trajectory.txt',
     'labelled_cloud.ply',
-    'floor_masks',
-    'moving_masks',
-    'floor_debug',
     'summary.json',
     'settings.yaml',
+    'report.html',
 )
 
 
@@ -52,8 +59,9 @@ class RunSummary:
     is, and whether it was `joined` later; what was not is in no map and no trajectory. sensors:
     messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. moving_frames:
     in which something was found that moves. sensor_remarks: what seems wrong with sensors, in
-    words. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and
-    slope_per_update in MB, and samples over the updates.
+    words. failed_frames, failed_keyframes: at which a stage failed; they are lost or not in the
+    map. interrupted: whether the drive was cut short. stages: by name count, mean_ms, p50_ms,
+    p95_ms, max_ms. rss_mb: start, peak and slope_per_update in MB, and samples over the updates.
     """
 
     frames: int
@@ -74,6 +82,9 @@ class RunSummary:
     blind_frames: int
     moving_frames: int
     sensor_remarks: list[str]
+    failed_frames: int
+    failed_keyframes: int
+    interrupted: bool
     stages: dict[str, dict[str, float]]
     rss_mb: dict[str, Any]
 
@@ -133,53 +144,122 @@ def relocalisations(stamp_ns: Sequence[int], tracked: NDArray[np.bool_]) -> list
 
 class OutputFolder:
     """A results folder in the making; used as a context manager, it appears only when `write`
-    was called.
+    was called. inputs: files and folders that are read. Raises InputError where nothing can be
+    written, or something of others is in the way.
+
+    path: where the results are. problems: what could not be written, in words.
     """
 
-    def __init__(self, target: Path) -> None:
-        if target.exists() and not target.is_dir():
-            raise InputError(f'{target}: exists and is no folder; choose another --out')
-        self._target = target
+    def __init__(self, target: Path, inputs: Iterable[Path | str] = ()) -> None:
+        check_target(target, OUTPUT_NAMES, inputs)
+        self.path = target
+        self.problems: list[str] = []
 
     def __enter__(self) -> OutputFolder:
-        parent = self._target.absolute().parent
-        with os_errors(f'{parent}: cannot write there', '; choose another --out'):
-            parent.mkdir(parents=True, exist_ok=True)
-            self._staging = Path(tempfile.mkdtemp(prefix='.segfloor-', dir=parent))
+        self._stack = ExitStack()
+        self._made = self._stack.enter_context(folder_in_the_making(self.path))
         return self
 
     def __exit__(self, *error: object) -> None:
-        shutil.rmtree(self._staging, ignore_errors=True)
+        self._stack.close()
 
     def add_picture(self, folder: str, name: str, picture: NDArray[np.uint8]) -> None:
-        """Keep a mask (H, W), or a picture (H, W, 3) BGR, in one of the folders of pictures."""
-        target = self._staging / folder
-        target.mkdir(exist_ok=True)
-        cv2.imwrite(str(target / f'{name}.png'), picture)
+        """Keep a mask (H, W), or a picture (H, W, 3) BGR, in one of the folders of pictures. One
+        that cannot be written is missing, and said to be.
+        """
+        target = self._made / folder / f'{name}.png'
+        try:
+            target.parent.mkdir(exist_ok=True)
+            target.write_bytes(cv2.imencode('.png', picture)[1].tobytes())
+        except OSError as error:
+            target.unlink(missing_ok=True)
+            if not self.problems:
+                words = f'{folder}/{name}.png cannot be written ({error.strerror})'
+                self.problems.append(f'{words}; it and perhaps others are missing')
 
     def write(self, result: RunResult) -> None:
-        """Write every file and move them into place, replacing the files of an earlier run."""
-        staging = self._staging
-        save_map(result.grid, staging / 'map.yaml')
-        write_tum(staging / 'trajectory.txt', result.trajectory)
-        write_tum(staging / 'keyframes.txt', result.keyframes)
-        camera = result.trajectory.seen_from(result.mount.T_base_left)
-        write_tum(staging / 'camera_trajectory.txt', camera)
-        write_ply(staging / 'labelled_cloud.ply', result.labelled)
-        summary = json.dumps(dataclasses.asdict(result.summary), indent=2)
-        (staging / 'summary.json').write_text(summary + '\n')
-        settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
-        (staging / 'settings.yaml').write_text(settings)
-        self._move_into_place(staging)
+        """Write every file and move them into place, replacing the files of an earlier run; what is
+        interrupted does not replace a whole result. Where that cannot be, as many files as possible
+        are written elsewhere. Raises InputError where not even that can be.
+        """
+        if result.summary.interrupted and _is_whole(self.path):
+            self.path = self.path.with_name(f'{self.path.name}.interrupted')
+        failed = _write_files(self._made, result)
+        try:
+            if not failed:
+                check_target(self.path, OUTPUT_NAMES)
+                return move_into_place(self._made, self.path)
+            why = ', '.join(f'{name} ({why})' for name, why in failed.items())
+        except (OSError, InputError) as error:
+            why = str(error)
+        self._write_elsewhere(result, why)
 
-    def _move_into_place(self, staging: Path) -> None:
-        self._target.mkdir(exist_ok=True)
-        for name in OUTPUT_NAMES:
-            old = self._target / name
-            if old.is_dir():
-                shutil.rmtree(old)
-            if (staging / name).exists():
-                os.replace(staging / name, old)
+    def _write_elsewhere(self, result: RunResult, why: str) -> None:
+        """Write to the folder for temporary files or the present one, wherever more can be."""
+        words = f'{self.path}: cannot be written: {why}'
+        tried: list[tuple[int, Path, dict[str, str]]] = []
+        for parent in (Path(tempfile.gettempdir()), Path.cwd()):
+            try:
+                folder = Path(tempfile.mkdtemp(prefix=f'{self.path.name}-', dir=parent))
+            except OSError:
+                continue
+            failed = _write_files(folder, result)
+            tried.append((len(failed), folder, failed))
+            if not failed:
+                break
+        tried.sort(key=lambda one: one[0])
+        for _, folder, _ in tried[1:]:
+            shutil.rmtree(folder, ignore_errors=True)
+        if not tried or tried[0][0] == len(_writers(result)):
+            raise InputError(f'{words}; nor can it be elsewhere')
+        self.path, failed = tried[0][1:]
+        for name in PICTURES:
+            with suppress(OSError):
+                shutil.copytree(self._made / name, self.path / name)
+        missing = f' but {", ".join(failed)}' if failed else ''
+        self.problems.append(f'{words}; the result is in {self.path}, all{missing}')
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a folder holds a result of a drive that was not interrupted."""
+    if 'summary.json' not in own_files(folder):
+        return False
+    try:
+        return not read_json(folder / 'summary.json', 'a summary').get('interrupted')
+    except InputError:
+        return False
+
+
+def _writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
+    """Return what writes each file of a result."""
+    camera = result.trajectory.seen_from(result.mount.T_base_left)
+    summary = json.dumps(dataclasses.asdict(result.summary), indent=2)
+    settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
+    return {
+        'map.yaml': lambda path: save_map(result.grid, path),
+        'trajectory.txt': lambda path: write_tum(path, result.trajectory),
+        'keyframes.txt': lambda path: write_tum(path, result.keyframes),
+        'camera_trajectory.txt': lambda path: write_tum(path, camera),
+        'labelled_cloud.ply': lambda path: write_ply(path, result.labelled),
+        'summary.json': lambda path: path.write_text(summary + '\n'),
+        'settings.yaml': lambda path: path.write_text(settings),
+    }
+
+
+def _write_files(folder: Path, result: RunResult) -> dict[str, str]:
+    """Write every file that can be written; returns why the others cannot, by name."""
+    why = {name: _try_to(write, folder / name) for name, write in _writers(result).items()}
+    return {name: words for name, words in why.items() if words}
+
+
+def _try_to(write: Callable[[Path], object], path: Path) -> str:
+    """Write a file; returns why that cannot be, '' where it can."""
+    try:
+        write(path)
+    except (OSError, SegfloorError) as error:
+        path.unlink(missing_ok=True)
+        return getattr(error, 'strerror', None) or str(error)
+    return ''
 
 
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
@@ -195,6 +275,13 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         *(('frames mapped apart', _apart_words(part)) for part in summary.apart),
         *(('remark', remark) for remark in summary.sensor_remarks),
         ('frames skipped (unreadable)', summary.skipped_frames),
+        *([('frames that failed', summary.failed_frames)] if summary.failed_frames else []),
+        *(
+            [('keyframes that failed', summary.failed_keyframes)]
+            if summary.failed_keyframes
+            else []
+        ),
+        *([('interrupted', 'yes')] if summary.interrupted else []),
         ('frames with something that moves', summary.moving_frames),
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import os
 from collections.abc import Callable
+from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from segfloor_ros.camera.sources.bag_file import MISSING_LIBRARY
 from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import ImuSample, Measurement, MeasurementLog, WheelPose
 
@@ -108,6 +109,7 @@ class BagWriter:
             ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
             ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
         }
+        self._stack = ExitStack()
         self._staging = Path()
         self._writer: Any = None
         self._typestore: Any = None
@@ -115,7 +117,7 @@ class BagWriter:
         self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
 
     def __enter__(self) -> BagWriter:
-        if self._out.exists():
+        if os.path.lexists(self._out):
             raise InputError(f'{self._out}: exists already; remove it or choose another name')
         try:
             from rosbags import rosbag2
@@ -124,7 +126,7 @@ class BagWriter:
             raise InputError(f'{self._out}: {MISSING_LIBRARY}') from None
         with os_errors(f'{self._out}: cannot be written'):
             self._out.parent.mkdir(parents=True, exist_ok=True)
-            self._staging = Path(tempfile.mkdtemp(prefix='.bag-', dir=self._out.parent))
+            self._staging = self._stack.enter_context(scratch_folder(self._out.parent))
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._writer = rosbag2.Writer(
             self._staging / self._out.stem, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
@@ -148,7 +150,7 @@ class BagWriter:
                 bag = bag / f'{self._out.stem}.mcap'
             bag.rename(self._out)
         finally:
-            shutil.rmtree(self._staging, ignore_errors=True)
+            self._stack.close()
 
     def write(self, pair: RawPair) -> None:
         """Append one pair, recorded at its own stamp; of a depth camera, image and depth."""

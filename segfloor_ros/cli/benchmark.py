@@ -21,7 +21,8 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options
 from segfloor_ros.cli.output import announcing, console, figure_table, progress_bar
 from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.errors import SettingsError, os_errors
+from segfloor_ros.errors import SettingsError
+from segfloor_ros.files.results import check_writable, write_file
 
 DEFAULT = BenchmarkPlan()
 
@@ -60,7 +61,8 @@ def benchmark(
         print_node_figures(options.configuration(params, assignments, nodes), rate)
         return
     configuration = resolve(params, assignments or ())
-    _make_folder_of(json_file)
+    if json_file is not None:
+        check_writable(json_file, '--json')
     plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
     with announcing() as announce:
         workloads = run_benchmark(plan, configuration, announce)
@@ -83,20 +85,11 @@ def print_node_figures(configuration: Configuration, rate: float, lossless: bool
     console.print(figures_table(figures))
 
 
-def _make_folder_of(path: Path | None) -> None:
-    """Find out before minutes of work whether the figures can be written."""
-    if path is None:
-        return
-    with os_errors(f'{path}: cannot be written', '; choose another --json'):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open('a').close()
-
-
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
     """Write figures to a file and say where."""
     if path is None:
         return
-    path.write_text(json.dumps(document, indent=2) + '\n')
+    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
     console.print(f'figures: {path}', highlight=False, soft_wrap=True)
 
 

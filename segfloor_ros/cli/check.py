@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
-import sys
+import tempfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,15 +17,21 @@ from rich.text import Text
 from segfloor_ros.cli.output import console, figure_table, print_error
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.evaluation.truth import Pose2d
+from segfloor_ros.files.results import add_files, check_target, check_writable
 from segfloor_ros.files.whole import read_json, read_text
+from segfloor_ros.results_folder import OUTPUT_NAMES
 from segfloor_ros.suite import verdicts
 from segfloor_ros.suite.description import Suite, read_suite
-from segfloor_ros.suite.job import Job, Outcome, package_digest
+from segfloor_ros.suite.job import LOG, SAVED_MAP, Job, Outcome, package_digest
 from segfloor_ros.suite.measures import known_measures, number
 from segfloor_ros.suite.result_files import MEASURED, pack, unpack
 from segfloor_ros.suite.workers import outcomes
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
+JUNIT, PAGE, FAILED = 'junit.xml', 'suite.html', 'failed.txt'
+FILES = (*OUTPUT_NAMES, MEASURED, LOG, SAVED_MAP, FAILED)
+"""In the folder of a recording."""
+
 HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
 
 
@@ -64,13 +69,12 @@ def check_suite(
     """Map recordings and hold the results against bounds. Status 1: a bound failed."""
     described = read_suite(suite)
     known = verdicts.read_baseline(baseline) if baseline is not None else None
-    with os_errors(f'{out}: cannot be a folder for the results', '; choose another --out'):
-        out.mkdir(parents=True, exist_ok=True)
+    _check_out(out, described)
+    if baseline_to_write is not None:
+        check_writable(baseline_to_write, '--write-baseline', verdicts.is_baseline)
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, verdicts.Checked] = {}
-    # As an interrupt does, a signal to end lets the workers end first.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     with contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results:
         for job, outcome in results:
             checked = verdicts.check(job.entry, outcome, known)
@@ -85,6 +89,18 @@ def check_suite(
         console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)
     if not result.holds:
         raise typer.Exit(1)
+
+
+def _check_out(out: Path, suite: Suite) -> None:
+    """Raise InputError unless all results can be written to a folder, which is made."""
+    named = [(entry.input, entry.truth, entry.reference_map) for entry in suite.entries]
+    check_target(out, (JUNIT, PAGE), [path for paths in named for path in paths])
+    for entry in suite.entries:
+        check_target(out / entry.name, FILES)
+    with os_errors(f'{out}: cannot be a folder for the results', '; choose another --out'):
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
 
 
 def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:
@@ -118,15 +134,20 @@ def _write(job: Job, outcome: Outcome, out: Path) -> None:
             f'worker {outcome.worker} has another version of segfloor_ros than this machine; '
             'install the same on all'
         )
-    unpack(outcome.archive, out / outcome.name)
-    if not outcome.problem:
+    folder = out / outcome.name
+    with os_errors(f'{folder}: cannot be written'):
+        if outcome.problem:
+            # What is there of last time stays.
+            add_files(folder, {FAILED: f'{outcome.problem}\n'.encode()})
+            return
         record = {
             'job': job.digest(),
             'seconds': outcome.seconds,
             'start_pose': outcome.start_pose,
             'measured': outcome.measured,
         }
-        (out / outcome.name / MEASURED).write_text(json.dumps(record, indent=2) + '\n')
+        measured = (json.dumps(record, indent=2) + '\n').encode()
+        unpack(outcome.archive, folder, {MEASURED: measured})
 
 
 def _read_outcome(job: Job, out: Path) -> Outcome | None:
@@ -134,7 +155,7 @@ def _read_outcome(job: Job, out: Path) -> Outcome | None:
     folder = out / job.entry.name
     try:
         record = read_json(folder / MEASURED, 'what a check has measured')
-        if record['job'] != job.digest():
+        if (folder / FAILED).exists() or record['job'] != job.digest():
             return None
         return Outcome(
             job.entry.name,
@@ -160,7 +181,7 @@ def _finish(
 ) -> None:
     """Print the table and what fails, and write the files of the suite."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.suite.page import write_junit, write_page
+    from segfloor_ros.suite.page import junit, page
 
     console.print(_table(result))
     for checked in result.recordings:
@@ -169,9 +190,10 @@ def _finish(
     if baseline is not None:
         for name in [e.name for e in described.entries if e.name not in baseline]:
             print_error(f"{name}: is not in the baseline, so only the suite's own bounds hold")
-    write_junit(result, out / 'junit.xml')
-    console.print(f'junit: {out / "junit.xml"}', highlight=False, soft_wrap=True)
-    console.print(f'page: {write_page(result, out)}', highlight=False, soft_wrap=True)
+    with os_errors(f'{out}: cannot be written'):
+        add_files(out, {JUNIT: junit(result), PAGE: page(result, out)})
+    console.print(f'junit: {out / JUNIT}', highlight=False, soft_wrap=True)
+    console.print(f'page: {out / PAGE}', highlight=False, soft_wrap=True)
 
 
 def _print_progress(checked: verdicts.Checked, done: int, total: int) -> None:

@@ -12,8 +12,9 @@ from segfloor_ros.cli.evaluate import map_table
 from segfloor_ros.cli.output import console
 from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
-from segfloor_ros.evaluation.map_score import compare, save_overlay, score_map
+from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.files.results import add_files
 from segfloor_ros.grid.map_file import load_map
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
@@ -60,6 +61,6 @@ def _print_scores(out: Path) -> None:
         f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)',
         highlight=False,
     )
-    save_overlay(compare(grid, truth), out / 'overlay.png')
+    add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
     console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)

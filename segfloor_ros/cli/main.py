@@ -20,6 +20,7 @@ from segfloor_ros.cli.run import run
 from segfloor_ros.cli.simulate import simulate
 from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.silence import own_standard_error
+from segfloor_ros.interrupts import terminated_like_interrupted
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 
 app = typer.Typer(
@@ -59,7 +60,8 @@ def run_app(program: typer.Typer) -> None:
     """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     try:
-        program()
+        with terminated_like_interrupted():
+            program()
     except MapError as error:
         print_error(str(error))
         sys.exit(1)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -19,8 +20,9 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from segfloor_ros.errors import printable
+from segfloor_ros.interrupts import Interrupt
 from segfloor_ros.measurements import RecordedSensor
-from segfloor_ros.results_folder import RunSummary, summary_rows
+from segfloor_ros.results_folder import OutputFolder, RunSummary, summary_rows
 
 console = Console(markup=False)
 error_console = Console(stderr=True, soft_wrap=True, markup=False)
@@ -104,15 +106,41 @@ def print_error(message: str) -> None:
     error_console.print(f'segfloor: {printable(message)}', highlight=False)
 
 
-def finish_run(input_name: str, out: Path, report: bool) -> None:
+def end_if_interrupted(interrupt: Interrupt) -> None:
+    """End the command where a signal came before there was a map."""
+    if interrupt.status:
+        print_error('interrupted before there was a map; nothing is written')
+        raise typer.Exit(interrupt.status)
+
+
+def finish_run(
+    input_name: str,
+    out: Path,
+    folder: OutputFolder,
+    report: bool,
+    remarks: Iterable[str],
+    status: int = 0,
+) -> None:
     """Write the report if asked for, with the truth where the recording has one, and say where the
-    results are.
+    results are and what there is to say about them. status: to end with; 1 where it is 0 and
+    something could not be written.
     """
-    console.print(f'map: {out / "map.yaml"}', highlight=False, soft_wrap=True)
+    console.print(f'map: {folder.path / "map.yaml"}', highlight=False, soft_wrap=True)
+    problems = list(folder.problems)
     if report:
         # Imported here: Matplotlib takes a second that other commands should not wait for.
         from segfloor_ros.evaluation.report import write_report
 
         recording = Path(input_name)
         truth = recording if (recording / 'map.yaml').is_file() else None
-        console.print(f'report: {write_report(out, truth)}', highlight=False, soft_wrap=True)
+        try:
+            written = write_report(folder.path, truth)
+            console.print(f'report: {written}', highlight=False, soft_wrap=True)
+        except Exception as error:  # whatever it is, the results are there
+            problems.append(f'there is no report: {str(error) or type(error).__name__}')
+    for line in (*problems, *remarks):
+        print_error(line)
+    if status and not problems and folder.path != out:
+        print_error(f'{out}: the whole result there stays; what is mapped is in {folder.path}')
+    if status or problems:
+        raise typer.Exit(status or 1)

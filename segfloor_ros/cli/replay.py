@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
 from functools import partial
 from typing import Annotated
 
@@ -11,7 +10,8 @@ import typer
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options, output
-from segfloor_ros.errors import SettingsError
+from segfloor_ros.errors import MapError, SettingsError
+from segfloor_ros.interrupts import first_interrupt_noted
 from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.results_folder import OutputFolder
@@ -61,20 +61,25 @@ def replay(
         configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
     output.print_sensors(source.sensors)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with OutputFolder(out) as folder:
+    inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
+    with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
         keep = partial(folder.add_picture, 'floor_masks')
         on_mask = keep if save_masks is SaveMasks.keyframes else None
         with output.progress_bar('replaying', source.frame_count) as progress:
-            session = ReplaySession(configuration, params, rate, on_mask, progress, maps, loaded)
-            result, found = session.execute()
+            session = ReplaySession(
+                configuration, params, rate, on_mask, progress, interrupt, maps, loaded
+            )
+            try:
+                result, found = session.execute()
+            except MapError:
+                output.end_if_interrupted(interrupt)
+                raise
         folder.write(result)
-    for notice in found.notices:
-        output.print_error(notice)
     output.print_summary(input, result.summary)
     output.console.print(
         f'nodes connected in {found.discovery_s:.1f} s, stopped in {found.shutdown_s:.1f} s; '
         f'keyframes that failed: {found.failed_keyframes}',
         highlight=False,
     )
-    output.finish_run(input, out, report)
+    status = interrupt.status or found.status
+    output.finish_run(input, out, folder, report, found.notices, status)

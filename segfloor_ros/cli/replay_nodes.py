@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.errors import SegfloorError
+from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS
 
@@ -140,8 +141,7 @@ def running_nodes(
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        with tempfile.TemporaryDirectory(prefix='segfloor-nodes-') as name:
-            folder = Path(name)
+        with scratch_folder(Path(tempfile.gettempdir()), 'segfloor-nodes-') as folder:
             resolved = folder / 'parameters.yaml'
             resolved.write_text(yaml.safe_dump(make_parameters(folder)))
             files = [str(file) for file in (params_file, resolved) if file is not None]
@@ -163,7 +163,7 @@ class NodeGraph(Generic[Recorder]):
         self._executor = SingleThreadedExecutor(context=recorder.context)
         self._executor.add_node(recorder)
 
-    def connect(self, is_paced: bool = True) -> float:
+    def connect(self, is_paced: bool = True, interrupted: threading.Event | None = None) -> float:
         """Wait until every topic has its subscribers; returns the seconds it took."""
         start_s, recorder = time.monotonic(), self.recorder
         while missing := unconnected(recorder.connections, recorder.recorded, is_paced):
@@ -172,17 +172,25 @@ class NodeGraph(Generic[Recorder]):
                     f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '
                     'the loopback interface up, and does a firewall block UDP?'
                 )
+            if interrupted is not None and interrupted.is_set():
+                raise ReplayError('interrupted')
             self.spin()
         return time.monotonic() - start_s
 
     def wait_for_map(self) -> None:
         """Wait until there is a map: one that is loaded takes its time."""
         deadline_s = time.monotonic() + DRAIN_S
-        while not self.recorder.has_map and time.monotonic() < deadline_s:
+        while self.recorder.grid is None and time.monotonic() < deadline_s:
             self.spin()
 
     def call(self, kind: Any, name: str, request: Any, patience_s: float = SERVICE_S) -> None:
         """Call a service. Raises ReplayError with its answer when it fails."""
+        response = self.ask(kind, name, request, patience_s)
+        if not response.success:
+            raise ReplayError(f'{name}: {response.message}')
+
+    def ask(self, kind: Any, name: str, request: Any, patience_s: float = SERVICE_S) -> Any:
+        """Return the answer of a service. Raises ReplayError where there is none."""
         client = self.recorder.create_client(kind, name)
         deadline_s = time.monotonic() + patience_s
         while not client.service_is_ready() and time.monotonic() < deadline_s:
@@ -192,9 +200,7 @@ class NodeGraph(Generic[Recorder]):
             self.spin()
         if not future.done():
             raise ReplayError(f'the service {name} does not answer')
-        response = future.result()
-        if not response.success:
-            raise ReplayError(f'{name}: {response.message}')
+        return future.result()
 
     def play(self, on_progress: ProgressListener, interrupted: threading.Event) -> bool:
         """Follow the nodes until the recording has ended and everything sent has arrived; False

@@ -3,67 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from types import FrameType
 
 from segfloor_ros.errors import MapError
+from segfloor_ros.interrupts import interrupts_deferred
+from segfloor_ros.processes import end_with_parent
 from segfloor_ros.timing import rss_mb
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 INTERRUPT_S = 1.2
 
 TERMINATE_S = 0.5
 
 NOTICES = ('[WARN]', '[ERROR]', '[FATAL]', 'segfloor: ')
-
-
-@contextlib.contextmanager
-def interrupts_deferred() -> Iterator[None]:
-    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
-    process and the note that it runs. A started program gets the default handlers again.
-    """
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    handlers = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
-        yield
-    finally:
-        _restore(handlers)
-    if received:
-        signal.raise_signal(received[0])
-
-
-@contextlib.contextmanager
-def first_interrupt_noted() -> Iterator[threading.Event]:
-    """Set an event at the first SIGINT or SIGTERM within the block, so that the work can come to an
-    orderly end; the next one takes its usual course.
-    """
-    event = threading.Event()
-
-    def note(number: int, frame: FrameType | None) -> None:
-        event.set()
-        _restore(handlers)
-
-    handlers = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
-        yield event
-    finally:
-        _restore(handlers)
-
-
-def _restore(handlers: dict[signal.Signals, signal._HANDLER]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 class ReplayError(MapError):
@@ -107,6 +65,7 @@ class NodeProcesses:
                     stderr=output,
                     # An interrupt from the terminal ends the replay, which then stops its nodes.
                     start_new_session=True,
+                    preexec_fn=partial(end_with_parent, os.getpid()),
                 )
 
     def __exit__(self, *error: object) -> None:

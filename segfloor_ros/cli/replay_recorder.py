@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
+from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
@@ -51,7 +52,7 @@ class ReplayRecorder(Node):
         self.labelled: LabelledPoints | None = None
         self.mount: Mount | None = None
         self.last_sign_s = time.monotonic()
-        self.has_map = False
+        self.grid: OccupancyGridMessage | None = None
         self._T_odom_base: dict[int, Array] = {}
         self._T_map_base: dict[int, Array] = {}
         self._on_mask = on_mask
@@ -141,8 +142,8 @@ class ReplayRecorder(Node):
     def _take_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._T_map_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
 
-    def _take_map(self, message: OccupancyGrid) -> None:
-        self.has_map = True
+    def _take_map(self, message: OccupancyGridMessage) -> None:
+        self.grid = message
 
     def _take_mount(self, message: TransformStamped) -> None:
         self.mount = Mount.from_transform(transform_array(message))

@@ -8,22 +8,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.camera.settings import SENSORS
 from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli.replay_nodes import NodeGraph, running_nodes
-from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError, first_interrupt_noted
+from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.errors import InputError, MapError, SegfloorError
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.interrupts import Interrupt
 from segfloor_ros.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import Level, Status
+from segfloor_ros.messages.map_files import grid_of
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.results_folder import (
     RunResult,
@@ -45,19 +49,22 @@ ReplayGraph = NodeGraph[ReplayRecorder]
 @dataclass(frozen=True)
 class ReplayReport:
     """What there is to say beside the results. failed_keyframes: how many did not reach the map
-    because a node failed on them. notices: warnings of the nodes.
+    because a node failed on them. notices: warnings of the nodes, and what could not be done.
+    status: to end with where it broke off, else 0.
     """
 
     discovery_s: float
     shutdown_s: float
     failed_keyframes: int
     notices: list[str]
+    status: int
 
 
 @dataclass(frozen=True)
 class ReplaySession:
-    """One replay: starts the nodes in a graph of their own, follows them, and stops them. loaded:
-    the map that `maps` names to go on with.
+    """One replay: starts the nodes in a graph of their own, follows them, and stops them.
+
+    interrupt: ends it early. loaded: the map that `maps` names to go on with.
     """
 
     configuration: Configuration
@@ -65,14 +72,16 @@ class ReplaySession:
     rate: float
     on_mask: MaskListener | None
     on_progress: ProgressListener
+    interrupt: Interrupt
     maps: MapOptions = NO_MAPS
     loaded: MapFile | None = None
 
     def execute(self) -> tuple[RunResult, ReplayReport]:
-        """Run the replay; an interrupt (Ctrl-C) ends it early and keeps the map.
+        """Run the replay. An interrupt, a node that dies or a recording that breaks off ends it
+        early and keeps the map.
 
-        Raises ReplayError naming the node that died or what is stuck, MapError when no map came of
-        it, InputError when the recording breaks off.
+        Where no map came of it raises ReplayError naming the node that died or what is stuck,
+        InputError when the recording broke off, else MapError.
         """
 
         def listen(context: Context, processes: NodeProcesses) -> ReplayRecorder:
@@ -102,75 +111,106 @@ class ReplaySession:
             localize=self.maps.localize,
             use_depth=self.configuration.stereo_camera.depth,
         )
-        for name, file in (('load_map', self.maps.load), ('save_map', self.maps.save)):
-            if file is not None:
-                parameters[SLAM]['ros__parameters'][name] = str(file.absolute())
+        if self.maps.load is not None:
+            parameters[SLAM]['ros__parameters']['load_map'] = str(self.maps.load.absolute())
         parameters[GRID]['ros__parameters'].update(map_file=str(folder / MAP_FILE))
         return parameters
 
     def _follow(self, graph: ReplayGraph) -> tuple[RunResult, ReplayReport]:
-        discovery_s = graph.connect()
-        start_s = time.perf_counter()
-        graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
-        with first_interrupt_noted() as interrupted:
-            if not graph.play(self.on_progress, interrupted):
-                graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=True))
-                graph.catch_up()
+        discovery_s = graph.connect(interrupted=self.interrupt)
+        start_s, recorder = time.perf_counter(), graph.recorder
+        broken, is_whole = self._play(graph)
         wall_s = time.perf_counter() - start_s
-        self._check_result(graph.recorder)
-        graph.wait_for_map()
-        graph.call(Trigger, 'save_map', Trigger.Request())
-        kept_map = self._save_map(graph)
-        result = self._result(graph.recorder, graph.folder / MAP_FILE, wall_s)
+        self._check_result(recorder, broken)
+        notices = []
+        try:
+            graph.wait_for_map()
+            graph.call(Trigger, 'save_map', Trigger.Request())
+            grid = load_map(graph.folder / MAP_FILE)
+            notices += self._save_map(graph, is_whole)
+        except (ReplayError, InputError) as error:
+            broken = broken or error
+            if recorder.grid is None:
+                raise broken from None
+            grid = grid_of(recorder.grid)
+        result = self._result(recorder, grid, wall_s, is_whole and broken is None)
         stop_s = time.perf_counter()
         graph.processes.stop()
+        shutdown_s = time.perf_counter() - stop_s
+        if broken is not None:
+            notices.append(f'{broken}; the map is of what came before')
         report = ReplayReport(
             discovery_s,
-            time.perf_counter() - stop_s,
-            len(graph.recorder.failed),
-            [*graph.processes.notices(), *kept_map],
+            shutdown_s,
+            len(recorder.failed),
+            [*graph.processes.notices(), *notices],
+            0 if broken is None else 1 if isinstance(broken, MapError) else 2,
         )
         return result, report
 
-    def _save_map(self, graph: ReplayGraph) -> list[str]:
-        """Save the map; returns why it was not, where the one that was loaded stays as it is."""
+    def _play(self, graph: ReplayGraph) -> tuple[SegfloorError | None, bool]:
+        """Play the recording; returns what it broke off with, and whether it came to its end."""
+        try:
+            graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=False))
+            if not graph.play(self.on_progress, self.interrupt):
+                graph.call(SetBool, f'{CAMERA}/pause', SetBool.Request(data=True))
+                graph.catch_up()
+                return None, False
+        except ReplayError as error:
+            return error, False
+        finished = graph.recorder.finished
+        if finished is not None and finished.level is Level.ERROR:
+            return InputError(finished.message), False
+        return None, True
+
+    def _save_map(self, graph: ReplayGraph, is_whole: bool) -> list[str]:
+        """Save the map; returns where it is where that is elsewhere, or why it is not saved where
+        the one that was loaded stays as it is.
+        """
         if self.maps.save is None:
             return []
-        try:
-            graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), SAVE_S)
-        except ReplayError as error:
-            if self.maps.load is None or self.maps.save.resolve() != self.maps.load.resolve():
-                raise
-            return [str(error)]
-        return []
 
-    def _check_result(self, recorder: ReplayRecorder) -> None:
+        def write(path: Path) -> None:
+            name = Parameter('save_map', value=str(path.absolute())).to_parameter_msg()
+            request = SetParameters.Request(parameters=[name])
+            graph.ask(SetParameters, f'{SLAM}/set_parameters', request)
+            graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), SAVE_S)
+
+        if self.maps.load is not None and self.maps.save.resolve() == self.maps.load.resolve():
+            try:
+                write(self.maps.save)
+            except ReplayError as error:
+                return [str(error)]
+            return []
+        note = self.maps.write(write, not is_whole)
+        return [note] if note else []
+
+    def _check_result(self, recorder: ReplayRecorder, broken: SegfloorError | None) -> None:
         name, sent = self.configuration.stereo_camera.input, len(recorder.frame_index)
-        finished = recorder.finished
-        if finished is not None and finished.level is Level.ERROR:
-            raise InputError(finished.message)
         if self.loaded is not None:
             if not recorder.tracked:
-                raise MapError(self.maps.why_not_found(name, sent))
+                raise broken or MapError(self.maps.why_not_found(name, sent))
             return
         if recorder.mount is None:
-            raise MapError(no_floor(name, sent))
+            raise broken or MapError(no_floor(name, sent))
         if not recorder.updated:
             words = next((s.message for s in recorder.failed.values()), 'none could be tracked')
-            raise MapError(f'{name}: no map came of {sent} frames: {words}')
+            raise broken or MapError(f'{name}: no map came of {sent} frames: {words}')
 
-    def _result(self, recorder: ReplayRecorder, map_file: Path, wall_s: float) -> RunResult:
+    def _result(
+        self, recorder: ReplayRecorder, grid: OccupancyGrid, wall_s: float, is_whole: bool
+    ) -> RunResult:
         mount, labelled = recorder.mount, recorder.labelled or self._loaded_cloud()
         assert mount is not None and labelled is not None
         path = recorder.path or KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
         path = new_keyframes(path)
         return RunResult(
-            load_map(map_file),
+            grid,
             corrected_trajectory(recorder.tracked, path),
             Trajectory(path.stamp_ns, path.T_map_base),
             labelled,
             mount,
-            self._summary(recorder, wall_s),
+            self._summary(recorder, wall_s, is_whole),
             self.configuration,
         )
 
@@ -187,7 +227,7 @@ class ReplaySession:
             return len(recorder.path.stamp_ns)
         return 0 if self.loaded is None else len(loaded_map(self.loaded, 0).path.stamp_ns)
 
-    def _summary(self, recorder: ReplayRecorder, wall_s: float) -> RunSummary:
+    def _summary(self, recorder: ReplayRecorder, wall_s: float, is_whole: bool) -> RunSummary:
         stamps = sorted(recorder.frame_index)
         answers = [recorder.answers.get(stamp) for stamp in stamps]
         tracked = np.array([bool(s and s.values.get('tracked') == '1') for s in answers], bool)
@@ -216,9 +256,17 @@ class ReplaySession:
             blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
             moving_frames=sum(bool(s and int(s.values.get('moving', 0))) for s in answers),
             sensor_remarks=recorder.remarks,
+            failed_frames=sum(_failed(status) for status in answers),
+            failed_keyframes=len(recorder.failed),
+            interrupted=not is_whole,
             stages=recorder.times.summary(),
             rss_mb=recorder.memory.summary(),
         )
+
+
+def _failed(status: Status | None) -> bool:
+    """Whether SLAM failed at a frame, which is more than not to track it."""
+    return status is not None and status.level is Level.ERROR and 'tracked' not in status.values
 
 
 def _sensors_sent(finished: Status | None) -> dict[str, int]:

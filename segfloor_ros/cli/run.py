@@ -8,6 +8,8 @@ import typer
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options, output
+from segfloor_ros.errors import MapError
+from segfloor_ros.interrupts import first_interrupt_noted
 from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
 from segfloor_ros.results_folder import OutputFolder
 
@@ -40,12 +42,22 @@ def run(
     configuration = options.configuration(params, assignments, input, masks, ignore, depth)
     source = open_source(configuration.stereo_camera)
     output.print_sensors(source.sensors)
-    with OutputFolder(out) as folder:
+    inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
+    with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
         with output.progress_bar('mapping', source.frame_count) as progress:
-            drive = LockstepRun(source, configuration, folder, save_masks, save_debug, maps)
-            result = drive.execute(progress)
+            drive = LockstepRun(
+                source, configuration, folder, save_masks, save_debug, maps, interrupt
+            )
+            try:
+                result = drive.execute(progress)
+            except MapError:
+                output.end_if_interrupted(interrupt)
+                raise
         folder.write(result)
+        drive.save_map()
     output.print_summary(input, result.summary)
-    output.finish_run(input, out, report)
-    if drive.note:
-        output.print_error(drive.note)
+    remarks, status = [drive.note] if drive.note else [], interrupt.status
+    if drive.broken_off is not None:
+        remarks.append(f'{drive.broken_off}; the map is of what came before')
+        status = status or 2
+    output.finish_run(input, out, folder, report, remarks, status)

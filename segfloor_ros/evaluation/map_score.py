@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import os_errors
 from segfloor_ros.evaluation.raster import (
     FREE,
     OCCUPIED,
@@ -22,6 +21,7 @@ from segfloor_ros.evaluation.raster import (
     states,
 )
 from segfloor_ros.evaluation.truth import MapTruth, Pose2d
+from segfloor_ros.files.results import write_file
 from segfloor_ros.grid.map_file import OccupancyGrid
 
 DEFAULT_RANGE_M = 5.0
@@ -186,12 +186,14 @@ def draw_overlay(maps: Comparison) -> NDArray[np.uint8]:
     return np.vstack([picture, _legend(picture.shape[1])])
 
 
+def overlay_png(maps: Comparison) -> bytes:
+    """Return the picture as a PNG file."""
+    return cv2.imencode('.png', draw_overlay(maps))[1].tobytes()
+
+
 def save_overlay(maps: Comparison, path: Path) -> None:
     """Write the picture as PNG. Raises InputError where it cannot be written."""
-    written, data = cv2.imencode('.png', draw_overlay(maps))
-    with os_errors(f'{path}: cannot write the overlay'):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data.tobytes() if written else b'')
+    write_file(path, overlay_png(maps))
 
 
 def _coloured(maps: Comparison) -> NDArray[np.uint8]:

@@ -22,6 +22,7 @@ from segfloor_ros.evaluation.report_pictures import (
     v_disparity_picture,
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.files.results import add_files
 
 REPORT_NAME = 'report.html'
 
@@ -38,7 +39,7 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     page = _page(data)
     path = run / REPORT_NAME
     with os_errors(f'{path}: cannot be written'):
-        path.write_text(page, encoding='utf-8')
+        add_files(run, {REPORT_NAME: page.encode()})
     return path
 
 

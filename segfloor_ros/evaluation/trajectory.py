@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.trajectory import read_trajectory
@@ -231,8 +233,9 @@ def save_trajectory_plot(matched: MatchedTrajectories, path: Path) -> None:
     error.plot(matched.times_s - matched.times_s[0], distances_cm, color='tab:red')
     error.set(xlabel='time [s]', ylabel='position error [cm]', ylim=(0, None))
     error.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=110, format=path.suffix.lstrip('.') or 'png')
+    write_file(path, picture.getvalue())
 
 
 def plane_axes(path: Array) -> Array:

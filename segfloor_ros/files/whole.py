@@ -1,33 +1,16 @@
-"""Files as bytes, text and JSON, and files that are written whole in place of an older one."""
+"""Files as bytes, text and JSON."""
 
 from __future__ import annotations
 
 import json
-import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from segfloor_ros.errors import InputError, SegfloorError
 
 MAX_BYTES = 1 << 28
 """Of a file that is read whole: an hour of an IMU at 1 kHz has about as many."""
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Write a file beside its target and move it into place at the end of the block; after an error
-    nothing is left of it. Raises OSError.
-    """
-    written = path.with_name(f'.{path.name}.{os.getpid()}.part')
-    try:
-        with written.open('wb') as file:
-            yield file
-        written.replace(path)
-    finally:
-        written.unlink(missing_ok=True)
 
 
 def check_file(path: Path, error_type: type[SegfloorError] = InputError) -> int:

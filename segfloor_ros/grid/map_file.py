@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.files.images import read_picture
-from segfloor_ros.files.whole import replacing
+from segfloor_ros.files.results import replacing
 from segfloor_ros.files.yaml_files import read_yaml
 
 OCCUPIED_THRESH = 0.65

@@ -31,6 +31,14 @@ def grid_message(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> Occupancy
     return message
 
 
+def grid_of(message: OccupancyGridMessage) -> OccupancyGrid:
+    """Return the map of a message."""
+    info = message.info
+    cells = np.array(message.data, np.int8).reshape(info.height, info.width)
+    origin = info.origin.position
+    return OccupancyGrid(cells, float(info.resolution), (origin.x, origin.y))
+
+
 def map_file_message(saved: MapFile) -> UInt8MultiArray:
     """Return a map, or a part of one, as the bytes of its file, not compressed."""
     data = array.array('B', to_bytes(saved, compress=False))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,8 @@ import yaml
 
 from segfloor_ros import __version__
 from segfloor_ros.camera.calibration.files import write_ros_calibration
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.files.results import RENDERED, folder_in_the_making, move_into_place
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.simulation.scene import Scene
@@ -32,8 +31,6 @@ IMU_COLUMNS = (
 PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
 
 Progress = Callable[[int], None]
-
-STAMP = 'rendered_from.txt'
 
 
 @dataclass(frozen=True)
@@ -58,18 +55,11 @@ def record(
     left/ and right/ with ROS calibrations left.yaml and right.yaml; what wheels, IMU and depth
     camera tell goes beside them. Raises InputError when `out` holds something already.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
         raise InputError(f'{out}: exists already; choose another --out or remove it')
-    out.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
-    try:
-        _record_into(staging, simulation, options, on_frame)
-        staging.chmod(0o755)
-        if out.exists():
-            out.rmdir()
-        staging.rename(out)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+    with folder_in_the_making(out) as made, os_errors(f'{out}: cannot be written'):
+        _record_into(made, simulation, options, on_frame)
+        move_into_place(made, out)
 
 
 def _record_into(
@@ -192,12 +182,11 @@ def render_once(
     on_start: told the number of frames; returns whom to tell how many are done. Raises
     RenderingError where nothing can be rendered.
     """
-    stamp = recording / STAMP
+    stamp = recording / RENDERED
     wanted = hashlib.sha256(repr((__version__, scene, options)).encode()).hexdigest() + '\n'
     if stamp.is_file() and stamp.read_text() == wanted:
         return
-    with Simulation(scene) as simulation:
-        if recording.is_dir():
-            shutil.rmtree(recording)
-        record(simulation, recording, options, on_start(simulation.frame_count))
-    stamp.write_text(wanted)
+    with Simulation(scene) as simulation, folder_in_the_making(recording) as made:
+        _record_into(made, simulation, options, on_start(simulation.frame_count))
+        (made / RENDERED).write_text(wanted)
+        move_into_place(made, recording)

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 
+UNKNOWN_COVARIANCE = 1e6
 NO_POINT = -1
 """Id of a feature that has no map point."""
 
@@ -157,3 +159,12 @@ class Track:
     def covariance(self) -> Array:
         """The covariance (6, 6) of the pose's twist."""
         return self.estimate.covariance
+
+
+def lost_frame(frame: StereoFrame) -> FrameResult:
+    """Return the outcome of a frame that nothing came of."""
+    nowhere = np.eye(4)
+    unknown = np.eye(6) * UNKNOWN_COVARIANCE
+    return FrameResult(
+        frame.index, frame.stamp_ns, False, nowhere, nowhere, unknown, 0, 'lost: failed', 0
+    )

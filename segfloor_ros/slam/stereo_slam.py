@@ -23,7 +23,7 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd
 from segfloor_ros.slam.moving.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.places.loops import Candidate
-from segfloor_ros.slam.results import FrameResult, Keyframe, Track
+from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, FrameResult, Keyframe, Track
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.front_end import FrontEnd
@@ -40,7 +40,6 @@ HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
 ORB-SLAM2, 2017, does the same)."""
 
-UNKNOWN_COVARIANCE = 1e6
 NOTHING_SEEN = 'too few known points in view'
 MAPPED_APART = ', mapped before the map was recognised'
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'

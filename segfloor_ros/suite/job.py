@@ -22,6 +22,7 @@ from typing import Any
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError, without_credentials
 from segfloor_ros.evaluation.truth import Pose2d
+from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.processes import end_with_parent
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import measure_run, start_pose_of
@@ -166,8 +167,8 @@ def _map_and_measure(job: Job, origin: Outcome | None) -> Outcome:
     if entry.source == RESULTS:
         measured = measure_run(recording, truth, reference_map, start_pose)
         return Outcome(entry.name, measured, archive=pack(recording))
-    with tempfile.TemporaryDirectory(prefix='segfloor-check-') as temporary:
-        loaded = _map_to_load(origin, Path(temporary))
+    with scratch_folder(Path(tempfile.gettempdir()), 'segfloor-check-') as temporary:
+        loaded = _map_to_load(origin, temporary)
         named = [recording, truth, reference_map, loaded, *_files_of(entry.assignments)]
         files = dict.fromkeys(path for path in named if path is not None)
         cache, key = Cache(folder / 'results'), job.content_digest(files) if job.reuse else ''
@@ -175,7 +176,7 @@ def _map_and_measure(job: Job, origin: Outcome | None) -> Outcome:
             return Outcome(entry.name, kept[0], '', kept[1], start_pose, reused=True)
         reference = ReferenceWorkload()
         reference.time()
-        out = _run(job, recording, loaded, Path(temporary))
+        out = _run(job, recording, loaded, temporary)
         reference.time()
         measured = measure_run(out, truth, reference_map, start_pose, reference.median_ms)
         archive = pack(out)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import datetime
 import html
+import io
 import socket
 from pathlib import Path
 
@@ -25,7 +26,6 @@ from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
 from segfloor_ros.suite.measures import MEASURES, Bound, number
 from segfloor_ros.suite.verdicts import Checked, SuiteResult
 
-PAGE = 'suite.html'
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent',
            'known_area_m2', 'time_ratio', 'memory_peak_mb')  # fmt: skip
 THUMBNAIL_PX = 110
@@ -36,8 +36,8 @@ img { image-rendering: pixelated; border: 1px solid #e1e6ec; }
 """
 
 
-def write_page(result: SuiteResult, folder: Path) -> Path:
-    """Write suite.html into the suite's folder, which holds a folder for each recording."""
+def page(result: SuiteResult, folder: Path) -> bytes:
+    """Return the page of a suite's folder, which holds a folder for each recording."""
     kept = sum(checked.holds for checked in result.recordings)
     names = ('recording', 'map', '', *COLUMNS)
     head = ''.join(f'<th>{_heading(name)}</th>' for name in names)
@@ -48,23 +48,21 @@ def write_page(result: SuiteResult, folder: Path) -> Path:
         for complaint in checked.complaints
     )
     complaints = f'<h2>What fails</h2><ul>{failed}</ul>' if failed else ''
-    path = folder / PAGE
     about = f'{kept} of {len(result.recordings)} recordings are as they should be'
     table = f'<h2>Recordings</h2><table><tr>{head}</tr>{rows}</table>'
-    path.write_text(
-        html_page(printable(result.name), about, complaints + table, MARKS), encoding='utf-8'
-    )
-    return path
+    return html_page(printable(result.name), about, complaints + table, MARKS).encode()
 
 
 def _row(checked: Checked, folder: Path) -> str:
     name = html.escape(checked.name)
     link = f'{checked.name}/{REPORT_NAME}'
-    if (folder / link).is_file():
+    has_map = not checked.problem  # what is there of an earlier check is not of this one
+    if has_map and (folder / link).is_file():
         name = f'<a href="{html.escape(link)}">{name}</a>'
     failing = {v.bound.measure for v in checked.verdicts if not v.holds}
     state = f'<span class="{"ok" if checked.holds else "bad"}">{checked.state}</span>'
-    cells = [name, _thumbnail(folder / checked.name / 'map.pgm'), state]
+    picture = _thumbnail(folder / checked.name / 'map.pgm') if has_map else ''
+    cells = [name, picture, state]
     for measure in COLUMNS:
         value = checked.measured.get(measure)
         text = '' if value is None else number(value)
@@ -102,8 +100,8 @@ class _Suite(TestSuite):
     package = Attr()
 
 
-def write_junit(result: SuiteResult, path: Path) -> None:
-    """Write a test case for each recording's map and for each of its bounds."""
+def junit(result: SuiteResult) -> bytes:
+    """Return a test case for each recording's map and for each of its bounds, as XML."""
     suite = _Suite(printable(result.name))
     suite.id, suite.package = 0, 'segfloor'
     suite.hostname = socket.gethostname()
@@ -119,7 +117,9 @@ def write_junit(result: SuiteResult, path: Path) -> None:
         suite.append(element)
     document = JUnitXml()
     document.append(suite)
-    document.write(str(path), pretty=True)
+    written = io.BytesIO()
+    document.write(written, pretty=True)
+    return written.getvalue()
 
 
 def _cases(suite: str, checked: Checked) -> list[TestCase]:

@@ -4,18 +4,18 @@ pattern or URL: found, copied to this machine, and told apart by content.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import hashlib
 import io
 import json
-import os
-import shutil
 import tarfile
-import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from segfloor_ros.errors import InputError, without_credentials
+from segfloor_ros.files.results import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.files.whole import read_bytes, read_json
 from segfloor_ros.suite.measures import known_measures
 
@@ -32,25 +32,25 @@ def pack(folder: Path) -> bytes:
     """Return the files of a folder as an archive."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode='w:gz', compresslevel=1) as archive:
-        for file in sorted(folder.rglob('*')):
+        for file in sorted(f for f in folder.rglob('*') if not f.is_symlink()):
             archive.add(file, str(file.relative_to(folder)), recursive=False)
     return buffer.getvalue()
 
 
-def unpack(archive: bytes, folder: Path) -> None:
-    """Put the files of an archive into a new folder, in place of an old one."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f'.{folder.name}-'))
-    staging.chmod(0o755)
-    if archive:
+def unpack(archive: bytes, folder: Path, more: Mapping[str, bytes] | None = None) -> None:
+    """Put the files of an archive, and more, in place of the results in a folder. Raises OSError,
+    or InputError where files of others are in the way.
+    """
+    with folder_in_the_making(folder) as made:
         with tarfile.open(fileobj=io.BytesIO(archive)) as opened:
             for member in opened.getmembers():
-                if member.name.startswith('/') or '..' in Path(member.name).parts:
+                beyond = member.name.startswith('/') or '..' in Path(member.name).parts
+                if beyond or not (member.isfile() or member.isdir()):
                     raise ValueError(f'{member.name}: not a file of the results folder')
-                opened.extract(member, staging)
-    if folder.exists():
-        shutil.rmtree(folder)
-    staging.rename(folder)
+                opened.extract(member, made)
+        for name, content in (more or {}).items():
+            (made / name).write_bytes(content)
+        move_into_place(made, folder)
 
 
 class Cache:
@@ -71,13 +71,13 @@ class Cache:
     def put(self, key: str, measured: dict[str, float], archive: bytes) -> None:
         """Keep a result; one that is there already stays."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(dir=self._folder, prefix='.new-'))
-        (staging / ARCHIVE).write_bytes(archive)
-        (staging / MEASURED).write_text(json.dumps(measured))
-        try:
-            os.rename(staging, self._folder / key)
-        except OSError:
-            shutil.rmtree(staging, ignore_errors=True)
+        with scratch_folder(self._folder) as scratch:
+            entry = scratch / key
+            entry.mkdir()
+            (entry / ARCHIVE).write_bytes(archive)
+            (entry / MEASURED).write_text(json.dumps(measured))
+            with contextlib.suppress(OSError):  # another process has been faster
+                entry.rename(self._folder / key)
 
 
 def is_url(text: str) -> bool:
@@ -117,9 +117,10 @@ def local_copy(path_or_url: str, folder: Path) -> Path:
         copy = target / _name(path)
         if not target.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
-            staging = Path(tempfile.mkdtemp(dir=folder, prefix='.copy-'))
-            system.get(path.rstrip('/'), str(staging / copy.name), recursive=True)
-            _move(staging, target)
+            with scratch_folder(folder) as scratch:
+                (made := scratch / target.name).mkdir()
+                system.get(path.rstrip('/'), str(made / copy.name), recursive=True)
+                _move(made, target)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f'{path_or_url}: cannot be read ({error})') from None
     return copy
@@ -159,7 +160,6 @@ def _move(staging: Path, target: Path) -> None:
     try:
         staging.rename(target)
     except OSError:
-        shutil.rmtree(staging, ignore_errors=True)
         if not target.is_dir():
             raise
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.errors import InputError
+from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
@@ -70,9 +71,16 @@ def write_baseline(result: SuiteResult, path: Path) -> None:
     """Write the measures of all recordings that have a map."""
     measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
     document = {'version': FORMAT, 'recordings': measures}
-    with os_errors(f'{path}: cannot be written'):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(document, indent=2) + '\n')
+    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
+
+
+def is_baseline(path: Path) -> bool:
+    """Whether a file is one of `write_baseline`."""
+    try:
+        read_baseline(path)
+    except InputError:
+        return False
+    return True
 
 
 def read_baseline(path: Path) -> Baseline:

@@ -41,7 +41,11 @@ def test_pairs_without_the_whole_board_are_left_out(
         result = calibrate_folder(folder, SQUARE_M, BOARD, out=tmp_path / 'out')
     assert (result.pairs_used, result.pairs_total) == (5, 6)
     assert 'left02.png, right02.png: the board is not seen whole' in caplog.text
-    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['left.yaml', 'right.yaml']
+    assert sorted(p.name for p in (tmp_path / 'out').glob('*')) == [
+        '.segfloor_result',
+        'left.yaml',
+        'right.yaml',
+    ]
 
 
 def test_faults_are_named(tmp_path: Path) -> None:

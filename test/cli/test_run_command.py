@@ -45,6 +45,7 @@ def result(recording, tmp_path_factory):
 def test_every_promised_file_is_there(result):
     out, done = result
     assert {path.name for path in out.iterdir()} == {
+        '.segfloor_result',
         'map.pgm',
         'map.yaml',
         'trajectory.txt',

@@ -90,9 +90,14 @@ def test_results_survive_packing_and_the_cache(tmp_path):
     cache.put('key', {'recall_percent': 1.0}, b'')  # who comes second finds it there
     measured, archive = cache.get('key')
     assert measured == {'recall_percent': 93.5}
-    (tmp_path / 'new').mkdir()
-    (tmp_path / 'new' / 'old').write_text('of an earlier run')
+    earlier = out / 'earlier.txt'
+    earlier.write_text('of an earlier run')
+    unpack(pack(out), tmp_path / 'new', {'more.txt': b'more'})
+    assert (tmp_path / 'new' / 'more.txt').read_bytes() == b'more'
+    earlier.unlink()
     unpack(archive, tmp_path / 'new')
+    assert sorted(tmp_path.iterdir()) == [tmp_path / name for name in ('cache', 'new', 'out')]
+    (tmp_path / 'new' / '.segfloor_result').unlink()
     assert digest_of(tmp_path / 'new') == digest_of(out)
 
 

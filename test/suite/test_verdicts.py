@@ -18,7 +18,7 @@ from segfloor_ros.suite.measures import (
     bounds_of_baseline,
     measure_run,
 )
-from segfloor_ros.suite.page import write_junit, write_page
+from segfloor_ros.suite.page import junit, page
 from segfloor_ros.suite.verdicts import SuiteResult, check, read_baseline, write_baseline
 
 GOOD = {'tracked_percent': 100.0, 'path_error_m': 0.012, 'recall_percent': 93.0}
@@ -61,7 +61,7 @@ def result() -> SuiteResult:
 
 
 def test_junit_has_a_case_for_each_map_and_each_bound(tmp_path):
-    write_junit(result(), tmp_path / 'junit.xml')
+    (tmp_path / 'junit.xml').write_bytes(junit(result()))
     document = JUnitXml.fromfile(str(tmp_path / 'junit.xml'))
     assert (document.tests, document.failures, document.errors, document.skipped) == (8, 1, 1, 2)
     (suite,) = document
@@ -78,12 +78,12 @@ def test_junit_has_a_case_for_each_map_and_each_bound(tmp_path):
 def test_the_page_says_what_fails_and_links_the_reports(tmp_path):
     (tmp_path / 'good').mkdir()
     (tmp_path / 'good' / 'report.html').write_text('x')
-    page = write_page(result(), tmp_path).read_text()
-    assert '1 of 3 recordings' in page
-    assert '<a href="good/report.html">good</a>' in page
-    assert 'bad/report.html' not in page
-    assert 'no map &lt;came&gt;' in page
-    assert '<span class="bad">0.012</span>' in page
+    text = page(result(), tmp_path).decode()
+    assert '1 of 3 recordings' in text
+    assert '<a href="good/report.html">good</a>' in text
+    assert 'bad/report.html' not in text
+    assert 'no map &lt;came&gt;' in text
+    assert '<span class="bad">0.012</span>' in text
 
 
 def test_a_baseline_survives_the_round_trip(tmp_path):

@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration.files import write_ros_calibration
+from segfloor_ros.camera.calibration.files import ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.sources.image_folders import find_image_pairs
 from segfloor_ros.errors import CalibrationError, InputError, os_errors
 from segfloor_ros.files.images import CorruptImageError, read_grey
+from segfloor_ros.files.results import add_files, check_target
 from segfloor_ros.geometry import Array, make_transform
 
 MIN_PAIRS = 5
@@ -25,6 +26,8 @@ MIN_PAIRS = 5
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 
 SUBPIX_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+
+FILES = ('left.yaml', 'right.yaml')
 
 logger = logging.getLogger(__name__)
 
@@ -71,13 +74,13 @@ def calibrate_folder(
     if not 0 < square_m < 100 or min(board) < 3:
         raise InputError(f'a board of {board[0]}x{board[1]} corners and {square_m} m is impossible')
     left, right = find_image_pairs(folder)
+    target = folder if out is None else out
+    check_target(target, FILES)
     views = _find_boards(folder, left, right, board, on_progress)
     calibration, rms_px = _solve(views, board, square_m, str(folder))
-    target = folder if out is None else out
+    texts = ros_calibration(calibration.left, 'left'), ros_calibration(calibration.right, 'right')
     with os_errors(f'{target}: cannot be written', '; choose another --out'):
-        target.mkdir(parents=True, exist_ok=True)
-        write_ros_calibration(target / 'left.yaml', calibration.left, 'left')
-        write_ros_calibration(target / 'right.yaml', calibration.right, 'right')
+        add_files(target, {n: text.encode() for n, text in zip(FILES, texts, strict=True)})
     error_px = epipolar_rms_px(calibration, views.left, views.right)
     return CalibrationResult(calibration, rms_px, error_px, len(views.left), len(left))
 

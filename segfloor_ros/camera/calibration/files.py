@@ -84,8 +84,8 @@ def _body_pose(document: Mapping[str, Any], path: Path) -> Array:
     return _matrix(document['T_BS'], 16, f'{path}, T_BS').reshape(4, 4)
 
 
-def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:
-    """Write one eye as a ROS camera calibration file; numbers are exact."""
+def ros_calibration(eye: EyeCalibration, camera_name: str) -> str:
+    """Return one eye as the text of a ROS camera calibration file; numbers are exact."""
 
     def matrix(values: Array, rows: int) -> dict[str, Any]:
         return {'rows': rows, 'cols': values.size // rows, 'data': values.ravel().tolist()}
@@ -100,7 +100,12 @@ def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> 
         'rectification_matrix': matrix(eye.R, 3),
         'projection_matrix': matrix(eye.P, 3),
     }
-    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100))
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+
+
+def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:
+    """Write one eye as a ROS camera calibration file."""
+    path.write_text(ros_calibration(eye, camera_name))
 
 
 def _ros_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:

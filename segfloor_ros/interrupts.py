@@ -1,0 +1,80 @@
+"""SIGINT and SIGTERM: what is under way comes to an orderly end."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupt(threading.Event):
+    """Set when a signal has come."""
+
+    number = 0
+
+    @property
+    def status(self) -> int:
+        """The exit status that the signal stands for, 0 before one has come."""
+        return 128 + self.number if self.number else 0
+
+
+@contextlib.contextmanager
+def terminated_like_interrupted() -> Iterator[None]:
+    """Let SIGTERM within the block end what is under way with all its clean-ups, status 143."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
+    process and the note that it runs. A started program gets the default handlers again.
+    """
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    handlers = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        _restore(handlers)
+    if received:
+        signal.raise_signal(received[0])
+
+
+@contextlib.contextmanager
+def first_interrupt_noted() -> Iterator[Interrupt]:
+    """Set an event at the first SIGINT or SIGTERM within the block, so that the work can come to an
+    orderly end; the next one takes its usual course.
+    """
+    event = Interrupt()
+
+    def note(number: int, frame: FrameType | None) -> None:
+        event.number = number
+        event.set()
+        _restore(handlers)
+
+    handlers = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield event
+    finally:
+        _restore(handlers)
+
+
+def _restore(handlers: dict[signal.Signals, signal._HANDLER]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
