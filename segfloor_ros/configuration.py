@@ -67,12 +67,12 @@ def resolve(
     """
     values: dict[str, dict[str, Any]] = {name: {} for name in STAGE_SETTINGS}
     if params_file is not None:
-        _merge(values, _with_one_robot(read_params_file(params_file), str(params_file)))
+        _merge(values, _checked(read_params_file(params_file), str(params_file)))
     assigned: dict[str, dict[str, Any]] = {}
     for assignment in assignments:
         stage, name, value = _parse_assignment(assignment)
         assigned.setdefault(stage, {})[name] = value
-    _merge(values, _with_one_robot(assigned, '--set'))
+    _merge(values, _checked(assigned, '--set'))
     _merge(values, stage_changes)
     stages: dict[str, Any] = {
         name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()
@@ -131,7 +131,7 @@ def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
     key, separator, text = assignment.partition('=')
     stage, dot, name = key.strip().partition('.')
     if not separator or not (dot or stage in ROBOT_PARAMETERS):
-        raise SettingsError(f'--set {assignment}: expected stage.parameter=value')
+        raise SettingsError(f'--set {shortened(assignment)}: expected stage.parameter=value')
     try:
         value = yaml_value(text)
     except ValueError as error:
@@ -140,8 +140,22 @@ def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
     if not dot:
         return ROBOT_STAGES[0], stage, value
     if stage not in STAGE_SETTINGS:
-        raise SettingsError(f'unknown stage {stage}{suggestion(stage, list(STAGE_SETTINGS))}')
+        near = suggestion(stage, list(STAGE_SETTINGS))
+        raise SettingsError(f'--set: unknown stage {shortened(stage)}{near}')
     return stage, name, value
+
+
+def _checked(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:
+    """Return values by stage with those of the robot in all stages. Raises SettingsError saying
+    where a bad one is from.
+    """
+    result = _with_one_robot(values, where)
+    try:
+        for name, changes in result.items():
+            STAGE_SETTINGS[name].from_mapping(changes)
+    except SettingsError as error:
+        raise SettingsError(f'{where}: {error}') from None
+    return result
 
 
 def _with_one_robot(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:

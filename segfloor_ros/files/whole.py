@@ -32,15 +32,12 @@ def read_bytes(
     path: Path, error_type: type[SegfloorError] = InputError, at_most: int = MAX_BYTES
 ) -> bytes:
     """Return what a file holds. Raises an error of a type, also for more than `at_most` bytes."""
-    check_file(path, error_type)
+    if check_file(path, error_type) > at_most:
+        raise error_type(f'{path}: has more than {at_most / 1e6:.1f} MB; is it the right file?')
     try:
-        with path.open('rb') as file:
-            data = file.read(at_most + 1)
+        return path.read_bytes()
     except OSError as error:
         raise error_type(f'{path}: cannot be read ({error.strerror})') from None
-    if len(data) > at_most:
-        raise error_type(f'{path}: has more than {at_most / 1e6:.1f} MB; is it the right file?')
-    return data
 
 
 def read_text(

@@ -18,7 +18,7 @@ import yaml
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.files.whole import read_text
 
-MAX_BYTES = 1 << 19
+MAX_BYTES = 1 << 18
 MAX_VALUES = MAX_BYTES // 2
 """More values than a file of that size can name without aliases."""
 

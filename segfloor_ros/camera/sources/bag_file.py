@@ -134,6 +134,8 @@ def _read_errors(path: Path) -> Iterator[None]:
         yield
     except Exception as error:  # damaged bytes make the library fail in any way, anywhere
         reason = ' '.join(str(error).split()) or type(error).__name__
+        if isinstance(error, MemoryError):
+            reason = 'it asks for more memory than there is'
         repair = REPAIRS.get(path.suffix, 'ros2 bag reindex')
         raise InputError(
             f'{path}: cannot read the bag ({reason}); if its recording was interrupted, repair it '
