@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import shutil
 import tempfile
 import threading
 import time
@@ -76,8 +77,8 @@ class MapOptions:
 
     def write(self, write: Callable[[Path], object], interrupted: bool) -> str:
         """Have the map saved; returns where it is, in words, where that is elsewhere: what is
-        interrupted does not replace an older map, and what cannot be written there is written to
-        the folder for temporary files. Raises SegfloorError where that cannot be either.
+        interrupted does not replace an older map. Raises MapError where the map cannot be written;
+        it is then in the folder for temporary files, if it can be written there.
         """
         assert self.save is not None
         path = self.save
@@ -86,9 +87,13 @@ class MapOptions:
         try:
             write(path)
         except SegfloorError as error:
-            path = Path(tempfile.mkdtemp(prefix='segfloor-map-')) / path.name
-            write(path)
-            return f'{error}; the map is in {path}'
+            elsewhere = Path(tempfile.mkdtemp(prefix='segfloor-map-'))
+            try:
+                write(elsewhere / path.name)
+            except SegfloorError:
+                shutil.rmtree(elsewhere, ignore_errors=True)
+                raise MapError(str(error)) from None
+            raise MapError(f'{error}; the map is in {elsewhere / path.name}') from None
         return '' if path == self.save else f'{self.save}: stays as it was; the map is in {path}'
 
     def why_not_found(self, name: str, frames: int) -> str:
@@ -187,7 +192,7 @@ class LockstepRun:
 
     def save_map(self) -> None:
         """Save the map, after `execute`; one that the drive has not recognised is not overwritten
-        with its own. Raises InputError where it cannot be written anywhere.
+        with its own. Raises MapError where it cannot be written there.
         """
         save, load = self._map_options.save, self._map_options.load
         if save is None:

@@ -50,6 +50,19 @@ class Up:
 
 Measurement = WheelPose | ImuSample
 
+
+def is_sound(measurement: Measurement) -> bool:
+    """Whether all that was measured are numbers that can be reckoned with: finite, as their squares
+    are.
+    """
+    if isinstance(measurement, WheelPose):
+        values = measurement.T_wheels_base
+    else:
+        values = np.concatenate([measurement.gyro_rad_s, measurement.accel_m_s2])
+    with np.errstate(over='ignore', invalid='ignore'):
+        return bool(np.isfinite(np.square(values.astype(np.float32))).all())
+
+
 DEPTH = 'depth'
 """Name of the depth images among the sensors of a recording."""
 

@@ -37,9 +37,15 @@ def eye_calibration(info: Any, name: str) -> EyeCalibration:
 
 
 def wheel_pose(message: Any, name: str) -> WheelPose:
-    """Return the pose that an Odometry of the wheels tells. Raises InputError where it is none."""
+    """Return the pose that an Odometry of the wheels tells, NaN where it is none. name: of the
+    topic.
+    """
     pose = message.pose.pose
-    return WheelPose(stamp_ns(message), rigid_motion(pose.position, pose.orientation, name))
+    try:
+        T_wheels_base = rigid_motion(pose.position, pose.orientation, name)
+    except InputError:
+        T_wheels_base = np.full((4, 4), np.nan)
+    return WheelPose(stamp_ns(message), T_wheels_base)
 
 
 def imu_sample(message: Any, T_left_imu: Array) -> ImuSample:

@@ -122,18 +122,22 @@ class ReplaySession:
         broken, is_whole = self._play(graph)
         wall_s = time.perf_counter() - start_s
         self._check_result(recorder, broken)
-        notices = []
         try:
             graph.wait_for_map()
             graph.call(Trigger, 'save_map', Trigger.Request())
             grid = load_map(graph.folder / MAP_FILE)
-            notices += self._save_map(graph, is_whole)
         except (ReplayError, InputError) as error:
             broken = broken or error
             if recorder.grid is None:
                 raise broken from None
             grid = grid_of(recorder.grid)
         result = self._result(recorder, grid, wall_s, is_whole and broken is None)
+        notices, status = [], 0 if broken is None else 1 if isinstance(broken, MapError) else 2
+        try:
+            notices += self._save_map(graph, result.summary.interrupted)
+        except MapError as error:
+            notices.append(str(error))
+            status = status or 1
         stop_s = time.perf_counter()
         graph.processes.stop()
         shutdown_s = time.perf_counter() - stop_s
@@ -144,7 +148,7 @@ class ReplaySession:
             shutdown_s,
             len(recorder.failed),
             [*graph.processes.notices(), *notices],
-            0 if broken is None else 1 if isinstance(broken, MapError) else 2,
+            status,
         )
         return result, report
 
@@ -163,9 +167,9 @@ class ReplaySession:
             return InputError(finished.message), False
         return None, True
 
-    def _save_map(self, graph: ReplayGraph, is_whole: bool) -> list[str]:
+    def _save_map(self, graph: ReplayGraph, interrupted: bool) -> list[str]:
         """Save the map; returns where it is where that is elsewhere, or why it is not saved where
-        the one that was loaded stays as it is.
+        the one that was loaded stays as it is. Raises MapError.
         """
         if self.maps.save is None:
             return []
@@ -182,7 +186,7 @@ class ReplaySession:
             except ReplayError as error:
                 return [str(error)]
             return []
-        note = self.maps.write(write, not is_whole)
+        note = self.maps.write(write, interrupted)
         return [note] if note else []
 
     def _check_result(self, recorder: ReplayRecorder, broken: SegfloorError | None) -> None:

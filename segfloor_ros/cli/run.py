@@ -54,7 +54,10 @@ def run(
                 output.end_if_interrupted(interrupt)
                 raise
         folder.write(result)
-        drive.save_map()
+        try:
+            drive.save_map()
+        except Exception as error:  # whatever it is, the results are there
+            folder.problems.append(str(error) or type(error).__name__)
     output.print_summary(input, result.summary)
     remarks, status = [drive.note] if drive.note else [], interrupt.status
     if drive.broken_off is not None:

@@ -242,14 +242,30 @@ def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
     assert kept.take() is None
 
 
-def test_a_folder_that_others_can_write_to_is_not_used(monkeypatch, tmp_path) -> None:
+@pytest.mark.parametrize('mode', [0o777, 0o750, 0o705])
+def test_a_folder_that_is_not_private_is_not_touched(monkeypatch, tmp_path, mode) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
     monkeypatch.setattr('segfloor_ros.nodes.shared.kept_state.IN_MEMORY', tmp_path)
     kept = KeptState('/robot/open', 30.0)
     keep(kept)
-    kept._file.parent.chmod(0o777)
+    before = kept._file.read_bytes()
+    kept._file.parent.chmod(mode)
     assert kept.take() is None
-    keep(KeptState('/robot/open', 30.0))
-    assert list(kept._file.parent.glob('*.new')) == []
+    kept.remove()
+    keep(KeptState('/robot/open', 30.0), value=2)
+    assert [path.read_bytes() for path in kept._file.parent.iterdir()] == [before]
     kept._file.parent.chmod(0o700)
+    assert kept_value(kept) == 1
+
+
+def test_a_link_in_place_of_the_folder_is_not_followed(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    monkeypatch.setattr('segfloor_ros.nodes.shared.kept_state.IN_MEMORY', tmp_path)
+    kept = KeptState('/robot/linked', 30.0)
+    (theirs := tmp_path / 'theirs').mkdir(mode=0o700)
+    (theirs / kept._file.name).write_text('mine')
+    kept._file.parent.symlink_to(theirs)
     assert kept.take() is None
+    kept.remove()
+    keep(kept)
+    assert (theirs / kept._file.name).read_text() == 'mine'

@@ -119,7 +119,9 @@ def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
     if T_left_imu is not None:
         return T_left_imu
     some = islice(bag.messages([imu_topic]), GRAVITY_SAMPLES)
-    felt = np.mean([ros_messages.xyz(message.linear_acceleration) for _, message in some], axis=0)
+    felt = np.nanmedian(
+        [ros_messages.xyz(message.linear_acceleration) for _, message in some], axis=0
+    )
     return np.eye(4) if is_upright(felt) else None
 
 

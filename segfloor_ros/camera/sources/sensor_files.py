@@ -95,7 +95,7 @@ def read_imu(path: Path, T_left_imu: Array | None = None) -> list[ImuSample]:
 
 def check_gravity(where: str, accel_m_s2: Array) -> None:
     """Raise InputError unless accelerations (N, 3) are about those on earth."""
-    felt = float(np.median(np.linalg.norm(accel_m_s2, axis=1)))
+    felt = float(np.nanmedian(np.linalg.norm(accel_m_s2, axis=1)))
     if not ACCEL_RANGE_M_S2[0] <= felt <= ACCEL_RANGE_M_S2[1]:
         raise InputError(
             f'{where}: the median acceleration is {felt:.3g}, but gravity alone is 9.81 m/s²; '

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import tempfile
 import threading
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.results import replacing
 from segfloor_ros.map_file import MapFile, read_map_file, write_to
 
 IN_MEMORY = Path('/dev/shm')
@@ -58,12 +60,9 @@ class KeptState:
     def _write(self, saved: MapFile, start_s: float) -> None:
         with contextlib.suppress(OSError):
             self._file.parent.mkdir(mode=0o700, exist_ok=True)
-            if not _is_private(self._file.parent):
-                return
-            written = self._file.with_suffix('.new')
-            with written.open('wb') as file:
+            self._check_private()
+            with replacing(self._file) as file:
                 write_to(file, saved, compress=False)
-            written.replace(self._file)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
 
@@ -77,23 +76,26 @@ class KeptState:
         handed out once: a map that ends its node is not tried again.
         """
         try:
-            age_s = time.time() - self._file.stat().st_mtime
-            if not _is_private(self._file.parent) or age_s > self._resume_within_s:
-                return None
-            return read_map_file(self._file)
+            self._check_private()
+            age_s = time.time() - self._file.lstat().st_mtime
+            return read_map_file(self._file) if age_s <= self._resume_within_s else None
         except (OSError, InputError):
             return None
         finally:
             self.remove()
 
     def remove(self) -> None:
-        """Leave nothing to be taken up."""
+        """Leave nothing to be taken up; in a folder that is not private, nothing is touched."""
         self.finish()
         with contextlib.suppress(OSError):
+            self._check_private()
             self._file.unlink()
 
-
-def _is_private(folder: Path) -> bool:
-    """Whether the folder is this user's own and nobody else can write to it."""
-    found = folder.lstat()
-    return found.st_uid == os.getuid() and not found.st_mode & 0o022
+    def _check_private(self) -> None:
+        """Raise PermissionError unless the folder is this user's own, no link, and nobody else can
+        look into it or change it: then nobody else decides what lies there.
+        """
+        found = self._file.parent.lstat()
+        is_own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+        if not is_own or found.st_mode & 0o077:
+            raise PermissionError(f'{self._file.parent} is not private')

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import Array, adjoint, invert, make_transform
-from segfloor_ros.measurements import ImuSample, Measurement, WheelPose
+from segfloor_ros.measurements import Measurement, WheelPose, is_sound
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
@@ -94,6 +94,7 @@ class BodyMotion:
     def __init__(self) -> None:
         self.T_base_left: Array | None = None
         self.messages = {'wheel_odometry': 0, 'imu': 0}
+        self._dropped = dict.fromkeys(self.messages, 0)
         self.slips = 0
         self.remarks: dict[str, str] = {}
         self.gyroscope = Gyroscope()
@@ -107,12 +108,17 @@ class BodyMotion:
         self._slipped_ns: int | None = None
 
     def add(self, measurement: Measurement) -> None:
-        """Take in what a sensor measured."""
+        """Take in what a sensor measured; what is no measurement is dropped and counted."""
+        name = 'wheel_odometry' if isinstance(measurement, WheelPose) else 'imu'
+        if not is_sound(measurement):
+            self._dropped[name] += 1
+            words = f'{name}: messages without finite numbers, dropped: {self._dropped[name]}'
+            self._remark({f'dropped {name}': words})
+            return
+        self.messages[name] += 1
         if isinstance(measurement, WheelPose):
-            self.messages['wheel_odometry'] += 1
             self._wheels.add(measurement)
-        elif isinstance(measurement, ImuSample):
-            self.messages['imu'] += 1
+        else:
             self.gyroscope.add(measurement)
 
     def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
