@@ -69,7 +69,9 @@ SLAM: dict[str, Mechanism] = {
     'triangulation by motion': Mechanism(
         {'slam.mapping.keyframe_mapping.LocalMapper._partners': lambda *_: []}
     ),
-    'place keyframes in the local map': Mechanism({'slam.tracking.map_tracking.views_near': _no_rows}),
+    'place keyframes in the local map': Mechanism(
+        {'slam.tracking.map_tracking.views_near': _no_rows}
+    ),
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
     'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
     'disparity offset': Mechanism(settings={'disparity_offset_sigma_px': 0.0}),
@@ -79,9 +81,7 @@ SLAM: dict[str, Mechanism] = {
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MIN_KEPT_RATIO': 0.0}),
     'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
-    'keyframes where few points are found': Mechanism(
-        {'slam.places.known_views.FEW_FOUND': 0.0}
-    ),
+    'keyframes where few points are found': Mechanism({'slam.places.known_views.FEW_FOUND': 0.0}),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
         {

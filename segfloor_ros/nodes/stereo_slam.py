@@ -23,13 +23,17 @@ from segfloor_ros.nodes.slam.slam_maps import SlamMaps
 from segfloor_ros.nodes.slam.slam_outputs import CameraFrames, LostTime, SlamOutputs
 from segfloor_ros.nodes.slam.stereo_input import Pair, PairQueue, StereoInput
 from segfloor_ros.slam.results import FrameResult
-from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, saved_camera
+from segfloor_ros.slam.saved_slam import (
+    LoadedMap,
+    last_pose_of,
+    last_pose_values,
+    load_slam,
+    saved_camera,
+)
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.stages import make_slam
 
 LOOK_AGAIN_S = 0.2
-PATIENCE_S = 5.0
-"""For how long the place where the node was killed is looked for before a new map begins."""
 REMARK_AGAIN_S = 600.0
 NEXT_S, IDLE_S = 0.005, 0.05
 """Results that were held back are published one by one: others need time to take each of them."""
@@ -92,12 +96,15 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._unannounced = saved, loaded
 
     def restore(self, saved: MapFile) -> None:
-        """Go on with the map of a killed node: with its stamps, and where it ended."""
+        """Go on with the map of a killed node: with its stamps, and where it ended. Raises
+        InputError.
+        """
+        last = last_pose_of(saved.header.get('note', {}))
         self._unannounced = None
         self._outputs.reset(saved.header['start_ns'])
         slam, camera = self._ready = self._make_slam(saved_camera(saved, 'kept map'))
-        load_slam(slam, camera, saved, 'kept map', ends_ns=None)
-        self._last_stamp_ns = slam.map.keyframes[-1].stamp_ns
+        load_slam(slam, camera, saved, 'kept map', last=last)
+        self._last_stamp_ns = last.stamp_ns
         self._is_resumed = True
 
     def is_needed_otherwise(self) -> bool:
@@ -206,10 +213,10 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._send_next()
         for about, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(about, remark, repeat_s=REMARK_AGAIN_S)
-        if self._lost.lost_s(stamp_ns) > PATIENCE_S and self._is_resumed and not self._lost.found:
-            self.reset('the place where the last SLAM was killed is not found')
-        elif self._mount is not None and not slam.is_adjusting:
+        if self._mount is not None and not slam.is_adjusting:
             self._maps.keep(slam)
+        if slam.last_pose is not None:
+            self.kept_state.note(last_pose_values(slam.last_pose))
         if not results:
             self._report_held(stamp_ns, slam)
 
@@ -279,18 +286,18 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         )
 
     def _report_held(self, stamp_ns: int, slam: StereoSlam) -> None:
-        """Tell why no result is ready. While the mount is being measured the newest pose is
-        published: it is corrected once, when keyframes come.
+        """Tell why no result is ready. While the mount is being measured, and by a drive that was
+        broken off, the newest pose is published: it is corrected once, when keyframes come.
         """
-        if slam.is_apart:
-            lost = self._lost.note(stamp_ns, tracked=False)
-            self.reporter.report(stamp_ns, Level.ERROR, MAPPING_APART, tracked=0, apart=1, **lost)
-            return
         result = slam.provisional
         if result is not None:
             self._provisional_ns = stamp_ns
             self._transforms.broadcast(result)
             self._outputs.publish(result, self._calibration, self._frames)
+        if slam.is_apart:
+            lost = self._lost.note(stamp_ns, tracked=False)
+            self.reporter.report(stamp_ns, Level.ERROR, MAPPING_APART, tracked=0, apart=1, **lost)
+            return
         words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
         self.reporter.report_waiting(stamp_ns, words)
 

@@ -6,7 +6,7 @@ What tracking hands to mapping: a frame with a pose, and what was seen in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.pose import PoseEstimate
@@ -83,6 +84,20 @@ class Keyframe:
     path: KeyframePath
     cloud: SparseCloud
     moving: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
+class LastPose:
+    """Where a drive was broken off: the last pose T_camera_world (4, 4) with its covariance (6, 6)
+    and velocity (6,), the correction of the odometry T_world_odom (4, 4), and what wheels told.
+    """
+
+    stamp_ns: int
+    T_camera_world: Array
+    T_world_odom: Array
+    covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    velocity: Array = field(default_factory=lambda: np.zeros(6))
+    wheels: tuple[WheelPose, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +13,8 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.errors import CalibrationError, InputError, MapError
 from segfloor_ros.geometry import invert, transform_points
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.slam.results import KeyframePath, SparseCloud
+from segfloor_ros.measurements import WheelPose
+from segfloor_ros.slam.results import KeyframePath, LastPose, SparseCloud
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 PART = 'slam'
@@ -19,6 +22,8 @@ BEFORE_ALL_NS = -1_000_000_000
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
+LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
+
 LOST_IDS = 1_000_000
 """More than a drive gives to points after its map was kept for the last time: who goes on with that
 map does not give them again."""
@@ -42,7 +47,6 @@ def save_slam(slam: StereoSlam, camera: StereoCamera) -> MapFile:
     header = {
         'camera': asdict(camera),
         'mount': asdict(slam.mount),
-        'T_world_odom': slam.T_world_odom.tolist(),
     }
     return MapFile(header, {PART: slam.to_arrays()})
 
@@ -53,11 +57,11 @@ def load_slam(
     saved: MapFile,
     name: str,
     localize: bool = False,
-    ends_ns: int | None = BEFORE_ALL_NS,
+    last: LastPose | None = None,
 ) -> LoadedMap:
     """Go on with a saved map, before the first frame. name: of the file. localize: the map stays as
-    it is. ends_ns: the stamp that the last keyframe of the map is to have; None: the drive that was
-    saved goes on, with its stamps and its `odom`, and is looked for where it ended.
+    it is. last: where the drive that was saved was broken off: it goes on, with its stamps and its
+    `odom`; else a new drive begins.
 
     Raises InputError for a map that is damaged or of another camera.
     """
@@ -67,17 +71,33 @@ def load_slam(
         if not all(np.isfinite(arrays[column]).all() for column in PLACES):
             raise ValueError('places that are nowhere')
         stamp_ns = arrays['keyframe_stamp_ns']
-        shift_ns = 0 if ends_ns is None else ends_ns - int(stamp_ns[-1])
-        T_world_odom = np.array(saved.header['T_world_odom']) if ends_ns is None else None
-        skipped = LOST_IDS if ends_ns is None else 0
+        shift_ns = 0 if last is not None else BEFORE_ALL_NS - int(stamp_ns[-1])
+        skipped = 0 if last is None else LOST_IDS
         moved = arrays | {
             'keyframe_stamp_ns': stamp_ns + shift_ns,
             'num_ever': arrays['num_ever'] + skipped,
         }
-        slam.load(moved, mount, localize, T_world_odom)
+        slam.load(moved, mount, localize, last)
         return loaded_map(saved, shift_ns)
     except (ArithmeticError, LookupError, ValueError, TypeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
+
+
+def last_pose_values(last: LastPose) -> dict[str, Any]:
+    """Return where a drive may be broken off as values of JSON."""
+    wheels = [[pose.stamp_ns, pose.T_wheels_base.tolist()] for pose in last.wheels]
+    arrays = {name: getattr(last, name).tolist() for name in LAST_ARRAYS}
+    return {'stamp_ns': last.stamp_ns, 'wheels': wheels, **arrays}
+
+
+def last_pose_of(values: Mapping[str, Any]) -> LastPose:
+    """Return what `last_pose_values` was made of. Raises InputError."""
+    try:
+        arrays = {name: np.array(values[name], float) for name in LAST_ARRAYS}
+        wheels = tuple(WheelPose(int(ns), np.array(T, float)) for ns, T in values['wheels'])
+        return LastPose(int(values['stamp_ns']), wheels=wheels, **arrays)
+    except (KeyError, ValueError, TypeError):
+        raise InputError('kept map: does not tell where the drive was broken off') from None
 
 
 def saved_camera(saved: MapFile, name: str) -> StereoCamera:

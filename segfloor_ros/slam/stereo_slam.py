@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import Array, invert
+from segfloor_ros.geometry import Array, adjoint, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement, Up
 from segfloor_ros.slam.map.records import KeyframeRecord
@@ -23,7 +23,7 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd
 from segfloor_ros.slam.moving.motion_search import MotionSearch, Searched
 from segfloor_ros.slam.places.loops import Candidate
-from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, FrameResult, Keyframe, Track
+from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, FrameResult, Keyframe, LastPose, Track
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.front_end import FrontEnd
@@ -31,15 +31,15 @@ from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes
 
-START_NS, RESUMING_NS, LOST_NS = 1_000_000_000, 5_000_000_000, 1_500_000_000
-"""For how long the camera is looked for in the map: of a new drive in the map that was loaded, of
-one that goes on after a pause, and of one that got lost. After that it maps on its own.
-"""
+START_NS, LOST_NS = 1_000_000_000, 1_500_000_000
+"""For how long the camera is looked for in the map: of a new drive in the map that was loaded, and
+of one that got lost or was broken off. After that it maps on its own."""
 
 HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
 ORB-SLAM2, 2017, does the same)."""
 
+HELD = 'held where the drive was broken off'
 NOTHING_SEEN = 'too few known points in view'
 MAPPED_APART = ', mapped before the map was recognised'
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
@@ -80,6 +80,7 @@ class StereoSlam:
         self._lost_ns: int | None = None
         self._patience_ns = LOST_NS
         self._is_shown = True
+        self._began_unsure: tuple[Array, Array] | None = None
 
     @property
     def disparity_offset_px(self) -> float:
@@ -123,12 +124,23 @@ class StereoSlam:
 
     @property
     def provisional(self) -> FrameResult | None:
-        """The newest pose while the mount is being measured, by the mount as it seems so far; None
-        before the first frame, and once `process` returns results.
+        """The newest pose while results are held back: while the mount is being measured, by the
+        mount as it seems so far; or of a drive that was broken off and maps on its own since, as
+        uncertain as its beginning. None before the first frame, and once `process` returns results.
         """
+        if self.is_apart and self._began_unsure is not None and self.mount is not None:
+            return self._held.newest(self.mount)
         if self.mount is not None or self._mount_meter is None:
             return None
         return self._held.newest(self._mount_meter.provisional)
+
+    @property
+    def last_pose(self) -> LastPose | None:
+        """What a drive that is broken off now goes on from; None where it is lost."""
+        last = self._front_end.motion.last_pose()
+        if self.mount is None or self._front_end.motion.is_lost:
+            return None
+        return replace(last, covariance=self._covariance())
 
     def add(self, measurement: Measurement) -> None:
         """Take in what wheels or an IMU measured; those up to a frame come before it."""
@@ -148,7 +160,8 @@ class StereoSlam:
             )
             if track is not None:
                 self._lost_ns, self._patience_ns = None, LOST_NS
-                self._is_shown |= not self._back_end.is_apart
+                if not self._back_end.is_apart:
+                    self._is_shown, self._began_unsure = True, None
             elif self.map.keyframes:
                 self._front_end.bridge(frame, fault)
                 self._search_on(frame, images, fault)
@@ -187,17 +200,20 @@ class StereoSlam:
         return self._back_end.to_arrays(of_known=self._is_shown)
 
     def load(
-        self, arrays: Arrays, mount: Mount, localize: bool, T_world_odom: Array | None = None
+        self, arrays: Arrays, mount: Mount, localize: bool, last: LastPose | None = None
     ) -> None:
         """Go on with a map, before the first frame; the camera must be found in it. localize: the
-        map stays as it is. T_world_odom: (4, 4), where the drive that made the map goes on. Raises
-        KeyError or ValueError for arrays that are no map.
+        map stays as it is. last: where the drive that made the map was broken off, which goes on:
+        until the camera is seen there, by what wheels tell, or with the last pose and a covariance
+        that grows. Raises KeyError or ValueError for arrays that are no map.
         """
         self._back_end.from_arrays(arrays)
         self.mount, self._front_end.is_fixed = mount, localize
-        self._is_shown = False
-        self._patience_ns = START_NS if T_world_odom is None else RESUMING_NS
-        self._front_end.start_lost(T_world_odom)
+        if last is None:
+            self._is_shown, self._patience_ns = False, START_NS
+            self._front_end.motion.stop()
+        else:
+            self._front_end.resume(last)
 
     def search_near(self, T_map_base: Array, reach_m: float, reach_rad: float) -> None:
         """Look for the camera around a pose of the base (4, 4) alone, as far as somebody who knows
@@ -236,6 +252,9 @@ class StereoSlam:
         is all there is of the drive. A map that had hardly begun is not worth waiting for.
         """
         self._lost_ns = None
+        motion = self._front_end.motion
+        if motion.is_held:
+            self._began_unsure = motion.T_camera_world, motion.covariance
         self._take_adjustment(wait=True)
         if self._is_shown and len(self.map.keyframes) <= HARDLY_BEGUN:
             self._back_end.begin_again()
@@ -307,6 +326,7 @@ class StereoSlam:
             keyframe = self.map.keyframes[-1]
             self._forget_views()
             self._body.reset_world()
+            self._began_unsure = None
             self._held.change(in_joined_map(self.map, self.T_world_odom))
         self._front_end.continue_from(images, keyframe)
         self._measure_mount(frame, keyframe)
@@ -331,6 +351,14 @@ class StereoSlam:
         if change():
             self._front_end.follow_map(before, self.map.keyframes[-1].T_camera_world)
 
+    def _covariance(self) -> Array:
+        """Return the covariance (6, 6) of the last pose, with that of where its map began."""
+        motion, began = self._front_end.motion, self._began_unsure
+        if began is None:
+            return motion.covariance
+        A = adjoint(motion.T_camera_world @ invert(began[0]))
+        return motion.covariance + A @ began[1] @ A.T
+
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None
     ) -> FrameResult:
@@ -339,7 +367,8 @@ class StereoSlam:
         sigma_m = self._front_end.seen_sigma_m
         unsure = f'what is seen leaves the place uncertain by {1000 * sigma_m:.0f} mm'
         tracked = track is not None or keyframe is not None or motion.is_blind
-        state = f'on {motion.carried_by}: {why}' if motion.is_blind else 'tracking'
+        blind = f'on {motion.carried_by}' if not motion.is_held else HELD
+        state = f'{blind}: {why}' if motion.is_blind else 'tracking'
         state += f': {unsure}' if sigma_m > UNSURE_M and not motion.is_blind else ''
         if self._back_end.is_apart:
             state += MAPPED_APART if self._is_shown else ', outside the loaded map'
@@ -350,7 +379,7 @@ class StereoSlam:
             tracked,
             motion.T_odom_camera,
             motion.T_world_odom,
-            motion.covariance if tracked else unknown,
+            self._covariance() if tracked else unknown,
             len(track.point_ids) if track else 0,
             state if tracked else f'lost: {why}',
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,

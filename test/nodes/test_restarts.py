@@ -96,6 +96,10 @@ class Journey:
         """Return the last message of a topic."""
         return self._received[name][-1]
 
+    def truth(self, stamp_ns: int) -> np.ndarray:
+        """Return the true pose (4, 4) of a frame."""
+        return self._truth[int(stamp_ns)]
+
     def odometry_error_m(self) -> float:
         """Return how far the last pose is from the truth."""
         message = self.latest('odometry')
@@ -168,21 +172,47 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_a_slam_that_does_not_find_its_place_again_begins_a_new_map(journey) -> None:
+def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(journey) -> None:
     chain = journey.chain
+    grid, _ = journey.keyframes(1)
+    last = journey.latest('odometry')
     chain.kill(SLAM)
     chain.start(SLAM)
     dark = np.zeros_like(journey.next().left)
-    chain.wake(lambda: replace(journey.next(), left=dark, right=dark))
-    journey.miss(51)
-    chain.drive([replace(journey.next(), left=dark, right=dark)])
-    begun = journey.next()
-    assert chain.drive([begun])[0].level is Level.OK
-    # The first keyframes may miss a node that still takes the new SLAM for the one killed.
+
+    def covered() -> StereoFrame:
+        return replace(journey.next(), left=dark, right=dark)
+
+    chain.wake(covered)
+    answer = chain.drive([covered() for _ in range(10)])[-1]
+    assert 'held where the drive was broken off' in answer.message
+    chain.graph.until(lambda: stamp_of(journey.latest('odometry')) == answer.stamp_ns, 'it')
+    held = journey.latest('odometry')
+    np.testing.assert_allclose(place_of(held), place_of(last), atol=1e-6)
+    since_s = 1e-9 * (stamp_of(held) - stamp_of(last))
+    # A robot that nobody sees may be carried at a walking pace: three sigma.
+    sigma_m = np.sqrt(held.pose.covariance[0])
+    assert sigma_m >= 0.5 * since_s
+    moved_m = journey.odometry_error_m()
+    assert 0.3 < moved_m < 3 * sigma_m
     journey.rejoin()
+    grid_after, _ = journey.keyframes(1)
     path = path_arrays(journey.latest('keyframe/path'))
-    assert path.stamp_ns[0] == begun.stamp_ns
-    assert 'is not found' in chain.log(SLAM)
+    assert path.stamp_ns[0] == 0
+    truth = journey.truth(path.stamp_ns[-1])
+    assert np.linalg.norm(path.T_map_base[-1][:3, 3] - truth[:3, 3]) < 0.03
+    # `odom` is continuous: what was not seen is now between it and the map.
+    assert journey.odometry_error_m() > 0.5 * moved_m
+    known, known_after = known_cells(grid), known_cells(grid_after)
+    assert len(known & known_after.keys()) >= 0.98 * len(known)
+
+
+def stamp_of(message) -> int:
+    return to_ns(message.header.stamp)
+
+
+def place_of(message) -> np.ndarray:
+    return pose_array(message.pose.pose)[:3, 3]
 
 
 def known_cells(grid: OccupancyGrid) -> dict[tuple[int, int], bool]:
@@ -225,6 +255,21 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkey
     os.utime(file, (long_ago, long_ago))
     assert kept.take() is None
     assert not file.exists()
+
+
+def test_what_was_noted_last_comes_with_the_map_and_tells_its_age(monkeypatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    kept = KeptState('/robot/noting', 30.0)
+    keep(kept)
+    for stamp_ns in (1, 2):
+        kept.note({'stamp_ns': stamp_ns})
+    long_ago = kept._file.stat().st_mtime - 31
+    os.utime(kept._file, (long_ago, long_ago))  # it has stood since, and made no keyframe
+    assert KeptState('/robot/noting', 30.0).take().header['note'] == {'stamp_ns': 2}
+    assert [file.name for file in kept._file.parent.glob('test-robot-noting*')] == []
+    off = KeptState('/robot/noting', 0.0)
+    off.note({'stamp_ns': 3})
+    assert [file.name for file in kept._file.parent.glob('test-robot-noting*')] == []
 
 
 def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:

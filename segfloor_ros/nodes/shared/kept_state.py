@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import stat
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import replacing
@@ -34,6 +36,7 @@ class KeptState:
         parent = IN_MEMORY if IN_MEMORY.is_dir() else Path(tempfile.gettempdir())
         folder = parent / f'segfloor_ros-{os.getuid()}'
         self._file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
+        self._note = self._file.with_suffix('.json')
         self._resume_within_s = resume_within_s
         self._next_save_s = -float('inf')
         self._writing: threading.Thread | None = None
@@ -46,6 +49,17 @@ class KeptState:
             and time.monotonic() >= self._next_save_s
             and not (self._writing is not None and self._writing.is_alive())
         )
+
+    def note(self, values: Mapping[str, Any]) -> None:
+        """Keep values of JSON beside the map, now: the last frame before a crash counts."""
+        if self._resume_within_s <= 0:
+            return
+        with contextlib.suppress(OSError):
+            self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            self._check_private()
+            written = self._note.with_suffix('.note')
+            written.write_text(json.dumps(values))
+            written.replace(self._note)
 
     def save(self, make: Callable[[], MapFile]) -> None:
         """Keep what `make` returns in place of the last map, unless that was kept only just now; it
@@ -72,14 +86,21 @@ class KeptState:
             self._writing.join()
 
     def take(self) -> MapFile | None:
-        """Return the map that a killed node of this name left a short time ago, or None. It is
-        handed out once: a map that ends its node is not tried again.
+        """Return the map that a killed node of this name left a short time ago, or None; what it
+        noted last is `note` of the header. It is handed out once: a map that ends its node is not
+        tried again.
         """
         try:
             self._check_private()
-            age_s = time.time() - self._file.lstat().st_mtime
-            return read_map_file(self._file) if age_s <= self._resume_within_s else None
-        except (OSError, InputError):
+            files = [file for file in (self._file, self._note) if file.is_file()]
+            age_s = time.time() - max((file.lstat().st_mtime for file in files), default=0.0)
+            if age_s > self._resume_within_s:
+                return None
+            saved = read_map_file(self._file)
+            if self._note in files:
+                saved.header['note'] = json.loads(self._note.read_text())
+            return saved
+        except (OSError, ValueError, InputError):
             return None
         finally:
             self.remove()
@@ -89,7 +110,8 @@ class KeptState:
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()
-            self._file.unlink()
+            for file in (self._file, self._note):
+                file.unlink(missing_ok=True)
 
     def _check_private(self) -> None:
         """Raise PermissionError unless the folder is this user's own, no link, and nobody else can

@@ -30,10 +30,9 @@ Pair = tuple[NDArray[np.uint8], NDArray[Any]]
 
 
 class LostTime:
-    """Measures by the stamps of the frames. found: whether any frame has been tracked."""
+    """Measures by the stamps of the frames."""
 
     def __init__(self, node: AnyStageNode) -> None:
-        self.found = False
         self._node = node
         self._since_ns: int | None = None
 
@@ -49,7 +48,7 @@ class LostTime:
             self._since_ns = stamp_ns if self._since_ns is None else self._since_ns
             return {'lost_s': f'{self.lost_s(stamp_ns):.2f}'}
         lost_s, was_lost = self.lost_s(stamp_ns), self._since_ns is not None
-        self.found, self._since_ns = True, None
+        self._since_ns = None
         if not was_lost:
             return {}
         self._node.get_logger().info(f'tracking again, after {lost_s:.2f} s')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -104,12 +106,8 @@ class LoopChecks:
         first, known = self._map.keyframes[0], self._known.keyframes
         T_own_known = drift(self._map, match)
         way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
-        stamp_s = np.array([k.stamp_ns for k in (*known, first)]) / 1e9
-        steps = np.diff([k.T_world_camera[:3, 3] for k in known], axis=0)
-        speeds = np.linalg.norm(steps, axis=1) / np.maximum(np.diff(stamp_s[:-1]), 1e-3)
-        speed = SPEED_FACTOR * speeds.max(initial=LEAST_SPEED_MPS)
-        reach_m = FREE_WAY_M + speed * (stamp_s[-1] - stamp_s[-2])
-        return bool(np.linalg.norm(way[:3, 3]) <= reach_m)
+        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
+        return bool(np.linalg.norm(way[:3, 3]) <= FREE_WAY_M + greatest_speed_mps(known) * lost_s)
 
     def objection(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> str:
         """Return what else speaks against a match, '' for nothing."""
@@ -194,6 +192,14 @@ class LoopChecks:
         uvr = self._camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))
         uvr[~front] = np.nan
         return uvr[:, :2], uvr[:, 0] - uvr[:, 2]
+
+
+def greatest_speed_mps(keyframes: Sequence[KeyframeRecord]) -> float:
+    """Return how fast a robot moves at most while nobody sees it."""
+    stamp_s = np.array([k.stamp_ns for k in keyframes]) / 1e9
+    steps = np.diff([k.T_world_camera[:3, 3] for k in keyframes], axis=0)
+    speeds = np.linalg.norm(steps.reshape(-1, 3), axis=1) / np.maximum(np.diff(stamp_s), 1e-3)
+    return SPEED_FACTOR * float(speeds.max(initial=LEAST_SPEED_MPS))
 
 
 def drift(sparse_map: SparseMap, match: Match) -> Array:

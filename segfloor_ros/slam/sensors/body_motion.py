@@ -55,13 +55,13 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class RelativeMotion:
     """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
-    twist in exp(twist) T_now_before, translation first. told_by: wheels, an IMU, or a gyroscope
-    alone with a speed that is taken for constant.
+    twist in exp(twist) T_now_before, translation first. told_by: wheels, an IMU, a gyroscope alone
+    with a speed that is taken for constant, or nothing at all: the last pose is held.
     """
 
     T_now_before: Array
     covariance: Array
-    told_by: Literal['wheels', 'IMU', 'gyroscope'] = 'wheels'
+    told_by: Literal['wheels', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
 
     @property
     def by_wheels(self) -> bool:
@@ -120,6 +120,11 @@ class BodyMotion:
             self._wheels.add(measurement)
         else:
             self.gyroscope.add(measurement)
+
+    @property
+    def latest_wheels(self) -> list[WheelPose]:
+        """The last poses that the wheels told: enough for the motion since."""
+        return self._wheels.latest
 
     def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
         """Return R_now_before (3, 3) of the camera as the gyroscope tells it, and the standard

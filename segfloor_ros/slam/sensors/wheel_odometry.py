@@ -13,7 +13,9 @@ from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.sensors.gyroscope import is_late, lag_in_words
 
-HISTORY = 2000
+HISTORY, NEEDED = 2000, 20
+"""Poses that are kept, and those that a drive needs to go on after it was broken off."""
+
 MAX_GAP_NS = 500_000_000
 MAX_AHEAD_NS = 100_000_000
 """Messages may be so late; until then the base is taken to go on as it did."""
@@ -38,6 +40,11 @@ class WheelOdometry:
         insort(self._poses, pose, key=_stamp)
         if len(self._poses) > 2 * HISTORY:
             del self._poses[:-HISTORY]
+
+    @property
+    def latest(self) -> list[WheelPose]:
+        """The poses of the last moments."""
+        return self._poses[-NEEDED:]
 
     def motion(self, before_ns: int, now_ns: int) -> Array | None:
         """Return T_before_now (4, 4) of the base as told; None where too little was told."""
@@ -65,8 +72,10 @@ class WheelOdometry:
             return self._poses[place].T_wheels_base
         if place == 0 or len(self._poses) < 2:
             return None
-        if place == len(self._poses):
-            if stamp_ns - self._poses[-1].stamp_ns > MAX_AHEAD_NS:
+        before_ns = self._poses[place - 1].stamp_ns
+        is_gap = place == len(self._poses) or self._poses[place].stamp_ns - before_ns > MAX_GAP_NS
+        if is_gap:
+            if place < 2 or stamp_ns - before_ns > MAX_AHEAD_NS:
                 return None
             place -= 1
         one, other = self._poses[place - 1 : place + 1]

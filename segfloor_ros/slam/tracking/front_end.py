@@ -12,9 +12,10 @@ from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.loop_checks import greatest_speed_mps
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.places.relocalisation import Relocaliser, is_within
-from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
+from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, LastPose, ObservedFeatures, Track
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.consensus import Consensus, differ
@@ -91,7 +92,8 @@ class FrontEnd:
     @property
     def is_searching(self) -> bool:
         """Whether the camera is looked for in the whole map."""
-        return self.motion.is_lost and not self._relocaliser.is_narrow
+        motion = self.motion
+        return (motion.is_lost or motion.is_held) and not self._relocaliser.is_narrow
 
     def leave_map(self) -> None:
         """Forget what was seen of the map: another one takes its place."""
@@ -100,16 +102,12 @@ class FrontEnd:
         self.follower.reset()
         self._relocaliser.reset()
 
-    def start_lost(self, T_world_odom: Array | None) -> None:
-        """Go on with a map in which the camera must be found. T_world_odom: (4, 4), where the drive
-        that made it goes on.
-        """
-        if T_world_odom is not None:
-            last = self._map.keyframes[-1]
-            self.motion.T_camera_world = last.T_camera_world
-            self.motion.T_world_odom = T_world_odom
-            self.local.move_to(last.point_id[last.point_id != NO_POINT], last.T_camera_world)
-        self.motion.stop()
+    def resume(self, last: LastPose) -> None:
+        """Go on with a map whose drive was broken off."""
+        # A robot that nobody sees goes three standard deviations at most.
+        self.motion.resume(last, greatest_speed_mps(self._map.keyframes) / 3)
+        seen = self._map.keyframes[-1].point_id
+        self.local.move_to(seen[seen != NO_POINT], last.T_camera_world)
 
     def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
         """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
@@ -176,7 +174,9 @@ class FrontEnd:
         if len(track.point_ids) < PLENTY:
             self.seen_sigma_m = self._sigma_m(track, images)
         if motion.is_consistent(pose, track.covariance, stamp_ns):
-            return motion.is_plausible(pose, stamp_ns)
+            return motion.is_resuming or motion.is_plausible(pose, stamp_ns)
+        if motion.is_resuming:
+            return False
         least, ratio = CONTRARY_WHEN_BLIND if motion.is_blind else CONTRARY
         return len(track.point_ids) >= least and _recognised(track, ratio)
 
@@ -233,7 +233,7 @@ class FrontEnd:
             predictions,
             self.offset_px,
         )
-        if not (self.motion.is_lost or self.motion.is_blind):
+        if not (self.motion.is_lost or self.motion.is_blind or self.motion.is_resuming):
             return self._carry_on(images, features, frame.stamp_ns, track)
         if track is not None and _recognised(track, RECOVERY_RATIO):
             return track
@@ -276,6 +276,7 @@ class FrontEnd:
         motion = self.motion
         is_possible = partial(motion.may_face, stamp_ns=stamp_ns)
         lost_at = motion.T_camera_world if motion.lost_here else None
+        lost_at = motion.steady(stamp_ns) if motion.is_resuming else lost_at
         found = self._relocaliser.find_surely(
             images, features, self.offset_px, is_possible, lost_at
         )
@@ -288,7 +289,7 @@ class FrontEnd:
     def is_new_place(self) -> bool:
         """Whether the sensors have the camera somewhere new: the map goes on from there."""
         motion = self.motion
-        if not motion.is_blind or motion.sigma_m > MAX_BLIND_SIGMA_M:
+        if not motion.is_blind or motion.is_held or motion.sigma_m > MAX_BLIND_SIGMA_M:
             return False
         return self.local.is_new_view(motion.T_camera_world)
 

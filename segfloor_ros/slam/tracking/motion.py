@@ -14,6 +14,7 @@ from segfloor_ros.geometry import (
     se3_exp,
     se3_log,
 )
+from segfloor_ros.slam.results import LastPose
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 
@@ -46,7 +47,9 @@ class CameraMotion:
     T_camera_world: the latest pose (4, 4). covariance: (6, 6) of its twist. T_world_odom: the
     correction of the odometry; both frames are the camera's first pose. is_lost: whether the last
     frame had no pose; `T_camera_world` then turns on as a gyroscope tells. lost_here: whether that
-    is where the camera was lost. carried_by: the sensor that told the last pose alone, or ''.
+    is where the camera was lost. carried_by: the sensor that told the last pose alone, or '';
+    'nothing' where a pose is held. is_resuming: whether the drive was broken off, and
+    nothing has told the pose since.
     """
 
     def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
@@ -67,6 +70,17 @@ class CameraMotion:
         self._since_keyframe: RelativeMotion | None = None
         self._at_keyframe: tuple[Array, Array] = self.T_camera_world, self.covariance
         self._latest: tuple[tuple[int, int], RelativeMotion | None] | None = None
+        self._broken_off: tuple[LastPose, float] | None = None
+
+    @property
+    def is_resuming(self) -> bool:
+        """Whether the drive was broken off, and nothing has told the pose since."""
+        return self._broken_off is not None
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the last pose is that from before the drive was broken off."""
+        return self.carried_by == 'nothing'
 
     @property
     def T_odom_camera(self) -> Array:
@@ -151,6 +165,30 @@ class CameraMotion:
         off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
         return off_rad < MAX_LOST_TURN_RAD + 3 * (self._heading_sigma_rad + turned[1])
 
+    def last_pose(self) -> LastPose:
+        """Return what a drive that is broken off here goes on from."""
+        return LastPose(
+            self._last_stamp_ns,
+            self.T_camera_world,
+            self.T_world_odom,
+            self.covariance,
+            self._velocity,
+            tuple(self._body.latest_wheels),
+        )
+
+    def resume(self, last: LastPose, sigma_per_s: float) -> None:
+        """Go on where a drive was broken off. sigma_per_s: by how many metres and radians a pose
+        that is held becomes less certain per second.
+        """
+        self.stop()
+        self.is_lost = False
+        self.T_camera_world, self.T_world_odom = last.T_camera_world, last.T_world_odom
+        self.covariance, self._velocity = last.covariance, last.velocity
+        self._last_stamp_ns = last.stamp_ns
+        self._broken_off = last, sigma_per_s
+        for pose in last.wheels:
+            self._body.add(pose)
+
     def take(
         self,
         T_camera_world: Array,
@@ -174,6 +212,7 @@ class CameraMotion:
         self.T_camera_world, self.covariance = T_camera_world, covariance
         self._last_stamp_ns = stamp_ns
         self.is_lost, self.lost_here, self.carried_by = False, False, ''
+        self._broken_off = None
         T_seen = T_camera_world if T_seen is None else T_seen
         T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
         self._body.learn(stamp_ns, T_odom_seen, self.T_world_odom[:3, :3])
@@ -186,8 +225,12 @@ class CameraMotion:
         predicted = self._predicted(measured)
         if measured is None or predicted is None:
             return False
+        if measured.told_by == 'nothing':
+            self.covariance, self.carried_by = predicted[1], measured.told_by
+            return True
         if not measured.by_wheels and sigma_m(predicted[1]) > MAX_BLIND_SIGMA_M:
             return False
+        self._broken_off = None
         self._note(measured)
         self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]
         self._last_stamp_ns = stamp_ns
@@ -213,7 +256,7 @@ class CameraMotion:
         self._velocity = np.zeros(6)
         self.is_lost, self.lost_here, self.carried_by = True, False, ''
         self._heading_sigma_rad = self._latest = None
-        self._since_keyframe = None
+        self._since_keyframe = self._broken_off = None
         self._body.stop()
 
     def start_keyframe(self) -> RelativeMotion | None:
@@ -235,13 +278,18 @@ class CameraMotion:
         self.T_world_odom = _without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
 
     def _measured(self, stamp_ns: int) -> RelativeMotion | None:
-        """Return the motion since the last pose, by wheels or by an IMU alone; asked for often."""
+        """Return the motion since the last pose, by wheels or by an IMU alone, or none where the
+        pose is held; asked for often.
+        """
         stretch = self._last_stamp_ns, stamp_ns
         if self._latest is None or self._latest[0] != stretch:
             measured = self._body.between(*stretch)
             if measured is None:
                 R_world_odom = self.T_world_odom[:3, :3]
                 measured = self._body.felt(*stretch, self.T_odom_camera, R_world_odom)
+            if measured is None and self._broken_off is not None:
+                sigma = self._broken_off[1] * self._step_s(stamp_ns)
+                measured = RelativeMotion(np.eye(4), sigma**2 * np.eye(6), 'nothing')
             self._latest = stretch, measured
         return self._latest[1]
 
@@ -258,7 +306,9 @@ class CameraMotion:
         """Return where the sensors have the camera after a motion (4, 4), and the covariance."""
         if measured is None or self.is_lost:
             return None
-        return _moved((self.T_camera_world, self.covariance), measured)
+        held = self._broken_off
+        covariance = self.covariance if held is None else held[0].covariance
+        return _moved((self.T_camera_world, covariance), measured)
 
     def _note(self, measured: RelativeMotion | None) -> None:
         """Add the motion of a frame to that since the last keyframe."""

@@ -119,7 +119,7 @@ def test_frames_in_a_row_must_find_who_is_lost(mapped):
 
 
 def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch):
-    slam = loaded(mapped, localize=False, ends_ns=None)
+    slam = loaded(mapped, localize=False, last=mapped.last_pose)
     here, other = there(25)[-1], StereoRoom(seed=77)
     assert slam.process(ROOM.frame(30, here))[0].tracked
     monkeypatch.setattr(
@@ -139,7 +139,7 @@ def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkey
 
 def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
     mapped._front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
-    slam = loaded(mapped, localize=False, ends_ns=None)
+    slam = loaded(mapped, localize=False, last=mapped.last_pose)
     stamps = [k.stamp_ns for k in slam.map.keyframes]
     assert stamps == [k.stamp_ns for k in mapped.map.keyframes]
     result = slam.process(ROOM.frame(30, there(25)[-1]))[0]
