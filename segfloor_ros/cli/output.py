@@ -140,7 +140,8 @@ def finish_run(
             problems.append(f'there is no report: {str(error) or type(error).__name__}')
     for line in (*problems, *remarks):
         print_error(line)
-    if status and not problems and folder.path != out:
-        print_error(f'{out}: the whole result there stays; what is mapped is in {folder.path}')
+    if status and not problems:
+        kept = f'; the whole result in {out} stays' if folder.path != out else ''
+        print_error(f'cut short: what is mapped is in {folder.path}{kept}')
     if status or problems:
         raise typer.Exit(status or 1)

@@ -88,7 +88,7 @@ def test_an_interrupt_keeps_what_is_mapped_and_no_whole_result_goes(drive, tmp_p
         process = run(drive, '--out', out, '--save-map', saved)
         errors = stop_midway(process, tmp_path, number)
         assert process.returncode == 128 + number
-        assert f'what is mapped is in {out}.interrupted' in errors
+        assert f'what is mapped is in {out}.interrupted; the whole result in {out} stays' in errors
         assert summary_of(tmp_path / 'out.interrupted')['interrupted'] is True
         assert {path: path.read_bytes() for path in before} == before
     names = {path.name for path in tmp_path.iterdir()}

@@ -176,6 +176,43 @@ def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None
     assert not any(Path(f'/proc/{pid}').exists() for pid in nodes.values())
 
 
+def test_a_killed_replay_leaves_no_node_and_no_file(drive, tmp_path, monkeypatch) -> None:
+    (temporary := tmp_path / 'temporary').mkdir()
+    monkeypatch.setenv('TMPDIR', str(temporary))
+    replay = start('replay', drive, '--out', tmp_path / 'out', '--rate', 0.2)
+    while not list(tmp_path.rglob('made/floor_masks/*.png')) and replay.poll() is None:
+        time.sleep(0.05)
+    nodes = node_processes(replay)
+    assert len(nodes) == 5
+    replay.kill()
+    replay.communicate()
+    end_s = time.monotonic() + 30
+
+    def left() -> list[object]:
+        running = [pid for pid in nodes.values() if Path(f'/proc/{pid}').exists()]
+        return [*running, *temporary.iterdir(), *tmp_path.glob('.*'), *tmp_path.glob('out')]
+
+    while left() and time.monotonic() < end_s:
+        time.sleep(0.05)
+    assert left() == []
+
+
+def test_a_node_that_dies_midway_keeps_what_is_mapped(drive, tmp_path) -> None:
+    out = tmp_path / 'out'
+    replay = start('replay', drive, '--out', out, '--rate', 0.2)
+    while len(list(tmp_path.rglob('made/floor_masks/*.png'))) < 2 and replay.poll() is None:
+        time.sleep(0.05)
+    time.sleep(1.0)  # the map of them arrives
+    os.kill(node_processes(replay)['floor_segmentation'], signal.SIGKILL)
+    _, errors = replay.communicate(timeout=60)
+    assert replay.returncode == 1
+    assert 'node floor_segmentation died (signal SIGKILL)' in errors
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['interrupted'] is True
+    assert summary['map_updates'] >= 1
+    assert (load_map(out / 'map.yaml').cells == FREE).any()
+
+
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [

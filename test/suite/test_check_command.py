@@ -167,3 +167,56 @@ def test_what_nobody_foresaw_fails_one_recording_only(tmp_path, monkeypatch):
     entry = Entry('a', str(tmp_path), RESULTS)
     outcome = do_job(Job(entry, '', str(tmp_path / 'cache'), reuse=False))
     assert outcome.problem.startswith('ZeroDivisionError: ')
+
+
+def test_a_recording_is_not_taken_for_its_results(room, tmp_path, monkeypatch):
+    aisle = tmp_path / 'aisle'
+    shutil.copytree(room, aisle)
+    before = digest_of(aisle)
+    suite = suite_of(tmp_path, room, 'recordings:\n  - input: aisle\n')
+    monkeypatch.chdir(tmp_path)
+    for out in ('.', 'aisle', 'aisle/out'):
+        done = check(suite, '--out', out)
+        assert done.returncode == 2
+        assert 'is, holds or lies in' in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+    assert digest_of(aisle) == before
+    # Nor is a folder of somebody else by the name of a recording.
+    (tmp_path / 'out' / 'aisle' / 'floor_masks').mkdir(parents=True)
+    (tmp_path / 'out' / 'aisle' / 'floor_masks' / 'mine').write_text('mine')
+    done = check(suite, '--out', 'out')
+    assert done.returncode == 2
+    assert 'out/aisle: holds floor_masks, which segfloor did not write' in done.stderr
+    assert (tmp_path / 'out' / 'aisle' / 'floor_masks' / 'mine').read_text() == 'mine'
+
+
+def test_a_recording_that_fails_keeps_the_results_of_last_time(room, tmp_path):
+    out = tmp_path / 'out'
+    recording = tmp_path / 'good'
+    shutil.copytree(room, recording)
+    suite = suite_of(tmp_path, recording, good_alone())
+    done = check(suite, '--out', out, '--no-cache')
+    assert done.returncode == 0, done.stderr
+    before = {path: path.read_bytes() for path in (out / 'good').rglob('*') if path.is_file()}
+    (recording / 'calib.txt').rename(tmp_path / 'calib.txt')
+    done = check(suite, '--out', out, '--no-cache')
+    assert done.returncode == 1
+    after = {path: path.read_bytes() for path in (out / 'good').rglob('*') if path.is_file()}
+    marker = out / 'good' / '.segfloor_result'
+    assert after.pop(out / 'good' / 'failed.txt').startswith(b'good') is False
+    assert {**after, marker: b''} == {**before, marker: b''}
+    assert 'good/report.html' not in (out / 'suite.html').read_text()
+    # It is mapped again, though what is there is of the same job.
+    (tmp_path / 'calib.txt').rename(recording / 'calib.txt')
+    done = check(suite, '--out', out, '--no-cache', '--resume')
+    assert done.returncode == 0, done.stderr
+    assert 'good: ok (kept)' not in done.stdout
+    assert not (out / 'good' / 'failed.txt').exists()
+    # A link in place of a file is not written through.
+    (out / 'good' / 'measured.json').unlink()
+    (tmp_path / 'mine.json').write_text('mine')
+    (out / 'good' / 'measured.json').symlink_to(tmp_path / 'mine.json')
+    done = check(suite, '--out', out, '--no-cache')
+    assert done.returncode == 2
+    assert 'holds measured.json' in done.stderr
+    assert (tmp_path / 'mine.json').read_text() == 'mine'
