@@ -66,9 +66,6 @@ SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
     'deblocking': Mechanism({'camera.calibration.rectification.deblocked': _first}),
     'fusion of points': Mechanism({'slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
-    'triangulation by motion': Mechanism(
-        {'slam.mapping.keyframe_mapping.LocalMapper._partners': lambda *_: []}
-    ),
     'place keyframes in the local map': Mechanism(
         {'slam.tracking.map_tracking.views_near': _no_rows}
     ),

@@ -55,11 +55,6 @@ class StereoSlamSettings(StageSettings):
         'A motion faster than this is implausible and ends tracking.',
         within=(0.1, 100.0),
     )
-    level_ground: bool = setting(
-        False,
-        'The base stays on one level plane: no ramps, no sills, no second floor. Takes away the '
-        'drift in height, pitch and roll.',
-    )
     detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
     mask_dilation_px: int = setting(
         5,

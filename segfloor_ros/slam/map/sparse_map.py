@@ -159,23 +159,6 @@ class SparseMap:
         keyframe.point_id[new_rows] = self._new_points(new_xyz_world, keyframe.index)
         self._link(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT), patches)
 
-    def add_points_between(
-        self,
-        keyframe: KeyframeRecord,
-        rows: NDArray[np.intp],
-        other: KeyframeRecord,
-        other_rows: NDArray[np.intp],
-        xyz_world: Array,
-        patches: NDArray[np.uint8],
-    ) -> None:
-        """Add points (N, 3) that two keyframes of the map see with their features `rows`,
-        `other_rows` (N,). patches: as in `add_keyframe`, of the first.
-        """
-        ids = self._new_points(xyz_world, keyframe.index)
-        keyframe.point_id[rows] = other.point_id[other_rows] = ids
-        self._link(keyframe, rows, patches)
-        self._add_edges(other, other_rows)
-
     def _new_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
         return self._points.add(len(xyz_world), xyz_world=xyz_world, born=born, seen_last=born)
 

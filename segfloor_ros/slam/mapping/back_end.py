@@ -23,7 +23,6 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
 from segfloor_ros.slam.mapping.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
-from segfloor_ros.slam.mapping.level_ground import LevelGround
 from segfloor_ros.slam.places.loop_closing import (
     Closing,
     apply_closing,
@@ -64,7 +63,6 @@ class BackEnd:
         self._local = AdjustmentRunner(background)
         self._global = AdjustmentRunner(background)
         self._background = background
-        self._is_level = settings.level_ground
         self._is_closing = False
         self._up_world: Up | None = None
 
@@ -91,8 +89,6 @@ class BackEnd:
         already.
         """
         self._up_world = up_world
-        if self._is_level and mount is not None:
-            self.mapper.ground = LevelGround(mount.T_base_left)
         self.places.add(keyframe)
         if self._join_known(keyframe, images, mount):
             return True
@@ -206,7 +202,7 @@ class BackEnd:
             return False
         # It would bring back the map from before the loop.
         self._global.drop()
-        closing = plan_closing(self._map, matches, self.mapper.ground)
+        closing = plan_closing(self._map, matches)
         self._is_closing = True
         self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
         return True
@@ -216,9 +212,7 @@ class BackEnd:
         if not apply_closing(self._camera, self._map, closing, result):
             return
         self.loop_count += 1
-        copied = copy_map(
-            self._map, self.mapper.offset.estimate, self._up_world, self.mapper.ground
-        )
+        copied = copy_map(self._map, self.mapper.offset.estimate, self._up_world)
         self._global.submit(
             partial(solve_global, self._camera, copied, self._global.is_wanted()),
             partial(apply_global, self._map),

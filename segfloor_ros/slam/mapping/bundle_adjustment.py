@@ -30,7 +30,6 @@ from segfloor_ros.slam.map.residuals import (
 )
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.disparity_offset import NO_OFFSET, OffsetEstimate
-from segfloor_ros.slam.mapping.level_ground import LevelGround
 from segfloor_ros.slam.mapping.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.places.loop_closing import move_keyframes
 from segfloor_ros.slam.sensors.motion_links import Factor, cost, factors_of, with_factors
@@ -56,7 +55,7 @@ class BundleProblem:
     T_camera_world: (K, 4, 4), the first `num_free` of them move. points_world: (P, 3).
     Observation i (N in total) is of point `point[i]` in keyframe `keyframe[i]`; a pair occurs at
     most once. offset: what was known before of the error that all disparities share. factors: what
-    wheels and an accelerometer measured of keyframes. ground: what the base is known to stay on.
+    wheels and an accelerometer measured of keyframes.
     """
 
     T_camera_world: Array
@@ -67,7 +66,6 @@ class BundleProblem:
     observations: Observations
     offset: OffsetEstimate = NO_OFFSET
     factors: tuple[Factor, ...] = ()
-    ground: LevelGround | None = None
 
 
 @dataclass(frozen=True)
@@ -163,8 +161,6 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimat
     total = huber_cost(chi2, problem.observations.chi2_limit)
     total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
     total += sum(cost(factor, problem.T_camera_world) for factor in problem.factors)
-    if problem.ground is not None:
-        total += problem.ground.cost(problem.T_camera_world)
     return _State(points, residual, chi2, front, total)
 
 
@@ -186,8 +182,6 @@ def _linearise(
     system = normal_equations(camera, at).with_prior(
         prior.information, problem.offset.value_px - prior.value_px
     )
-    if problem.ground is not None:
-        system = problem.ground.added_to(system, problem.T_camera_world)
     return with_factors(system, problem.T_camera_world, problem.factors)
 
 
@@ -219,7 +213,6 @@ class MapCopy:
     records: list[KeyframeRecord]
     offset: OffsetEstimate
     up_world: Up | None
-    ground: LevelGround | None
 
 
 @dataclass(frozen=True)
@@ -239,7 +232,6 @@ def copy_map(
     sparse_map: SparseMap,
     offset: OffsetEstimate,
     up_world: Up | None,
-    ground: LevelGround | None,
 ) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
@@ -256,7 +248,6 @@ def copy_map(
         keyframes,
         offset,
         up_world,
-        ground,
     )
 
 
@@ -288,7 +279,6 @@ def solve_global(
         _gather(copied, keyframe, row),
         OffsetEstimate(copied.offset.value_px, KNOWN_OFFSET),
         factors_of(copied.records, slot, copied.up_world),
-        copied.ground,
     )
     adjusted = adjust(camera, problem, STEPS, is_wanted)
     return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])

@@ -21,8 +21,6 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.mapping.disparity_offset import DisparityOffset
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates, retire_redundant
-from segfloor_ros.slam.mapping.level_ground import LevelGround
-from segfloor_ros.slam.mapping.triangulation import triangulate_between
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.sensors.motion_links import factors_of
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -90,7 +88,6 @@ class LocalMapper:
 
     def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
         self._camera = camera
-        self.ground: LevelGround | None = None
         self.offset = DisparityOffset(settings.disparity_offset_sigma_px, 1.0 / LOCAL_KEYFRAMES)
 
     def measure_stereo(
@@ -116,18 +113,12 @@ class LocalMapper:
     def insert(
         self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
     ) -> None:
-        """Add a keyframe, new points from its stereo features, and from the parallax to others
-        where the right image shows none; points that turn out to be known are fused with the older
-        ones.
+        """Add a keyframe and new points from its stereo features; points that turn out to be known
+        are fused with the older ones.
         """
         keyframe.point_id[self._contradicted(sparse_map, keyframe)] = NO_POINT
         rows, points = self._new_points(keyframe)
         sparse_map.add_keyframe(keyframe, patches, rows, points)
-        for other in self._partners(sparse_map, keyframe):
-            new = triangulate_between(self._camera, keyframe, other, self.offset.value_px)
-            sparse_map.add_points_between(
-                keyframe, new.rows, other, new.other_rows, new.xyz_world, patches
-            )
         fuse_duplicates(self._camera, sparse_map, keyframe)
         keyframe.links = self._links(sparse_map, keyframe)
 
@@ -153,18 +144,6 @@ class LocalMapper:
         measured = keyframe.observations.uvd_px[rows, 2] - self.offset.value_px
         limit = np.maximum(DISPARITY_REACH_PX, CONTRADICTED_SHARE * expected)
         return rows[np.abs(measured - expected) > limit]
-
-    def _partners(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> list[KeyframeRecord]:
-        """Return the covisible keyframes with which rays cross best: the farthest away of them, and
-        one in the middle.
-        """
-        own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        order, shared = sparse_map.covisible(own)
-        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
-        views = [sparse_map.keyframes[k] for k in near[:LOCAL_KEYFRAMES]]
-        centre = keyframe.T_world_camera[:3, 3]
-        views.sort(key=lambda k: float(np.linalg.norm(k.T_world_camera[:3, 3] - centre)))
-        return [views[-1], views[len(views) // 2]][: len(views)] if views else []
 
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
@@ -208,7 +187,6 @@ class LocalMapper:
             _gather(sparse_map, edge_keyframe, edge_row),
             self.offset.estimate,
             factors_of(sparse_map.keyframes, slot, up_world),
-            self.ground,
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 

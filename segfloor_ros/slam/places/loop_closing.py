@@ -22,7 +22,6 @@ from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
 from segfloor_ros.slam.map.records import LoopEdge, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates
-from segfloor_ros.slam.mapping.level_ground import LevelGround
 from segfloor_ros.slam.results import NO_POINT
 
 FUSED_KEYFRAMES = 10
@@ -52,9 +51,7 @@ class Closing:
     graph: PoseGraph
 
 
-def plan_closing(
-    sparse_map: SparseMap, matches: list[Match], ground: LevelGround | None = None
-) -> Closing:
+def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     """Copy the pose graph out of the map, with a loop from each keyframe that sees the place."""
     keyframes = sparse_map.keyframes
     poses = np.stack([k.T_camera_world for k in keyframes])
@@ -79,7 +76,6 @@ def plan_closing(
         sigma,
         # What is new is expected to pull; what was found before must go on to fit.
         (np.arange(len(sigma)) >= len(i)) & (np.arange(len(sigma)) < len(sigma) - len(new)),
-        ground,
     )
     return Closing(matches, new, graph)
 
@@ -163,7 +159,7 @@ def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np
 class PoseGraph:
     """T_camera_world: (K, 4, 4). Edge m (M in total) says that camera i[m] sees camera j[m] at
     T_i_j[m] (M, 4, 4), to sigma (M, 6) in metres and radians. is_robust: (M,) which edges
-    may be wrong. fixed: (K,) which cameras stay. ground: what the base is known to stay on.
+    may be wrong. fixed: (K,) which cameras stay.
     """
 
     T_camera_world: Array
@@ -173,7 +169,6 @@ class PoseGraph:
     T_i_j: Array
     sigma: Array
     is_robust: NDArray[np.bool_]
-    ground: LevelGround | None = None
 
 
 def optimise(graph: PoseGraph) -> tuple[Array, Array]:
@@ -212,7 +207,7 @@ def _robust(graph: PoseGraph, error: Array, poses: Array) -> tuple[Array, float]
     share = LOOP_KERNEL / (LOOP_KERNEL + chi2)
     weight = np.where(graph.is_robust, share**2, 1.0)
     cost = float(np.where(graph.is_robust, share * chi2, chi2).sum())
-    return weight, cost if graph.ground is None else cost + graph.ground.cost(poses)
+    return weight, cost
 
 
 def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping: float) -> Array:
@@ -229,13 +224,6 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
         (blocks, columns, 2 * np.arange(edges + 1)), shape=(6 * edges, 6 * count)
     ).tocsr()
     residual = (np.sqrt(weight)[:, None] * error).ravel()
-    if graph.ground is not None:
-        of_ground, J_ground = graph.ground.errors(poses)
-        rows = sparse.bsr_array(
-            (J_ground, np.arange(count), np.arange(count + 1)), shape=(3 * count, 6 * count)
-        )
-        J = sparse.csr_array(sparse.vstack([J, rows]))
-        residual = np.append(residual, of_ground)
     moving = np.flatnonzero(np.repeat(~graph.fixed, 6))
     J = J[:, moving]
     H = (J.T @ J).tocsc()

@@ -31,7 +31,7 @@ def errors_m(sparse_map):
 
 
 def adjust(sparse_map, meanwhile=lambda: None):
-    copied = copy_map(sparse_map, NO_OFFSET, None, None)
+    copied = copy_map(sparse_map, NO_OFFSET, None)
     result = solve_global(CAMERA, copied, lambda: True)
     meanwhile()
     apply_global(sparse_map, result)
@@ -85,6 +85,6 @@ def test_what_moved_meanwhile_keeps_its_move(bent):
 
 def test_an_adjustment_that_is_no_longer_wanted_changes_nothing(bent):
     before = np.stack([k.T_camera_world for k in bent.keyframes])
-    copied = copy_map(bent, NO_OFFSET, None, None)
+    copied = copy_map(bent, NO_OFFSET, None)
     apply_global(bent, solve_global(CAMERA, copied, lambda: False))
     np.testing.assert_array_equal(before, np.stack([k.T_camera_world for k in bent.keyframes]))

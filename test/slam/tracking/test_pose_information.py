@@ -14,6 +14,14 @@ from segfloor_ros.slam.tracking.pose import PoseEstimate
 from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer
 
 RNG = np.random.default_rng(3)
+START = RNG.bit_generator.state
+
+
+@pytest.fixture(autouse=True)
+def the_same_noise_whatever_ran_before():
+    RNG.bit_generator.state = START
+
+
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
 MIDDLE = np.array([CAMERA.cx, CAMERA.cy])
 
