@@ -50,6 +50,17 @@ def printable(text: str) -> str:
 
 
 @contextmanager
+def about(name: str) -> Iterator[None]:
+    """Have errors of the block say what they are about."""
+    try:
+        yield
+    except SegfloorError as error:
+        if name in str(error):
+            raise
+        raise type(error)(f'{name}: {error}') from error
+
+
+@contextmanager
 def os_errors(what: str, advice: str = '') -> Iterator[None]:
     """Turn an error of the operating system into one line: what is wrong, why, what to do. Raises
     InputError.

@@ -195,7 +195,8 @@ class _Running:
             return TRACEBACK
         if not all(line.startswith('segfloor: ') for line in lines):
             return FOREIGN
-        if code and not self._names_input(lines[-1] if lines else ''):
+        is_verdict = code == 1 and KINDS[self.case.kind].command[0] == 'check'
+        if code and not is_verdict and not self._names_input(lines[-1] if lines else ''):
             return UNNAMED
         return (OK, NO_MAP, REFUSED)[code]
 

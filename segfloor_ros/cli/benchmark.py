@@ -19,6 +19,7 @@ from segfloor_ros.benchmark.stages import (
 )
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options
+from segfloor_ros.cli.options import within
 from segfloor_ros.cli.output import announcing, console, figure_table, progress_bar
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError
@@ -32,11 +33,13 @@ def benchmark(
         str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
     ] = ','.join(map(str, DEFAULT.sizes)),
     frames: Annotated[
-        int, typer.Option(min=2, help='Generated image pairs for all stages.')
+        int, typer.Option(callback=within(2), help='Generated image pairs for all stages.')
     ] = DEFAULT.frames,
-    seed: Annotated[int, typer.Option(min=0, help='Of the generated data.')] = DEFAULT.seed,
+    seed: Annotated[
+        int, typer.Option(callback=within(0), help='Of the generated data.')
+    ] = DEFAULT.seed,
     threads: Annotated[
-        int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
+        int, typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.')
     ] = DEFAULT.threads,
     nodes: Annotated[
         str | None,
@@ -47,7 +50,7 @@ def benchmark(
         ),
     ] = None,
     rate: Annotated[
-        float, typer.Option(min=0.01, help='Speed of --nodes against real time.')
+        float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
     ] = 1.0,
     json_file: Annotated[
         Path | None,

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
-from segfloor_ros.cli.options import finite
+from segfloor_ros.cli.options import within
 from segfloor_ros.cli.output import console, progress_bar, value_table
 from segfloor_ros.errors import SettingsError
 
@@ -19,7 +19,8 @@ def calibrate(
         Path, typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.')
     ],
     square_m: Annotated[
-        float, typer.Option('--square', callback=finite, help='Side of a square in metres.')
+        float,
+        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
     ],
     board: Annotated[
         str, typer.Option(help='Inner corners along the long and the short side.')

@@ -14,6 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from segfloor_ros.cli.options import within
 from segfloor_ros.cli.output import console, figure_table, print_error
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.evaluation.truth import Pose2d
@@ -39,7 +40,10 @@ def check_suite(
     suite: Annotated[Path, typer.Argument(metavar='SUITE.yaml', help='Recordings and bounds.')],
     out: Annotated[Path, typer.Option('--out', help='Folder for the results.')],
     jobs: Annotated[
-        int, typer.Option(min=1, help='Recordings at a time, each in a process of this machine.')
+        int,
+        typer.Option(
+            callback=within(1), help='Recordings at a time, each in a process of this machine.'
+        ),
     ] = 1,
     scheduler: Annotated[
         str, typer.Option(help='Address of a Dask scheduler whose workers map the recordings.')

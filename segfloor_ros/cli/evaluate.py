@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli.options import finite
+from segfloor_ros.cli.options import within
 from segfloor_ros.cli.output import console, figure_table, value_table
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.alignment import find_alignment
@@ -27,7 +27,7 @@ from segfloor_ros.evaluation.raster import RoadMapPlan, Spread, from_frame
 from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
 from segfloor_ros.files.tables import number, read_table
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
-from segfloor_ros.trajectory import TUM_COLUMNS
+from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
 
@@ -54,24 +54,27 @@ def evaluate_map(
     ] = 'none',
     overlay: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
     nodes: Annotated[
-        int, typer.Option(min=0, help='Nodes of a road map; 0: one per 1.5 m², 20 to 400.')
+        int,
+        typer.Option(
+            callback=within(0, 10_000), help='Nodes of a road map; 0: one per 1.5 m², 20 to 400.'
+        ),
     ] = 0,
     min_distance: Annotated[
         float,
-        typer.Option(min=0.0, callback=finite, help='Between nodes of a road map [m].'),
+        typer.Option(callback=within(0.0), help='Between nodes of a road map [m].'),
     ] = 0.25,
-    repetitions: Annotated[int, typer.Option(min=1, help='Road maps to average.')] = 30,
-    seed: Annotated[int, typer.Option(min=0, help='Of the random nodes.')] = 0,
+    repetitions: Annotated[
+        int, typer.Option(callback=within(1), help='Road maps to average.')
+    ] = 30,
+    seed: Annotated[int, typer.Option(callback=within(0), help='Of the random nodes.')] = 0,
     sight: Annotated[
         float,
-        typer.Option(min=0.1, callback=finite, help='How far the camera counts as seeing [m].'),
+        typer.Option(callback=within(0.1, 1000.0), help='How far the camera counts as seeing [m].'),
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
         float | None,
         typer.Option(
-            min=1.0,
-            max=360.0,
-            callback=finite,
+            callback=within(1.0, 360.0),
             help='Horizontal field of view [deg]; else from the scene.',
         ),
     ] = None,
@@ -104,7 +107,7 @@ def evaluate_trajectory(
     ],
     frames: Annotated[
         int | None,
-        typer.Option(min=1, help='Frames of the recording; else one per true pose.'),
+        typer.Option(callback=within(1), help='Frames of the recording; else one per true pose.'),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
     as_json: JsonOption = False,
@@ -183,6 +186,8 @@ def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> P
         return find_alignment(estimate, truth.grid, truth.start_pose)
     try:
         x, y, yaw = (number(part.strip()) for part in align.split(','))
+        if max(map(abs, (x, y, yaw))) > FARTHEST:
+            raise ValueError('further than any map')
     except ValueError:
         raise SettingsError(
             f'--align {align}: expected none, found or X,Y,YAW in metres and radians'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -12,11 +13,20 @@ from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError
 
 
-def finite(parameter: typer.CallbackParam, value: float | None) -> float | None:
-    """Return a number of an option; `nan` is within any bounds. Raises SettingsError."""
-    if value is not None and not math.isfinite(value):
-        raise SettingsError(f'--{parameter.name} {value}: expected a finite number')
-    return value
+def within(
+    low: float, high: float = math.inf
+) -> Callable[[typer.CallbackParam, float | None], float | None]:
+    """Return what checks a finite number of an option, in one line; `nan` would pass the bounds of
+    typer. It raises SettingsError.
+    """
+
+    def check(parameter: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None and not (low <= value <= high and math.isfinite(value)):
+            words = f'at least {low:g}' if high == math.inf else f'{low:g} to {high:g}'
+            raise SettingsError(f'{parameter.opts[0]} {value}: expected {words}')
+        return value
+
+    return check
 
 
 Input = Annotated[

@@ -7,7 +7,9 @@ from typing import Annotated
 import typer
 
 from segfloor_ros.cli import options
+from segfloor_ros.cli.options import within
 from segfloor_ros.cli.output import console, progress_bar
+from segfloor_ros.errors import about
 
 
 def simulate(
@@ -23,13 +25,14 @@ def simulate(
         typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
     ] = None,
     floor_every: Annotated[
-        int, typer.Option(min=0, help='A true floor mask every so many frames; 0: none.')
+        int,
+        typer.Option(callback=within(0), help='A true floor mask every so many frames; 0: none.'),
     ] = 10,
     disparity: Annotated[
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
     ] = False,
     supersampling: Annotated[
-        int, typer.Option(min=1, max=4, help='Render so many times finer than the image.')
+        int, typer.Option(callback=within(1, 4), help='Render so many times finer than the image.')
     ] = 1,
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
@@ -41,6 +44,7 @@ def simulate(
     described = open_scene(scene, set_values or ())
     options = RecordingOptions(floor_every, disparity)
     with (
+        about(scene),
         Simulation(described, supersampling) as simulation,
         progress_bar('rendering', simulation.frame_count) as progress,
     ):

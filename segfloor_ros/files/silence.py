@@ -6,6 +6,7 @@ import io
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -22,6 +23,8 @@ def own_standard_error() -> None:
     if _standard_error is None:
         _standard_error = os.dup(2)
         sys.stderr = open(_standard_error, 'w', buffering=1, errors='backslashreplace')  # noqa: SIM115
+    if not sys.warnoptions:
+        warnings.simplefilter('ignore')  # of NumPy, about numbers of the input
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors='backslashreplace')  # names of files may be no text
 

@@ -13,6 +13,8 @@ from segfloor_ros.simulation.scene import Route
 
 STEP_M = 0.0025
 MIN_SPEED_M_S = 0.02
+LONGEST_M, MOST_FRAMES = 1e5, 10**6
+"""Of a drive: a day of a robot."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ def plan_drive(path: Route, rate_hz: float) -> Drive:
     heading = np.arctan2(step[:, 1], step[:, 0])
     yaw = np.unwrap(np.append(heading, heading[-1]))
     times_s = _times(path, distance_m, yaw)
+    if times_s[-1] * rate_hz > MOST_FRAMES:
+        raise InputError(f'the drive takes {times_s[-1]:.3g} s, which are too many images')
     frame_times_s = np.arange(int(times_s[-1] * rate_hz) + 1) / rate_hz
     dense = Drive(times_s, np.column_stack([line, yaw]))
     return Drive(frame_times_s, dense.at(frame_times_s))
@@ -61,6 +65,8 @@ def smooth_line(path: Route) -> Array:
     if len(corners) < 2:
         raise InputError('a path needs at least two different waypoints')
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+    if along[-1] > LONGEST_M:
+        raise InputError(f'the path is {along[-1]:.3g} m long, at most {LONGEST_M:g} are driven')
     wanted = np.linspace(0.0, along[-1], max(2, round(along[-1] / STEP_M) + 1))
     line = np.stack([np.interp(wanted, along, column) for column in corners.T], axis=1)
     return _smooth(line, path.smoothing_m / STEP_M)

@@ -29,6 +29,19 @@ from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene
 
 EXPECTED = 'names and values, e.g. `walls:`'
+FARTHEST_M = 1e4
+RANGES = {
+    'seed': (0, 2**32 - 1), 'posters': (0, 100), 'width': (16, 4096), 'height': (16, 4096),
+    'fov_x_deg': (1, 170), 'baseline_m': (1e-3, 10), 'exposure_s': (0, 1), 'rate_hz': (0, 2000),
+    'noise_sigma': (0, 255), 'speed_m_s': (0.01, 100), 'acceleration_m_s2': (0.01, 100),
+    'turn_rate_deg_s': (0.1, 1e4), 'smoothing_m': (0, 100), 'resolution_m': (0.005, 1),
+    'size': (1e-4, 1000), 'radius_m': (1e-4, 1000), 'height_m': (0, 100), 'width_m': (1e-4, 1000),
+    'thickness_m': (1e-4, 100), 'step_px': (1e-6, 1000), 'max_m': (0, FARTHEST_M),
+    'track_m': (0.01, 100), 'frequency_hz': (0.01, 100), 'noise_m': (0, 10), 'noise_px': (0, 1000),
+    'hole_share': (0, 1), 'raster_phase': (0, 1),
+    'right_gain': (0, 100), 'ambient': (0, 1), 'reflectance': (0, 1),
+}  # fmt: skip
+"""Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
 
 WALL_HEIGHT_M = 2.5
 FURNITURE_HEIGHTS_M = (0.4, 0.8, 1.2, 1.8)
@@ -116,7 +129,21 @@ def _build_entry(kind: Any, value: Any, where: str) -> Any:
     missing = [name for name in required if name not in value]
     if missing:
         raise InputError(f'{where}: {missing[0]} is missing')
-    return kind(**{name: _build(types[name], v, f'{where}, {name}') for name, v in value.items()})
+    built = {name: _build(types[name], v, f'{where}, {name}') for name, v in value.items()}
+    for name, found in built.items():
+        _check_range(name, found, f'{where}, {name}')
+    return kind(**built)
+
+
+def _check_range(name: str, value: Any, where: str) -> None:
+    """Raise InputError for a number, or one of a tuple, that no world has."""
+    if isinstance(value, tuple):
+        for item in value:
+            _check_range(name, item, where)
+    elif isinstance(value, (int, float)):
+        low, high = RANGES.get(name, (-FARTHEST_M, FARTHEST_M))
+        if not low <= value <= high:
+            raise InputError(f'{where}: {value:g} is not within {low:g} to {high:g}')
 
 
 def _build_tuple(kinds: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:

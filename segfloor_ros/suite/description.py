@@ -10,6 +10,7 @@ from typing import Any
 
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.files.tables import number as finite_number
 from segfloor_ros.files.yaml_files import Key, MarkedYaml, read_marked_yaml
 from segfloor_ros.settings import suggestion
 from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
@@ -176,8 +177,12 @@ class _Reader:
             better = MEASURES[name].better
             if isinstance(wanted, dict):
                 limits = _mapping(self._document, key, wanted, ('min', 'max'))
-                least = self._limit((*key, 'min'), limits.get('min', -math.inf))
-                greatest = self._limit((*key, 'max'), limits.get('max', math.inf))
+                least, greatest = (
+                    self._limit((*key, end), limits[end]) if end in limits else default
+                    for end, default in (('min', -math.inf), ('max', math.inf))
+                )
+                if least > greatest:
+                    raise self._document.error(key, f'{name}: min {least:g} > max {greatest:g}')
                 bounds.append(Bound(name, least, greatest))
             elif better == HIGHER:
                 bounds.append(Bound(name, least=self._limit(key, wanted)))
@@ -211,8 +216,8 @@ class _Reader:
         try:
             if isinstance(value, bool):
                 raise ValueError
-            return float(value)
-        except (TypeError, ValueError):
+            return finite_number(str(value))
+        except ValueError:
             raise self._document.error(key, f'{key[-1]}: {value!r} is not a number') from None
 
     def _value(self, name: str) -> Any:

@@ -89,8 +89,9 @@ def find_recordings(pattern: str) -> dict[str, str]:
     """Return paths or URLs by short name: the one given, or all that a pattern matches. Raises
     InputError where there is none.
     """
-    if not any(c in without_credentials(pattern) for c in WILDCARDS):
-        if not is_url(pattern) and not Path(pattern).exists():
+    is_there = not is_url(pattern) and Path(pattern).exists()
+    if is_there or not any(c in without_credentials(pattern) for c in WILDCARDS):
+        if not is_url(pattern) and not is_there:
             raise InputError(f'{pattern}: no such recording')
         return {_stem(pattern): pattern}
     if is_url(pattern):

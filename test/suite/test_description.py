@@ -12,7 +12,7 @@ from segfloor_ros.suite.measures import Bound, Slack
 
 
 def write(folder, text):
-    for name in ('a', 'b', 'other'):
+    for name in ('a', 'b', 'other', 'o[red]x'):
         (folder / 'bags' / name).mkdir(parents=True, exist_ok=True)
     (folder / 'robot.yaml').write_text('stereo_slam:\n  ros__parameters:\n    num_features: 700\n')
     path = folder / 'nightly.yaml'
@@ -60,6 +60,13 @@ def test_a_suite_is_read_with_its_defaults(tmp_path):
     assert (simulated.name, simulated.input) == ('corridor2-4', 'corridor2')
     assert simulated.scene_assignments == ('camera.width=160', 'seed=4')
     assert all(entry.params == str(tmp_path / 'robot.yaml') for entry in suite.entries)
+
+
+def test_a_folder_whose_name_is_a_pattern_is_that_folder(tmp_path):
+    suite = read_suite(write(tmp_path, "recordings:\n  - input: 'bags/o[red]x'\n    name: 1:30\n"))
+    assert [(entry.name, entry.input) for entry in suite.entries] == [
+        ('1-30', str(tmp_path / 'bags' / 'o[red]x'))
+    ]
 
 
 def test_a_pattern_is_all_it_matches(tmp_path):
@@ -120,6 +127,20 @@ def test_drives_in_order_each_continue_the_map_of_the_last(tmp_path):
             'b is not mapped by mode run',
         ),
         ('recordings:\n  - input: [\n', 3, ''),
+        ('recordings:\n  - simulate: corridor2\n    seed: -1\n', 2, 'seed: -1 is not within 0'),
+        ('recordings:\n  - input: bags/a\n    timeout_s: .inf\n', 3, 'inf is not a number'),
+        ('recordings:\n  - input: bags/a\n    rate: .nan\n', 3, 'nan is not a number'),
+        (
+            'recordings:\n  - input: bags/a\n    expect: {loops: {min: 3, max: 1}}\n',
+            3,
+            'min 3 > max 1',
+        ),
+        ('recordings:\n  - input: bags/a\n    expect: {tracked_percent: .nan}\n', 3, 'nan is not'),
+        (
+            'recordings:\n  - input: bags/a\n    expect: {tracked_percent: 1:30}\n',
+            3,
+            "'1:30' is not",
+        ),
         ('', 1, 'expected name, defaults, recordings'),
     ],
 )
