@@ -210,6 +210,15 @@ def test_of_two_topics_the_one_that_is_set_is_taken(tmp_path: Path) -> None:
         opened(recording, imu_topic='/imu/other')
 
 
+@pytest.mark.parametrize('stamp_ns', [0, 10**18], ids=['since start', 'since 1970'])
+def test_an_imu_of_another_clock_is_refused_in_a_bag_too(tmp_path: Path, stamp_ns: int) -> None:
+    samples = [imu_message(stamp_ns + i * MS, (0, -9.81, 0), 'camera') for i in range(3)]
+    recording = bag(tmp_path, *samples)
+    with pytest.raises(InputError, match=r'/imu/data: its stamps, .* --ignore imu'):
+        opened(recording)
+    assert [sensor.used for sensor in opened(recording, ignore='imu').sensors] == [False]
+
+
 def test_the_imu_of_a_bag_is_turned_by_tf(tmp_path: Path) -> None:
     source = opened(bag(tmp_path, tf_message(), imu_message(100 * MS, (1, 2, 9.81), 'imu_link')))
     (sample,) = measured(source)

@@ -113,7 +113,7 @@ def is_upright(accel_m_s2: Array) -> bool:
 def check_shared_clock(sensors: Sequence[RecordedSensor], stamps_ns: Sequence[int]) -> None:
     """Raise InputError when a sensor that is used measured at no time of the images."""
     for sensor in sensors:
-        times = [m.stamp_ns for m in sensor.read()] if sensor.used else []
+        times = sorted(m.stamp_ns for m in sensor.read()) if sensor.used else []
         if times and (times[-1] < stamps_ns[0] or times[0] > stamps_ns[-1]):
             raise InputError(
                 f'{sensor.where}: its stamps, {times[0] / 1e9:.3f} to {times[-1] / 1e9:.3f} s, do '
