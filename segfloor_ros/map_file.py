@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.files.results import replacing
-from segfloor_ros.files.whole import json_object, read_bytes
+from segfloor_ros.files.whole import check_file, json_object
 
 FORMAT = 'segfloor map'
 VERSION = 1
 HEADER = 'header.json'
 COMPRESSION_LEVEL = 3
 
-MAX_BYTES = 1 << 32
 MAX_RATIO, SMALL = 20, 1 << 24
 """A map unpacks to at most so many times its size, and a small one to so many bytes more."""
 
@@ -59,7 +58,9 @@ def read_map_file(path: Path) -> MapFile:
     """Read a map. Raises InputError, in one line, for a file that is missing, truncated, damaged,
     of another kind or of a newer version.
     """
-    return from_bytes(read_bytes(path, at_most=MAX_BYTES), str(path))
+    size = check_file(path)
+    with os_errors(f'{path}: cannot be read'), path.open('rb') as file:
+        return _read(file, size, str(path))
 
 
 def is_map_file(path: Path) -> bool:
@@ -96,9 +97,13 @@ def write_to(file: IO[bytes], saved: MapFile, compress: bool = True) -> None:
 
 def from_bytes(data: bytes, name: str) -> MapFile:
     """Return the map of a file's bytes; name: of the file, for what is wrong with it."""
+    return _read(io.BytesIO(data), len(data), name)
+
+
+def _read(file: IO[bytes], size: int, name: str) -> MapFile:
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            _check_sizes(archive, len(data))
+        with zipfile.ZipFile(file) as archive:
+            _check_sizes(archive, size)
             saved = MapFile(_header(archive, name))
             for member in archive.namelist():
                 if member != HEADER:

@@ -156,3 +156,10 @@ def test_a_deep_header_is_one_line():
         file.writestr('header.json', '[' * 100_000)
     with pytest.raises(InputError, match=r'x\.map: is no map'):
         from_bytes(buffer.getvalue(), 'x.map')
+
+
+def test_a_file_of_gigabytes_that_is_no_map_is_not_read(tmp_path):
+    with (tmp_path / 'my.map').open('wb') as file:
+        file.truncate(1 << 34)
+    with pytest.raises(InputError, match=r'my\.map: is truncated or damaged'):
+        read_map_file(tmp_path / 'my.map')

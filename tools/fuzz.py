@@ -196,7 +196,7 @@ class _Running:
         if not all(line.startswith('segfloor: ') for line in lines):
             return FOREIGN
         is_verdict = code == 1 and KINDS[self.case.kind].command[0] == 'check'
-        if code and not is_verdict and not self._names_input(lines[-1] if lines else ''):
+        if code and not is_verdict and not any(map(self._names_input, lines)):
             return UNNAMED
         return (OK, NO_MAP, REFUSED)[code]
 
