@@ -189,14 +189,14 @@ class OutputFolder:
             if not failed:
                 check_target(self.path, OUTPUT_NAMES)
                 return move_into_place(self._made, self.path)
-            why = ', '.join(f'{name} ({why})' for name, why in failed.items())
+            why = ', '.join(dict.fromkeys(failed.values()))
         except (OSError, InputError) as error:
             why = str(error)
         self._write_elsewhere(result, why)
 
     def _write_elsewhere(self, result: RunResult, why: str) -> None:
         """Write to the folder for temporary files or the present one, wherever more can be."""
-        words = f'{self.path}: cannot be written: {why}'
+        words = f'{self.path}: cannot be written ({why})'
         tried: list[tuple[int, Path, dict[str, str]]] = []
         for parent in (Path(tempfile.gettempdir()), Path.cwd()):
             try:
@@ -216,8 +216,8 @@ class OutputFolder:
         for name in PICTURES:
             with suppress(OSError):
                 shutil.copytree(self._made / name, self.path / name)
-        missing = f' but {", ".join(failed)}' if failed else ''
-        self.problems.append(f'{words}; the result is in {self.path}, all{missing}')
+        missing = f' without {", ".join(failed)}' if failed else ''
+        self.problems.append(f'{words}; the result is in {self.path}{missing}')
 
 
 def _is_whole(folder: Path) -> bool:
@@ -258,7 +258,7 @@ def _try_to(write: Callable[[Path], object], path: Path) -> str:
         write(path)
     except (OSError, SegfloorError) as error:
         path.unlink(missing_ok=True)
-        return getattr(error, 'strerror', None) or str(error)
+        return getattr(error.__cause__ or error, 'strerror', None) or str(error)
     return ''
 
 

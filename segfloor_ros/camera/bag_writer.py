@@ -58,7 +58,8 @@ def convert(
     """
     done, log = 0, MeasurementLog(source.sensors)
     depths = _by_stamp(depth)
-    with BagWriter(out, source.calibration, coding) as bag:
+    writing = os_errors(f'{out}: cannot be written')
+    with writing, BagWriter(out, source.calibration, coding) as bag:
         for pair in source.raw_pairs():
             for measurement in log.until(pair.stamp_ns):
                 bag.write_measurement(measurement)

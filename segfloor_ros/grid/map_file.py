@@ -78,7 +78,7 @@ def _replace_file(path: Path, content: bytes) -> None:
         with replacing(path) as file:
             file.write(content)
     except OSError as error:
-        raise MapError(f'{path}: cannot write the map ({error.strerror})') from None
+        raise MapError(f'{path}: cannot write the map ({error.strerror})') from error
 
 
 def _read_description(path: Path) -> dict[str, Any]:

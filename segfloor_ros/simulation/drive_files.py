@@ -167,8 +167,7 @@ def _write_poses(path: Path, T_world_left: Array) -> None:
 
 def _write_png(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(exist_ok=True)
-    if not cv2.imwrite(str(path), image, PNG_SPEED):
-        raise InputError(f'{path}: cannot be written; is the disk full?')
+    path.write_bytes(cv2.imencode('.png', image, PNG_SPEED)[1].tobytes())
 
 
 def render_once(

@@ -29,9 +29,6 @@ from segfloor_ros.suite.measures import measure_run, start_pose_of
 from segfloor_ros.suite.result_files import Cache, digest_of, local_copy, pack, unpack
 from segfloor_ros.timing import ReferenceWorkload
 
-STOP_S = 15.0
-"""For a program to end that was told to; a replay ends its nodes first."""
-
 LOG = 'log.txt'
 
 SAVED_MAP = 'saved.map'
@@ -67,15 +64,10 @@ def run_segfloor(words: list[str], log: Path, timeout_s: float) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a program and what it has started."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is not None:
-            return
-        os.killpg(process.pid, number)
-        try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            continue
+    """End a program; the nodes of a replay end with it, and nobody wants what it would write."""
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 class JobError(SegfloorError):
