@@ -242,7 +242,7 @@ class StereoSlam:
         is_long = frame.stamp_ns - self._lost_ns >= self._patience_ns
         if self.is_apart:
             features = front_end.extractor.extract(frame.left, images.excluded)
-            if is_long or self._back_end.sees_known(images, features):
+            if is_long or self._back_end.sees_known(images, features, frame.stamp_ns):
                 self._give_up_part()
         elif is_long and not (front_end.is_fixed or self._back_end.is_apart):
             self._map_apart()

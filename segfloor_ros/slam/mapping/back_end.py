@@ -119,9 +119,10 @@ class BackEnd:
         self._map.reset(self._map.num_ever)
         self._forget_places()
 
-    def sees_known(self, images: Images, features: Features) -> bool:
+    def sees_known(self, images: Images, features: Features, stamp_ns: int) -> bool:
         """Whether a camera that is lost in a part of the map is seen to be in the known one."""
-        return self._known is not None and self._known.is_seen(images, features, self.offset_px)
+        known = self._known
+        return known is not None and known.is_seen(images, features, self.offset_px, stamp_ns)
 
     def give_up_part(self) -> None:
         """Go back to the known map, and forget the part beside it."""

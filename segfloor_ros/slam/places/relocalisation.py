@@ -22,7 +22,13 @@ from segfloor_ros.slam.map.map_arrays import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import views_near
-from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain, drift, median_depth_m
+from segfloor_ros.slam.places.loop_checks import (
+    LoopChecks,
+    are_certain,
+    drift,
+    greatest_speed_mps,
+    median_depth_m,
+)
 from segfloor_ros.slam.places.loop_closing import fuse_latest, merge_pairs
 from segfloor_ros.slam.places.place_recognition import BEST_KEYFRAMES, PlaceRecognition
 from segfloor_ros.slam.results import NO_POINT, Track
@@ -38,11 +44,11 @@ SAME_RAD = 0.3
 """Two finds further apart than this are two places that look alike."""
 
 FRAMES_IN_A_ROW = 2
-STEP_M, STEP_RAD = 0.5, 0.6
+STEP_RAD = 0.6
 MIN_AGREEMENT = 0.7
-"""Away from where it was lost, so many frames must find the camera, each about where the one before
-did, and show what is expected in so many parts of the image: a shelf that stands twice in a
-building shows now and then enough for one frame, by chance."""
+"""Away from where it was lost, so many frames must find the camera, each as far from where the one
+before did as it can have moved since, and show what is expected in so many parts of the image: a
+shelf that stands twice in a building shows now and then enough for one frame, by chance."""
 
 NARROW_SEARCHES = 100
 """Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
@@ -74,7 +80,7 @@ class Relocaliser:
         """Search the whole map, and forget what was found in it."""
         self._near: tuple[Array, float, float] | None = None
         self._searches_left = 0
-        self._last_found: Array | None = None
+        self._last_found: tuple[int, Array] | None = None
         self._in_a_row = 0
 
     def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
@@ -92,20 +98,23 @@ class Relocaliser:
         images: Images,
         features: Features,
         offset_px: float,
-        is_possible: Callable[[Array], bool] | None,
-        lost_at: Array | None,
+        stamp_ns: int,
+        is_possible: Callable[[Array], bool] | None = None,
+        lost_at: Array | None = None,
     ) -> Track | None:
         """Return a frame with its pose as `find` does; None until enough frames in a row are found
         there, or one around a given pose or where the camera was lost (T_camera_world, (4, 4)).
         """
         given = self.is_narrow
         found = self.find(images, features, offset_px, is_possible)
-        expected = found is not None and (given or _follows(found, lost_at))
+        expected = found is not None and (given or _follows(found, lost_at, SAME_M))
         if found is None or not (expected or self._places.agreement(found) >= MIN_AGREEMENT):
             self._last_found, self._in_a_row = None, 0
             return None
-        self._in_a_row = self._in_a_row + 1 if _follows(found, self._last_found) else 1
-        self._last_found = found.T_camera_world
+        before_ns, last = self._last_found or (stamp_ns, None)
+        way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - before_ns)
+        self._in_a_row = self._in_a_row + 1 if _follows(found, last, SAME_M + way_m) else 1
+        self._last_found = stamp_ns, found.T_camera_world
         if self._in_a_row < FRAMES_IN_A_ROW and not expected:
             return None
         self._last_found, self._near = None, None
@@ -164,11 +173,11 @@ def is_within(motion: Array, reach_m: float, reach_rad: float) -> bool:
     return moved_m <= reach_m and rotation_angle(motion[:3, :3]) <= reach_rad
 
 
-def _follows(found: Track, T_camera_world: Array | None) -> bool:
-    """Whether a frame is about where a camera was before (4, 4), if that is known."""
+def _follows(found: Track, T_camera_world: Array | None, reach_m: float) -> bool:
+    """Whether a frame is within reach of where a camera was before (4, 4), if that is known."""
     if T_camera_world is None:
         return False
-    return is_within(found.T_camera_world @ invert(T_camera_world), STEP_M, STEP_RAD)
+    return is_within(found.T_camera_world @ invert(T_camera_world), reach_m, STEP_RAD)
 
 
 def _apart(a: Track, b: Track) -> bool:
@@ -229,9 +238,9 @@ class KnownMap:
             return False
         return not self._checks.objection(keyframe, match, mount)
 
-    def is_seen(self, images: Images, features: Features, offset_px: float) -> bool:
+    def is_seen(self, images: Images, features: Features, offset_px: float, stamp_ns: int) -> bool:
         """Whether enough frames in a row see the known map, this one the last of them."""
-        found = self._relocaliser.find_surely(images, features, offset_px, None, None)
+        found = self._relocaliser.find_surely(images, features, offset_px, stamp_ns)
         return found is not None
 
     def _look(self, keyframe: KeyframeRecord, images: Images, offset_px: float) -> Match | None:

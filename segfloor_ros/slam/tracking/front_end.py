@@ -278,7 +278,7 @@ class FrontEnd:
         lost_at = motion.T_camera_world if motion.lost_here else None
         lost_at = motion.steady(stamp_ns) if motion.is_resuming else lost_at
         found = self._relocaliser.find_surely(
-            images, features, self.offset_px, is_possible, lost_at
+            images, features, self.offset_px, stamp_ns, is_possible, lost_at
         )
         if found is None:
             return None

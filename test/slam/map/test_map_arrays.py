@@ -118,6 +118,14 @@ def test_frames_in_a_row_must_find_who_is_lost(mapped):
     assert tracked == [False] * 5 + [True] * 2
 
 
+@pytest.mark.parametrize(('second', 'is_found'), [(1, False), (10, True)])
+def test_two_finds_agree_as_far_as_the_camera_can_have_moved(mapped, second, is_found):
+    """0.9 m in a tenth of a second is another place, in a second it is a drive."""
+    slam = loaded(mapped, localize=True)
+    assert not slam.process(ROOM.frame(0, planar_pose(0.05, 0, 0)))[0].tracked
+    assert slam.process(ROOM.frame(second, planar_pose(0.95, 0, 0)))[0].tracked == is_found
+
+
 def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch):
     slam = loaded(mapped, localize=False, last=mapped.last_pose)
     here, other = there(25)[-1], StereoRoom(seed=77)
