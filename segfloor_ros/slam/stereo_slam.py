@@ -253,10 +253,11 @@ class StereoSlam:
         """
         self._lost_ns = None
         motion = self._front_end.motion
-        if motion.is_held:
+        is_resuming = motion.is_held
+        if is_resuming:
             self._began_unsure = motion.T_camera_world, motion.covariance
         self._take_adjustment(wait=True)
-        if self._is_shown and len(self.map.keyframes) <= HARDLY_BEGUN:
+        if self._is_shown and not is_resuming and len(self.map.keyframes) <= HARDLY_BEGUN:
             self._back_end.begin_again()
         else:
             self._back_end.map_apart(self._is_shown)

@@ -15,7 +15,7 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, save_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.slam.stereo_slam import HARDLY_BEGUN, StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
 ROOM, OTHER = StereoRoom(), StereoRoom(seed=77)
@@ -137,6 +137,16 @@ def test_what_is_mapped_elsewhere_merges_when_the_map_is_recognised(frames):
     error = invert(poses[-1]) @ last.T_map_odom @ last.T_odom_base
     assert np.linalg.norm(error[:3, 3]) < 0.05
     assert len(slam.to_arrays()['keyframe_stamp_ns']) > len(known) + 3
+
+
+def test_a_map_that_had_hardly_begun_stays(frames):
+    slam, _ = broken_off(frames[:3])
+    known = slam.to_arrays()['keyframe_stamp_ns']
+    assert len(known) < HARDLY_BEGUN
+    for k in range(10, 40):
+        slam.process(OTHER.frame(k, base_at(k)))
+    assert slam.is_apart
+    np.testing.assert_array_equal(slam.to_arrays()['keyframe_stamp_ns'], known)
 
 
 @pytest.mark.parametrize('name', ['stamp_ns', 'velocity', 'wheels'])
