@@ -29,6 +29,7 @@ from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.messages.topics import PACED_BY, TOPICS
 from segfloor_ros.node_settings import StereoCameraNodeSettings
 from segfloor_ros.nodes.shared.pacing import ChainPace, ClockPace
+from segfloor_ros.nodes.shared.reporter import SETTLED_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import TfLink
@@ -36,8 +37,7 @@ from segfloor_ros.nodes.shared.transforms import TfLink
 LOOK_AGAIN_S = 0.05
 """How often is looked for subscribers, and whether the chain has room: its answers say so too."""
 AFTER_THE_END_S = 1.0
-LOG_WAITING_S = 5.0
-
+WAITING = 'waiting'
 
 AHEAD_NS = round(MAX_LAG_S * 1e9)
 """What sensors measured is sent so far ahead of the images: their stamps may be late."""
@@ -92,14 +92,14 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
             self._imu_frame = self._place_imu(self._measurements.imu_place_m)
         self._frames_sent = 0
         self._connected = self._finished = False
-        self._logged_waiting_s = time.monotonic()
+        self._wait_no_more()
         self._clock_pace = ClockPace(own.rate or math.inf)
         self._chain_pace = ChainPace(is_on=own.lossless or not own.rate)
         self._paces = (self._clock_pace, self._chain_pace)
 
     def on_inputs_opened(self) -> None:
         """Keep the recording's pace from here on."""
-        self._logged_waiting_s = time.monotonic()
+        self._wait_no_more()
         for pace in self._paces:
             pace.restart()
 
@@ -182,7 +182,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         eyes = {'left': (pair.left, calibration.left), 'right': (pair.right, calibration.right)}
         for pace in self._paces:
             pace.sent(pair.stamp_ns)
-        self._logged_waiting_s = time.monotonic()
+        self._wait_no_more()
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
         for measurement in self._measurements.until(pair.stamp_ns + AHEAD_NS):
@@ -245,11 +245,13 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
             values[DEPTH] = self._frames_sent
         self.reporter.publish(RECORDING, stamp_ns, level, message, values)
 
+    def _wait_no_more(self) -> None:
+        self._waiting_since_s = time.monotonic()
+        self.reporter.over(WAITING)
+
     def _log_waiting_for(self, what: str) -> None:
-        now_s = time.monotonic()
-        if what and now_s - self._logged_waiting_s > LOG_WAITING_S:
-            self._logged_waiting_s = now_s
-            self.get_logger().warning(f'waiting for {what}')
+        if what and time.monotonic() - self._waiting_since_s > SETTLED_S:
+            self.reporter.warn(f'waiting for {what}', WAITING, repeat_s=math.inf)
 
 
 def main() -> None:

@@ -149,9 +149,9 @@ class Transforms:
         if not self._is_published():
             wait_s = min(wait_s, DISCOVERY_S)
         if time.monotonic() < self._opened_s + wait_s:
-            self._node.reporter.warn(f'waiting for tf from {base} to {camera_frame}')
+            self._node.reporter.health.waits(f'waiting for tf from {base} to {camera_frame}')
             return False
-        self._node.reporter.warn(
+        self._node.get_logger().info(
             f'no tf from {base} to {camera_frame} within {wait_s:g} s; the mount of the camera is '
             'measured from the floor'
         )
