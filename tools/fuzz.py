@@ -100,7 +100,7 @@ def run_cases(cases: Sequence[Case], jobs: int, keep: Path | None = None) -> Ite
     for module in EARLY:
         with contextlib.suppress(ImportError):
             __import__(module)
-    with tempfile.TemporaryDirectory(prefix='segfloor-fuzz-') as temporary:
+    with tempfile.TemporaryDirectory('', 'segfloor-fuzz-', ignore_cleanup_errors=True) as temporary:
         inputs = Path(temporary) / 'inputs'
         _make_inputs(inputs, {case.kind for case in cases})
         running: dict[int, _Running] = {}
