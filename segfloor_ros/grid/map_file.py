@@ -97,7 +97,7 @@ def _read_description(path: Path) -> dict[str, Any]:
             'occupied_thresh': float(document.get('occupied_thresh', OCCUPIED_THRESH)),
             'free_thresh': float(document.get('free_thresh', FREE_THRESH)),
         }
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f'{path}: a value is not a number where one is needed') from None
     _check_description(path, checked)
     return checked
