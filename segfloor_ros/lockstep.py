@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from segfloor_ros import results_folder
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
@@ -27,7 +27,7 @@ from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.map_file import MapFile, is_map_file, read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
-from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.timing import MemoryLog
@@ -110,17 +110,19 @@ NO_MAPS = MapOptions()
 def no_floor(name: str, frames: int) -> str:
     """Return why there is no map where the mount of the camera stayed unknown."""
     return (
-        f'{name}: no level floor was recognised in {frames} frames, so the height of the camera is '
-        'unknown; give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad'
+        f'{name}: no level floor was recognised in {frames} frames, so there is no map; give '
+        'stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad, or take --no-map for '
+        'the path alone'
     )
 
 
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
-    needs. interrupted: ends the drive after the frame at which it is set.
+    needs. interrupted: ends the drive after the frame at which it is set. path_only: no map is
+    made, and no floor is looked for.
 
     note: what there is to say about the map that was to be saved. broken_off: why the recording
-    could not be read to its end.
+    could not be read to its end. no_map: why only a path came of the drive.
     """
 
     def __init__(
@@ -132,6 +134,7 @@ class LockstepRun:
         save_debug: bool = False,
         map_options: MapOptions = NO_MAPS,
         interrupted: threading.Event | None = None,
+        path_only: bool = False,
     ) -> None:
         self._source = source
         self._configuration = configuration
@@ -139,10 +142,10 @@ class LockstepRun:
         self._save_masks = save_masks
         self._save_debug = save_debug
         self._memory = MemoryLog()
-        self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe)
+        self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe, path_only)
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
-        self.note = ''
+        self.note = self.no_map = ''
         self.broken_off: SegfloorError | None = None
         self._interrupted = interrupted or threading.Event()
         self._map_options = map_options
@@ -159,12 +162,12 @@ class LockstepRun:
         """Process every frame and return the result; an interrupt or a recording that breaks off
         ends the run early and keeps the map.
 
-        Raises MapError when no map came of it, or what the recording broke off with.
+        Raises MapError when no path came of it, or what the recording broke off with.
         """
         start = time.perf_counter()
         try:
             self._process_frames(on_progress)
-            for result in self._attempt(self._frames, self._pipeline.slam.finish) or []:
+            for result in self._attempt(self._frames, self._pipeline.finish_tracking) or []:
                 self._note(result)
             grid = self._pipeline.finish()
         finally:
@@ -173,18 +176,25 @@ class LockstepRun:
         self._results.sort(key=lambda result: result.index)
         stages = self._pipeline.keyframe_stages
         mount, labelled, poses = self._pipeline.mount, stages.labelled, self._tracked_poses()
-        if grid is None or mount is None or labelled is None or not poses:
+        if mount is None or labelled is None or not poses:
             raise self.broken_off or MapError(self._why_no_map())
         path = self._path
+        if grid is None:
+            self.no_map = self._why_no_map()
         return results_folder.RunResult(
             grid,
             corrected_trajectory(poses, path),
             Trajectory(path.stamp_ns, path.T_map_base),
             labelled,
             mount,
-            self._summary(wall_s),
+            self._summary(wall_s, grid is not None),
             self._configuration,
         )
+
+    @property
+    def _known_mount(self) -> Mount | None:
+        mount = self._pipeline.mount
+        return None if mount is CAMERA_AS_BASE else mount
 
     @property
     def _is_cut_short(self) -> bool:
@@ -196,6 +206,9 @@ class LockstepRun:
         """
         save, load = self._map_options.save, self._map_options.load
         if save is None:
+            return
+        if self.no_map:
+            self.note = f'{save}: is not written, since there is no map'
             return
         apart = not self._pipeline.slam.is_in_loaded_map
         if apart and load is not None and save.resolve() == load.resolve():
@@ -267,12 +280,10 @@ class LockstepRun:
         self._results.append(result)
 
     def _mask_frame(self, frame: StereoFrame, result: FrameResult) -> None:
-        if result.keyframe is not None or self._pipeline.mount is None:
+        if result.keyframe is not None or self._known_mount is None:
             return
         T_map_base = result.T_map_odom @ result.T_odom_base if result.tracked else None
-        floor = self._other_frames.process(
-            frame.left, frame.right, self._pipeline.mount, T_map_base
-        )
+        floor = self._other_frames.process(frame.left, frame.right, self._known_mount, T_map_base)
         self._folder.add_picture('floor_masks', f'{frame.index:06d}', floor.mask)
 
     def _on_keyframe(self, keyframe: Keyframe, floor: FloorObservation) -> None:
@@ -293,7 +304,7 @@ class LockstepRun:
             return f'{name}: no frame could be read, so there is no map'
         if self._map_options.load is not None:
             return self._map_options.why_not_found(name, self._frames)
-        if self._pipeline.mount is None:
+        if self._known_mount is None:
             return no_floor(name, self._frames)
         if self._pipeline.fault:
             return f'{name}: no keyframe came to the map: {self._pipeline.fault}'
@@ -308,11 +319,10 @@ class LockstepRun:
             if sensor.used
         }
 
-    def _summary(self, wall_s: float) -> results_folder.RunSummary:
+    def _summary(self, wall_s: float, has_map: bool) -> results_folder.RunSummary:
         tracked = np.array([result.tracked for result in self._results], bool)
-        mount = self._pipeline.mount
-        assert mount is not None
         return results_folder.RunSummary(
+            map=results_folder.MAP if has_map else None,
             frames=self._frames,
             tracked_frames=int(tracked.sum()),
             skipped_frames=self._source.skipped_frames,
@@ -330,9 +340,7 @@ class LockstepRun:
             map_updates=self._pipeline.keyframe_stages.map_updates,
             wall_s=round(wall_s, 3),
             frames_per_s=round(self._frames / wall_s, 2),
-            camera_height_m=round(mount.height_m, 4),
-            camera_pitch_rad=round(mount.pitch_rad, 5),
-            camera_roll_rad=round(mount.roll_rad, 5),
+            **results_folder.mount_figures(self._known_mount),
             sensors=self._sensors_used(),
             blind_frames=sum(result.blind for result in self._results),
             moving_frames=sum(_shows_motion(result) for result in self._results),

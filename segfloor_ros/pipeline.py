@@ -38,6 +38,9 @@ logger = logging.getLogger(__name__)
 
 MAX_PENDING_KEYFRAMES = 4
 
+CAMERA_AS_BASE = Mount(0.0, 0.0, 0.0)
+"""Where nothing is known of the mount: the camera in the axes of a base."""
+
 KeyframeListener = Callable[[Keyframe, FloorObservation], None]
 
 
@@ -91,6 +94,10 @@ class KeyframeStages:
             )
         self.map_updates += 1
 
+    def note_points(self, cloud: SparseCloud) -> None:
+        """Take in the points of a keyframe whose floor is not segmented."""
+        self.labelled = self._labelling.labelled(cloud)
+
     def to_arrays(self) -> dict[str, Arrays]:
         """Return what is known of points and grid, for a file."""
         return {'cloud': self._labelling.to_arrays(), 'grid': self._mapper.to_arrays()}
@@ -117,7 +124,8 @@ class Pipeline:
 
     Nothing flows back from the worker to SLAM, so the result does not depend on timing. A keyframe
     at which a stage fails does not reach the map, the others do. failed_keyframes: how many did
-    not; fault: of the last of them, in words.
+    not; fault: of the last of them, in words. path_only: whether SLAM runs alone, also where no
+    floor shows the mount; the camera is then taken for the base, and there is no map.
     """
 
     def __init__(
@@ -125,10 +133,13 @@ class Pipeline:
         camera: StereoCamera,
         configuration: Configuration,
         on_keyframe: KeyframeListener | None = None,
+        path_only: bool = False,
     ) -> None:
         self.times = StageTimes()
         self._camera = camera
-        self.slam = make_slam(camera, configuration.stereo_slam, times=self.times)
+        self.path_only = path_only
+        mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
+        self.slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
         self.keyframe_stages = KeyframeStages(camera, configuration, self.times)
         self.failed_keyframes, self.fault = 0, ''
         self._on_keyframe = on_keyframe
@@ -144,8 +155,22 @@ class Pipeline:
         """Take in the next frame; returns the tracking results that are ready, oldest first."""
         results = self.slam.process(frame)
         for result in results:
-            if result.keyframe is not None:
+            if result.keyframe is not None and self.path_only:
+                self.keyframe_stages.note_points(result.keyframe.cloud)
+            elif result.keyframe is not None:
                 self._submit(result.keyframe)
+        return results
+
+    def finish_tracking(self) -> list[FrameResult]:
+        """Return what is still held back after the last frame, as a path alone where the mount is
+        not known.
+        """
+        if self.mount is None:
+            self.path_only, self.slam.mount = True, CAMERA_AS_BASE
+        results = self.slam.finish()
+        keyframes = [result.keyframe for result in results if result.keyframe is not None]
+        if keyframes and self.path_only:
+            self.keyframe_stages.note_points(keyframes[-1].cloud)
         return results
 
     def finish(self) -> OccupancyGrid | None:

@@ -34,11 +34,12 @@ from segfloor_ros.files.whole import read_json
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.trajectory import Trajectory, write_tum
 
+MAP = 'map.yaml'
 PICTURES = ('floor_masks', 'moving_masks', 'floor_debug')
 OUTPUT_NAMES = (
     *PICTURES,
     'map.pgm',
-    'map.yaml',
+    MAP,
     'trajectory.txt',
     'keyframes.txt',
     'camera_trajectory.txt',
@@ -53,17 +54,20 @@ OUTPUT_NAMES = (
 class RunSummary:
     """The figures of a run, as written to summary.json.
 
-    lost_intervals: first and last frame number of every stretch without a pose. relocalisations:
-    the times in seconds at which tracking was lost and found again, lost_s and found_s. apart: the
-    first_frame and last_frame of every stretch that was mapped without knowing where in the map it
-    is, and whether it was `joined` later; what was not is in no map and no trajectory. sensors:
-    messages used, by name. blind_frames: with a pose of wheels or gyroscope alone. moving_frames:
-    in which something was found that moves. sensor_remarks: what seems wrong with sensors, in
-    words. failed_frames, failed_keyframes: at which a stage failed; they are lost or not in the
-    map. interrupted: whether the drive was cut short. stages: by name count, mean_ms, p50_ms,
-    p95_ms, max_ms. rss_mb: start, peak and slope_per_update in MB, and samples over the updates.
+    map: the file, None where only a path came of the drive; camera_height_m, camera_pitch_rad and
+    camera_roll_rad are None where the mount is not known. lost_intervals: first and last frame
+    number of every stretch without a pose. relocalisations: the times in seconds at which tracking
+    was lost and found again, lost_s and found_s. apart: the first_frame and last_frame of every
+    stretch that was mapped without knowing where in the map it is, and whether it was `joined`
+    later; what was not is in no map and no trajectory. sensors: messages used, by name.
+    blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
+    found that moves. sensor_remarks: what seems wrong with sensors, in words. failed_frames,
+    failed_keyframes: at which a stage failed; they are lost or not in the map. interrupted: whether
+    the drive was cut short. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
+    peak and slope_per_update in MB, and samples over the updates.
     """
 
+    map: str | None
     frames: int
     tracked_frames: int
     skipped_frames: int
@@ -75,9 +79,9 @@ class RunSummary:
     map_updates: int
     wall_s: float
     frames_per_s: float
-    camera_height_m: float
-    camera_pitch_rad: float
-    camera_roll_rad: float
+    camera_height_m: float | None
+    camera_pitch_rad: float | None
+    camera_roll_rad: float | None
     sensors: dict[str, int]
     blind_frames: int
     moving_frames: int
@@ -91,15 +95,28 @@ class RunSummary:
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """What a run leaves behind. trajectory, keyframes: `base_link` in `map`."""
+    """What a run leaves behind. grid: None where only a path came of it. trajectory, keyframes:
+    `base_link` in `map`.
+    """
 
-    grid: OccupancyGrid
+    grid: OccupancyGrid | None
     trajectory: Trajectory
     keyframes: Trajectory
     labelled: LabelledPoints
     mount: Mount
     summary: RunSummary
     configuration: Configuration
+
+
+def mount_figures(mount: Mount | None) -> dict[str, float | None]:
+    """Return the mount's part of a summary."""
+    if mount is None:
+        return dict.fromkeys(('camera_height_m', 'camera_pitch_rad', 'camera_roll_rad'))
+    return {
+        'camera_height_m': round(mount.height_m, 4),
+        'camera_pitch_rad': round(mount.pitch_rad, 5),
+        'camera_roll_rad': round(mount.roll_rad, 5),
+    }
 
 
 def lost_intervals(
@@ -235,8 +252,9 @@ def _writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
     camera = result.trajectory.seen_from(result.mount.T_base_left)
     summary = json.dumps(dataclasses.asdict(result.summary), indent=2)
     settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
-    return {
-        'map.yaml': lambda path: save_map(result.grid, path),
+    grid = result.grid
+    of_map = {} if grid is None else {MAP: lambda path: save_map(grid, path)}
+    return of_map | {
         'trajectory.txt': lambda path: write_tum(path, result.trajectory),
         'keyframes.txt': lambda path: write_tum(path, result.keyframes),
         'camera_trajectory.txt': lambda path: write_tum(path, camera),
@@ -285,13 +303,21 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('frames with something that moves', summary.moving_frames),
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),
-        ('camera height', f'{summary.camera_height_m:.3f} m'),
-        ('camera pitch', f'{np.degrees(summary.camera_pitch_rad):.2f} deg'),
+        *_mount_rows(summary.camera_height_m, summary.camera_pitch_rad),
         ('time', f'{summary.wall_s:.1f} s ({summary.frames_per_s:.1f} frames/s)'),
         ('memory, peak', f'{summary.rss_mb["peak"]:.0f} MB'),
         ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
     ]
     return [(what, str(value)) for what, value in rows]
+
+
+def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[str, str]]:
+    if height_m is None or pitch_rad is None:
+        return [('camera height and pitch', 'unknown')]
+    return [
+        ('camera height', f'{height_m:.3f} m'),
+        ('camera pitch', f'{np.degrees(pitch_rad):.2f} deg'),
+    ]
 
 
 def _apart_words(part: Mapping[str, int | bool]) -> str:

@@ -4,8 +4,6 @@ them here.
 
 from __future__ import annotations
 
-import math
-
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.slam.settings import StereoSlamSettings
@@ -29,7 +27,7 @@ def make_slam(
         settings.camera_pitch_rad,
         settings.camera_roll_rad,
     )
-    if mount is None and not any(math.isnan(v) for v in (height_m, pitch_rad, roll_rad)):
+    if mount is None and settings.has_mount:
         mount = Mount(
             height_m, pitch_rad, roll_rad, settings.camera_forward_m, settings.camera_left_m
         )

@@ -74,6 +74,11 @@ Report = Annotated[
 ]
 
 
+NoMap = Annotated[
+    bool, typer.Option('--no-map', help='The path alone: no floor is looked for, no map made.')
+]
+
+
 def configuration(
     params: Path | None,
     assignments: list[str] | None,

@@ -22,7 +22,7 @@ from rich.table import Table
 from segfloor_ros.errors import printable
 from segfloor_ros.interrupts import Interrupt
 from segfloor_ros.measurements import RecordedSensor
-from segfloor_ros.results_folder import OutputFolder, RunSummary, summary_rows
+from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
 
 console = Console(markup=False)
 error_console = Console(stderr=True, soft_wrap=True, markup=False)
@@ -125,7 +125,9 @@ def finish_run(
     results are and what there is to say about them. status: to end with; 1 where it is 0 and
     something could not be written.
     """
-    console.print(f'map: {folder.path / "map.yaml"}', highlight=False, soft_wrap=True)
+    has_map = (folder.path / MAP).is_file()
+    place = f'map: {folder.path / MAP}' if has_map else f'path: {folder.path / "trajectory.txt"}'
+    console.print(place, highlight=False, soft_wrap=True)
     problems = list(folder.problems)
     if report:
         # Imported here: Matplotlib takes a second that other commands should not wait for.

@@ -30,10 +30,12 @@ from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.map_files import grid_of
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.results_folder import (
+    MAP,
     RunResult,
     RunSummary,
     apart_intervals,
     lost_intervals,
+    mount_figures,
     relocalisations,
 )
 from segfloor_ros.slam.results import KeyframePath
@@ -238,6 +240,7 @@ class ReplaySession:
         mount, finished = recorder.mount, recorder.finished
         assert mount is not None
         return RunSummary(
+            map=MAP,
             frames=len(stamps),
             tracked_frames=int(tracked.sum()),
             skipped_frames=int(finished.values['skipped']) if finished is not None else 0,
@@ -253,9 +256,7 @@ class ReplaySession:
             map_updates=len(recorder.updated),
             wall_s=round(wall_s, 3),
             frames_per_s=round(len(stamps) / wall_s, 2),
-            camera_height_m=round(mount.height_m, 4),
-            camera_pitch_rad=round(mount.pitch_rad, 5),
-            camera_roll_rad=round(mount.roll_rad, 5),
+            **mount_figures(mount),
             sensors=_sensors_sent(finished),
             blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
             moving_frames=sum(bool(s and int(s.values.get('moving', 0))) for s in answers),

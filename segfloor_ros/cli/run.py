@@ -36,6 +36,7 @@ def run(
     load_map: options.LoadMap = None,
     localize: options.Localize = False,
     report: options.Report = False,
+    no_map: options.NoMap = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
     maps = MapOptions(load_map, save_map, localize)
@@ -46,7 +47,7 @@ def run(
     with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
         with output.progress_bar('mapping', source.frame_count) as progress:
             drive = LockstepRun(
-                source, configuration, folder, save_masks, save_debug, maps, interrupt
+                source, configuration, folder, save_masks, save_debug, maps, interrupt, no_map
             )
             try:
                 result = drive.execute(progress)
@@ -60,6 +61,8 @@ def run(
             folder.problems.append(str(error) or type(error).__name__)
     output.print_summary(input, result.summary)
     remarks, status = [drive.note] if drive.note else [], interrupt.status
+    if drive.no_map and not no_map:
+        folder.problems.append(drive.no_map)
     if drive.broken_off is not None:
         remarks.append(f'{drive.broken_off}; the map is of what came before')
         status = status or 2

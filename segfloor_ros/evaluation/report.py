@@ -71,6 +71,7 @@ def html_page(title: str, about: str, content: str, style: str = '') -> str:
 
 def _facts(data: ReportData) -> str:
     summary = data.summary
+    height_m = summary['camera_height_m']
     tracked = 100 * summary['tracked_frames'] / max(1, summary['frames'])
     facts = [
         (f'{summary["frames"]}', 'frames'),
@@ -78,7 +79,7 @@ def _facts(data: ReportData) -> str:
         (f'{summary["keyframes"]}', 'keyframes'),
         (f'{summary["map_updates"]}', 'map updates'),
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
-        (f'{100 * summary["camera_height_m"]:.1f} cm', 'camera above the floor'),
+        *([] if height_m is None else [(f'{100 * height_m:.1f} cm', 'camera above the floor')]),
     ]
     return _fact_row(facts) + _scores(data)
 

@@ -24,7 +24,7 @@ from segfloor_ros.cloud.labels import FLOOR as FLOOR_POINT
 from segfloor_ros.cloud.labels import OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.raster import FREE, OCCUPIED, states
-from segfloor_ros.evaluation.run_summary import read_summary
+from segfloor_ros.evaluation.run_summary import MOUNT_FIGURES, read_summary
 from segfloor_ros.evaluation.truth import MapTruth, load_truth
 from segfloor_ros.files.images import check_same_size, read_mask
 from segfloor_ros.files.whole import read_text
@@ -41,6 +41,7 @@ STRIP_WIDTH_PX = 480
 FREE_GREY, OCCUPIED_GREY, UNKNOWN_GREY = 1.0, 0.1, 0.8
 MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
+PATH_CELL_M = 0.05
 
 STRIP_LENGTH = 6
 
@@ -218,6 +219,7 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
     settings = folder / 'settings.yaml'
     parameters = resolve(settings)
     source = open_source(parameters.stereo_camera)
+    trajectory = read_trajectory(folder / 'trajectory.txt')[1]
     return ReportData(
         folder=folder,
         name=Path(source.name).name,
@@ -225,13 +227,9 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
         settings_text=read_text(settings),
         floor_settings=parameters.floor_segmentation,
         camera=source.camera,
-        mount=Mount(
-            summary['camera_height_m'],
-            summary['camera_pitch_rad'],
-            summary['camera_roll_rad'],
-        ),
-        grid=load_map(folder / 'map.yaml'),
-        trajectory=read_trajectory(folder / 'trajectory.txt')[1],
+        mount=Mount(*(summary[name] or 0.0 for name in MOUNT_FIGURES)),
+        grid=_grid(folder / 'map.yaml', trajectory),
+        trajectory=trajectory,
         keyframes=read_trajectory(folder / 'keyframes.txt')[1],
         cloud=read_ply(folder / 'labelled_cloud.ply'),
         strip=_masked_frames(folder / 'floor_masks', source.frames()),
@@ -239,6 +237,16 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
         truth=load_truth(truth) if truth is not None else None,
         truth_folder=truth if truth is not None and truth.is_dir() else None,
     )
+
+
+def _grid(path: Path, trajectory: Array) -> OccupancyGrid:
+    """Return the map; where a drive has none, cells of which nothing is known around its path."""
+    if path.exists():
+        return load_map(path)
+    lowest, highest = (trajectory[:, :2, 3].min(0) - 1.0, trajectory[:, :2, 3].max(0) + 1.0)
+    columns, rows = np.ceil((highest - lowest) / PATH_CELL_M).astype(int)
+    unknown = np.full((rows, columns), -1, np.int8)
+    return OccupancyGrid(unknown, PATH_CELL_M, (float(lowest[0]), float(lowest[1])))
 
 
 def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from segfloor_ros.settings import StageSettings, setting
@@ -85,3 +86,9 @@ class StereoSlamSettings(StageSettings):
         'estimated while driving. 0: disparities are taken as they are.',
         within=(0.0, 1.0),
     )
+
+    @property
+    def has_mount(self) -> bool:
+        """Whether height, pitch and roll of the camera are all given."""
+        given = (self.camera_height_m, self.camera_pitch_rad, self.camera_roll_rad)
+        return not any(math.isnan(value) for value in given)

@@ -127,7 +127,7 @@ def _of_summary(summary: dict[str, Any], reference_ms: float) -> dict[str, float
         'lost_intervals': float(len(summary['lost_intervals'])),
         'keyframes': float(summary['keyframes']),
         'loops': float(summary['loops']),
-        'camera_height_m': float(summary['camera_height_m']),
+        'camera_height_m': float(summary['camera_height_m'] or 'nan'),
         'time_ratio': stage_ms / reference_ms,
         'memory_peak_mb': float(memory['peak']),
         'memory_per_update_mb': float(memory['slope_per_update']),

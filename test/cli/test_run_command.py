@@ -265,6 +265,37 @@ def test_no_floor_no_map_and_no_success(tmp_path, recording):
     assert not (tmp_path / 'out').exists()
 
 
+def test_without_a_floor_everything_but_the_map_is_written(tmp_path):
+    """Right before a wall; the path is that of the camera, 2 cm to the left per frame."""
+    room, drive, out = StereoRoom(seed=5), tmp_path / 'drive', tmp_path / 'out'
+    write_kitti(drive, [room.frame(i, planar_pose(5.5, 0.02 * i, 0.0)) for i in range(8)])
+    done = segfloor('run', drive, '--out', out, '--report')
+    assert done.returncode == 1, done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith('segfloor: '))
+    assert f'{drive}: no level floor' in line
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['map'] is None and summary['camera_height_m'] is None
+    assert summary['tracked_frames'] == 8
+    left_m = np.loadtxt(out / 'trajectory.txt')[:, 2]
+    np.testing.assert_allclose(left_m, 0.02 * np.arange(8), atol=0.004)
+    there = {path.name for path in out.iterdir()}
+    assert {'labelled_cloud.ply', 'camera_trajectory.txt', 'settings.yaml'} <= there
+    assert 'report.html' in there and not there & {'map.pgm', 'map.yaml', 'floor_masks'}
+    done = segfloor('run', drive, '--out', out, '--no-map')
+    assert done.returncode == 0 and 'segfloor' not in done.stderr
+
+
+def test_the_path_alone_takes_a_mount_that_is_given(recording, result, tmp_path):
+    out = tmp_path / 'out'
+    done = segfloor('run', recording, '--out', out, '--no-map', *with_mount())
+    assert done.returncode == 0, done.stderr
+    for name in ('trajectory.txt', 'keyframes.txt'):
+        assert (out / name).read_bytes() == (result[0] / name).read_bytes()
+    assert not (out / 'map.pgm').exists()
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['map'] is None and summary['camera_height_m'] == MOUNT.height_m
+
+
 def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     saved, first = tmp_path / 'room.map', tmp_path / 'first'
     done = segfloor('run', recording, '--out', first, '--save-map', saved, *with_mount())
