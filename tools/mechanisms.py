@@ -106,9 +106,6 @@ SLAM: dict[str, Mechanism] = {
 
 FLOOR: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'memory': Mechanism(
-        {'floor.mask.remembered_floor.FloorMemory.fill': lambda self, view, mask, *_: mask}
-    ),
     'slope ahead': Mechanism({'floor.plane.frame_plane._slope_ahead': _none}),
     'a slope needs texture': Mechanism({'floor.plane.frame_plane._TEXTURED_SHARE': 0.0}),
     'a bend needs a measurement': Mechanism({'floor.disparity.profile._LINE_ITERATIONS': -1}),
@@ -139,7 +136,9 @@ FLOOR: dict[str, Mechanism] = {
         {'floor.segmentation.fill_gaps': lambda view, profile, mask, *_: mask}
     ),
     'islands dropped': Mechanism({'floor.segmentation.drop_islands': _first}),
-    'end of texture': Mechanism({'floor.segmentation.beyond_texture': _nowhere}),
+    'looks of the floor': Mechanism(
+        {'floor.segmentation.unlike_floor': lambda image, floor: _nowhere(image)}
+    ),
     'what stands beside the left border': Mechanism(
         {'floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),

@@ -34,10 +34,10 @@ from segfloor_ros.floor.disparity.texture import (
     row_slope,
     texture_grey,
 )
+from segfloor_ros.floor.mask.appearance import unlike_floor
 from segfloor_ros.floor.mask.contact import blank_feet
 from segfloor_ros.floor.mask.filling import (
     beside_something,
-    beyond_texture,
     drop_islands,
     fill_gaps,
     fill_regions,
@@ -46,11 +46,11 @@ from segfloor_ros.floor.mask.filling import (
 from segfloor_ros.floor.mask.hidden import clear_hidden, drop_hidden
 from segfloor_ros.floor.mask.overhead import OverheadMatcher
 from segfloor_ros.floor.mask.pixel_evidence import Comparison, Evidence, HeightTable, judge
-from segfloor_ros.floor.mask.remembered_floor import FloorMemory
 from segfloor_ros.floor.mask.runs import pixels_where
 from segfloor_ros.floor.mask.view import FloorView, column_step
 from segfloor_ros.floor.observation import (
     FLOOR,
+    NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
@@ -89,7 +89,6 @@ class FloorSegmentation:
         self._times = times or NoTimes()
         self._camera = camera
         self._settings = settings
-        self._memory = FloorMemory()
         self._mount: Mount | None = None
         self._matcher: TwoScaleMatcher
         self._overhead: OverheadMatcher
@@ -107,7 +106,7 @@ class FloorSegmentation:
         disparity (H, W) float32.
 
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
-        the map, where known; with it the floor found by earlier keyframes helps. moving: mask
+        the map, where known: the floor may be level there. moving: mask
         (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
         what it hides is unknown. The black border that rectification leaves is treated alike.
         """
@@ -125,8 +124,9 @@ class FloorSegmentation:
             enough = max(MIN_TEXTURE_GREY, NOISE_TEXTURE * noise)
             texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
             if measured is not None:
-                # Depth is measured on plain surfaces, too.
-                texture = np.full_like(texture, _PLAIN_TO_SEE * enough)
+                # Depth is measured on plain surfaces, too; a hole in it tells nothing.
+                plain = np.float32(_PLAIN_TO_SEE * enough)
+                texture = np.where(measured[columns] > 0, plain, np.float32(0))
         with measure(DISPARITY):
             disparity = self._disparity(first_row, left, right) if measured is None else measured
             drop_hidden(disparity, moving, right_border)
@@ -143,22 +143,21 @@ class FloorSegmentation:
             else:
                 compared = compare_measured(view, profile, below, NOISE_PX)
         with measure('evidence'):
-            slope = row_slope(left[columns])
+            left_view, is_measured = left[columns], measured is not None
             evidence = self._evidence(
-                view, profile, below, slope, texture, enough, compared, measured is not None
+                view, profile, below, left_view, texture, enough, compared, is_measured
             )
-            seen = evidence.mask
-            clear_hidden(seen, moving, columns)
+            clear_hidden(evidence.mask, moving, columns)
         with measure('filling'):
-            mask = self._fill(view, profile, below, seen, left_rows, textured, compared, T_map_base)
+            mask = self._fill(view, profile, below, evidence, left_rows, textured, compared)
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(
                 left, right, view.mount, first_row, enough, moving, measured
             )
         with measure('scan'):
-            feet_xy = _feet(view, profile, mask, slope, textured)
-            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, T_map_base)
+            feet_xy = _feet(view, profile, mask, row_slope(left_view), textured)
+            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy)
         return self._observation(view, profile, disparity, mask, scan, counted)
 
     def _evidence(
@@ -166,20 +165,26 @@ class FloorSegmentation:
         view: FloorView,
         profile: FloorProfile,
         below: NDArray[np.float32],
-        slope: NDArray[np.int16],
+        left: NDArray[np.uint8],
         texture: NDArray[np.float32],
         enough: float,
         compared: Comparison,
         measured: bool,
     ) -> Evidence:
-        """Return what the pixels (R, W) of the view say by themselves, cut back to edges."""
+        """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
+        open where they do not look like floor and are not measured to lie on it.
+        """
         settings = self._settings
         constant = self._camera.disparity_times_depth if measured else None
         most = self._matcher.num_disparities
         table = HeightTable.of(view.line, profile, most, settings, constant)
         evidence = judge(view, profile, below, texture > enough, compared, table, settings)
-        seen = trim_to_edges(evidence.mask, slope, _TEXTURE_WINDOW_PX // 2 + 3)
-        return Evidence(seen, evidence.above & (texture >= _LEAST_SHARE * enough))
+        seen = trim_to_edges(evidence.mask, row_slope(left), _TEXTURE_WINDOW_PX // 2 + 3)
+        floor = seen == FLOOR
+        odd = unlike_floor(left, floor)
+        seen[floor & odd & evidence.off] = NO_EVIDENCE
+        above = evidence.above & (texture >= _LEAST_SHARE * enough)
+        return Evidence(seen, above, evidence.off, odd)
 
     def _observation(
         self,
@@ -204,15 +209,8 @@ class FloorSegmentation:
         )
 
     def change_settings(self, settings: FloorSegmentationSettings) -> None:
-        """Segment with changed settings from now on. What is remembered stays as far as it holds:
-        floor under a lower step would have been floor under a higher one, but not the reverse.
-        """
-        before, self._settings = self._settings, settings
-        limits = [(s.step_height_m, s.drop_height_m) for s in (before, settings)]
-        if any(new < old for old, new in zip(*limits, strict=True)):
-            self._memory.forget_floor()
-        if any(new > old for old, new in zip(*limits, strict=True)):
-            self._memory.forget_blocked()
+        """Segment with changed settings from now on."""
+        self._settings = settings
         if self._mount is not None:
             self._make_tools(self._mount)
 
@@ -220,7 +218,6 @@ class FloorSegmentation:
         if mount == self._mount:
             return
         self._make_tools(mount)
-        self._memory = FloorMemory()
         self._mount = mount
 
     def _make_tools(self, mount: Mount) -> None:
@@ -261,25 +258,26 @@ class FloorSegmentation:
         view: FloorView,
         profile: FloorProfile,
         disparity: NDArray[np.float32],
-        mask: NDArray[np.uint8],
+        evidence: Evidence,
         left_rows: NDArray[np.uint8],
         textured: NDArray[np.bool_],
         compared: Comparison,
-        T_map_base: Array | None,
     ) -> NDArray[np.uint8]:
-        """Return the mask with floor where this pair of images alone cannot tell."""
+        """Return the mask with floor where this pair of images alone cannot tell: where it looks
+        like floor. The more floor is known the better is known how it looks, so this is done twice.
+        """
         settings = self._settings
+        mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
-        if T_map_base is not None:
-            # What is remembered may lie behind a blank wall that stands in front of it now.
-            unshared = view.columns < view.plane_px
-            mask = self._memory.fill(view, mask, textured & unshared & ~beside, T_map_base)
-        barred = beside | beyond_texture(mask, textured)
-        mask = fill_regions(
-            view, mask, left_rows, disparity, compared, textured, barred, settings.fill_support
-        )
-        may_be = compared.consistent & ~compared.denied & ~barred
-        mask = fill_gaps(view, profile, mask, may_be, settings.fill_gap_m)
+        left = np.ascontiguousarray(left_rows[:, :: view.step])
+        for _ in range(2):
+            barred = beside | odd
+            mask = fill_regions(
+                view, mask, left_rows, disparity, compared, textured, barred, settings.fill_support
+            )
+            may_be = compared.consistent & ~compared.denied & ~barred
+            mask = fill_gaps(view, profile, mask, may_be, settings.fill_gap_m)
+            odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
         return drop_islands(mask)
 
     def _scan(
@@ -291,17 +289,14 @@ class FloorSegmentation:
         mask: NDArray[np.uint8],
         hanging_xy: NDArray[np.float32],
         feet_xy: NDArray[np.float32],
-        T_map_base: Array | None,
     ) -> FloorScan:
-        """Return the scan, and let the memory learn what was seen. hanging_xy, feet_xy: (2, N),
-        what is in the way above the horizon, and where blank faces stand.
+        """Return the scan. hanging_xy, feet_xy: (2, N), what is in the way above the horizon, and
+        where blank faces stand.
         """
         standing = (evidence.mask[::2] == NOT_FLOOR) & evidence.above[::2]
         rows, columns = pixels_where(standing)
         rows *= 2
         upright_xy = view.positions(rows, columns, disparity[rows, columns])
-        if T_map_base is not None:
-            self._memory.learn(view, evidence.mask, upright_xy, T_map_base)
         v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
         floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
         floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR

@@ -33,8 +33,8 @@ POSE = 'keyframe/odometry'
 
 
 class FreeScan:
-    """Publishes `scan` while someone listens: of the newest frame that has come, from small images
-    and without memory, so that it keeps up with the camera.
+    """Publishes `scan` while someone listens: of the newest frame that has come, from small images,
+    so that it keeps up with the camera.
 
     mount: returns that of the camera and None while it is not known.
     """
@@ -105,7 +105,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         )
 
     def reset_stage(self) -> None:
-        """Begin without memory of the floor."""
+        """Begin anew."""
         self._free_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None

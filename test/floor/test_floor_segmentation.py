@@ -1,7 +1,6 @@
 """Floor masks of rendered scenes whose floor is known."""
 
 import dataclasses
-from functools import cache
 
 import cv2
 import numpy as np
@@ -112,13 +111,16 @@ def test_where_nothing_has_texture_the_floor_is_where_the_mount_says(seed):
     np.testing.assert_allclose(observation.profile_px[rows], expected_px, rtol=0.01)
 
 
+@pytest.mark.parametrize(('lighter', 'is_floor'), [(6.0, True), (70.0, False)])
 @pytest.mark.parametrize('floor_kind', FLOORS)
-def test_a_blank_strip_between_floor_is_filled(floor_kind):
+def test_a_blank_strip_between_floor_is_filled_if_it_looks_like_floor(
+    floor_kind, lighter, is_floor
+):
     scene = Scene(
         [
             floor_patch(far_m=1.2, **floor_kind),
             floor_patch(
-                near_m=1.2, far_m=1.8, contrast=0.0, grey=floor_kind.get('grey', 120.0) + 20
+                near_m=1.2, far_m=1.8, contrast=0.0, grey=floor_kind.get('grey', 120.0) + lighter
             ),
             floor_patch(near_m=1.8, **floor_kind),
             wall(),
@@ -127,7 +129,8 @@ def test_a_blank_strip_between_floor_is_filled(floor_kind):
     observation, _, depth = segment(scene)
     x = points_of(scene, depth)[..., 0]
     strip = (x > 1.25) & (x < 1.75)
-    assert np.mean(observation.mask[strip] == FLOOR) > 0.9
+    share = np.mean(observation.mask[strip] == FLOOR)
+    assert share > 0.9 if is_floor else share < 0.1
 
 
 @pytest.mark.parametrize(('seed', 'grey'), [(33, 100.0), (21, 85.0)])
@@ -135,14 +138,15 @@ def test_blank_floor_is_filled_to_the_foot_of_what_stands_on_it(seed, grey):
     """Across the edge of a light, beyond which no floor has texture."""
     blank = [
         floor_patch(near_m=near_m, far_m=far_m, contrast=0.0, grey=grey + lighter)
-        for near_m, far_m, lighter in ((1.0, 1.25, 20), (1.25, 2.0, 41))
+        for near_m, far_m, lighter in ((1.0, 1.25, 4), (1.25, 2.0, 8))
     ]
     textured = floor_patch(far_m=1.0, seed=seed, grey=grey, contrast=9.0)
     scene = Scene([textured, *blank, wall(1.6)], SMALL_CAMERA)
     observation, floor, depth = segment(scene)
     lit = floor & (points_of(scene, depth)[..., 0] > 1.3)
     assert lit.sum() > 2000
-    assert np.mean(observation.mask[lit] == FLOOR) > 0.85
+    # The last row before the wall looks like both.
+    assert np.mean(observation.mask[lit] == FLOOR) > 0.8
     assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
 
 
@@ -208,23 +212,6 @@ def test_a_ramp_is_floor_when_nothing_else_is_in_sight(slope_deg, floor_kind):
     _, recall = shares(observation, floor & below_camera, depth)
     assert precision > 0.99
     assert recall > 0.8
-
-
-def test_remembered_floor_is_not_drawn_beyond_a_crest():
-    """Floor ahead was seen before; now a wall is seen over the crest, where it ends."""
-    wall_behind = wall(5.0, contrast=8.0)
-    stage = FloorSegmentation(CAMERA, SETTINGS)
-    for seed in range(3):
-        left, right, _, _ = Scene([floor_patch(far_m=5.0), wall_behind], seed=seed).render()
-        stage.process(left, right, MOUNT, np.eye(4))
-    # The same place in the map; what is ahead ends in a drop of 0.5 m after 1.2 m.
-    left, right, floor, _ = Scene(
-        [floor_patch(far_m=1.2), Patch((5.0, -4, -3), (0, 8, 0), (0, 0, 5.5), False, contrast=8.0)]
-    ).render()
-    mask = stage.process(left, right, MOUNT, np.eye(4)).mask
-    called = mask == FLOOR
-    assert (called & floor).sum() / floor.sum() > 0.97
-    assert (called & ~floor).sum() / called.sum() < 0.05
 
 
 @pytest.mark.parametrize('drop_m', [0.10, 0.15])
@@ -293,83 +280,6 @@ def test_same_input_same_output():
     second, _, _ = segment(scene, (np.eye(4), np.eye(4)))
     assert first.mask.tobytes() == second.mask.tobytes()
     assert first.scan.ranges_m.tobytes() == second.scan.ranges_m.tobytes()
-
-
-LEFT_CORNER = np.s_[440:, 5:40]
-
-
-@cache
-def way(kind):
-    """Return the images of a drive ahead, and the way driven, over one kind of floor."""
-    patches = [floor_patch(**{'seed': 4, **FLOORS[kind]}), wall(6.0)]
-    seen = []
-    for x_m in (0.0, 0.1, 0.2, 0.3, 0.4):
-        moved = [dataclasses.replace(p, corner=(p.corner[0] - x_m, *p.corner[1:])) for p in patches]
-        seen.append((x_m, Scene(moved).render()[:2]))
-    return seen
-
-
-def approach(stage, kind=0):
-    """Drive ahead, to where the corner that the right camera cannot see was seen from farther
-    away. Returns the last images and the pose; the corner is floor in the last mask alone.
-    """
-    shares_of_corner = []
-    for x_m, images in way(kind):
-        T_map_base = np.eye(4)
-        T_map_base[0, 3] = x_m
-        mask = stage.process(*images, MOUNT, T_map_base).mask
-        shares_of_corner.append(np.mean(mask[LEFT_CORNER] == FLOOR))
-    return shares_of_corner, images, T_map_base
-
-
-@pytest.mark.parametrize('kind', range(len(FLOORS)))
-def test_the_left_border_is_known_from_before(kind):
-    settings = FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)
-    shares_of_corner, _, _ = approach(FloorSegmentation(CAMERA, settings), kind)
-    assert shares_of_corner[0] < 0.3
-    assert shares_of_corner[-1] > 0.7
-
-
-@pytest.mark.parametrize(
-    ('change', 'is_remembered'),
-    [
-        ({'scan_gap_m': 0.2}, True),
-        ({'step_height_m': 0.05}, True),
-        ({'step_height_m': 0.02}, False),
-        ({'drop_height_m': 0.02}, False),
-    ],
-)
-def test_changed_settings_keep_what_is_remembered_as_far_as_it_holds(change, is_remembered):
-    """The left border is known from before alone."""
-    before = dataclasses.replace(SETTINGS, fill_support=1.0, fill_gap_m=0.0)
-    stage = FloorSegmentation(CAMERA, before)
-    shares_of_corner, last, T_map_base = approach(stage)
-    assert shares_of_corner[0] < 0.3 and shares_of_corner[-1] > 0.7
-    stage.change_settings(dataclasses.replace(before, **change))
-    mask = stage.process(*last, MOUNT, T_map_base).mask
-    share = np.mean(mask[LEFT_CORNER] == FLOOR)
-    assert (share > 0.7) if is_remembered else (share < 0.3)
-
-
-@pytest.mark.parametrize('floor_kind', FLOORS)
-@pytest.mark.parametrize(('grey', 'wall_m'), [(70.0, 1.2), (120.0, 2.5), (200.0, 1.8)])
-def test_floor_known_from_the_other_side_is_not_drawn_through_a_blank_wall(
-    grey, wall_m, floor_kind
-):
-    stage = FloorSegmentation(CAMERA, SETTINGS)
-    ground = floor_patch(**floor_kind)
-    left, right, _, _ = Scene([ground, wall(6.0)]).render()
-    for _ in range(3):
-        stage.process(left, right, MOUNT, np.eye(4))
-    blank = Scene([ground, wall(wall_m, contrast=0.0, grey=grey)])
-    left, right, floor, _ = blank.render()
-    observation = stage.process(left, right, MOUNT, np.eye(4))
-    called = observation.mask == FLOOR
-    assert (called & ~floor).sum() / called.sum() < 0.01
-    scan = observation.scan
-    ahead = np.abs(scan.bearings_rad) < np.radians(35)
-    beyond_m = scan.ranges_m[ahead] - wall_m / np.cos(scan.bearings_rad[ahead])
-    assert np.nanquantile(beyond_m, 0.9) < 0.1
 
 
 def test_what_moves_is_no_obstacle_and_the_floor_it_hides_is_unknown():

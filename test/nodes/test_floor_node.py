@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish
-from rclpy.parameter import Parameter
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.floor.pictures import mask_overlay
@@ -81,36 +78,3 @@ def test_pictures_of_the_floor_are_published_for_those_who_look(make_graph) -> N
     rows, columns = np.nonzero(green)
     assert len(np.unique(rows)) > 0.3 * CAMERA.height
     assert np.corrcoef(rows, columns)[0, 1] > 0.98
-
-
-def test_a_changed_parameter_leaves_the_floor_its_memory(make_graph) -> None:
-    """The left border, which the right camera does not see, is known from before alone."""
-    room = StereoRoom(seed=5)
-    poses = [planar_pose(0.1 * k, 0.0, 0.0) for k in range(4)]
-    frames = [room.frame(k, pose) for k, pose in enumerate(poses)]
-    settings = FloorSegmentationSettings(fill_support=1.0, fill_gap_m=0.0)
-    changed = replace(settings, scan_gap_m=0.3)
-    stage = FloorSegmentation(CAMERA, settings)
-    for frame, pose in zip(frames[:-1], poses, strict=False):
-        stage.process(frame.left, frame.right, MOUNT, pose)
-    stage.change_settings(changed)
-    last = frames[-1].left, frames[-1].right, MOUNT, poses[-1]
-    expected, anew = stage.process(*last).mask, FloorSegmentation(CAMERA, changed).process(*last)
-    assert np.count_nonzero(expected != anew.mask) > 1000
-    graph = make_graph('-p', 'fill_support:=1.0', '-p', 'fill_gap_m:=0.0')
-    masks = graph.collect('keyframe/floor_mask')
-    node = graph.add(FloorSegmentationNode())
-    mount = transform_message(STAMP_NS, 'base_link', 'left', MOUNT.T_base_left)
-    publishers = publish(graph, {'camera_mount': mount})
-
-    def segmented(k: int) -> np.ndarray:
-        messages = keyframe_messages(STAMP_NS + k, frames[k].left, frames[k].right, poses[k])
-        publish(graph, messages, publishers)
-        graph.until(lambda: len(masks) == k + 1, 'the mask')
-        return grey8_image(masks[k], '')
-
-    for k in range(3):
-        segmented(k)
-    (result,) = node.set_parameters([Parameter('scan_gap_m', value=0.3)])
-    assert result.successful
-    np.testing.assert_array_equal(segmented(3), expected)

@@ -28,7 +28,6 @@ _STRONG_SLOPE = 10.0
 _TEXTURE_MARGIN = 7
 _HOLE_ROWS = 12
 """As high as the window in which texture is measured."""
-_TEXTURED_SHARE = 0.7
 _UNMATCHED_PX = 12
 """So wide a strip at the border of what both cameras see may be without matches."""
 
@@ -150,30 +149,6 @@ def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.boo
     # Rows in between begin with a hole.
     near = cv2.dilate(begins_with_floor.view(np.uint8), np.ones((_HOLE_ROWS + 1, 1), np.uint8))
     return (view.columns < floor_px) & (near == 0)
-
-
-def beyond_texture(mask: NDArray[np.uint8], textured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which blank pixels of a mask (R, W) lie beyond the end of a floor that has texture.
-
-    Up a column nearly all of the floor showed its texture, and now more is blank than a hole in
-    it, up to what is no floor or to the horizon: a blank wall looks like that, and what is known
-    left and right of it says nothing about it. A wall hides what is behind it; where floor is
-    seen farther up, there is none.
-    """
-    turned = np.ascontiguousarray(mask.T)
-    blank = (turned == NO_EVIDENCE) & ~textured.T
-    runs = Runs.of(blank)
-    last = turned.shape[1] - 1
-    foot = np.minimum(runs.stop, last)
-    seen, holes = (
-        np.cumsum(where[:, ::-1], axis=1, dtype=np.int32)[:, ::-1][runs.row, foot]
-        for where in (turned == FLOOR, blank)
-    )
-    ended = (runs.stop - runs.first > _HOLE_ROWS) & (runs.stop <= last)
-    ended &= seen > _TEXTURED_SHARE * (seen + holes)
-    ended &= ~_below_floor(turned)[runs.row, runs.first]
-    beyond: NDArray[np.bool_] = runs.painted(ended).T
-    return beyond
 
 
 def with_floor(mask: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,14 @@ _SURE_SHARE = 1.5
 """Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
+
+
+_NEIGHBOURS_PX = 9
+"""Heights are averaged over so wide a square; ones that are matched err together."""
+_MEAN_SIGMAS = 0.7
+"""Two sigmas of such a mean, which errs by 0.35 of what one height does."""
+_MOST_SIGMAS = np.float32(10)
+_LEAST_KNOWN = 0.2
 
 
 @dataclass(frozen=True)
@@ -44,8 +53,8 @@ class Comparison:
 @dataclass(frozen=True)
 class HeightTable:
     """Per disparity step: row: the de-rolled row of the floor. Height above the floor is
-    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor. All (B,)
-    float32, NaN at disparity 0.
+    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor; noise: its
+    error, one sigma. All (B,) float32, NaN at disparity 0.
     """
 
     row: NDArray[np.float32]
@@ -53,6 +62,7 @@ class HeightTable:
     scale: NDArray[np.float32]
     up: NDArray[np.float32]
     down: NDArray[np.float32]
+    noise: NDArray[np.float32]
 
     @classmethod
     def of(
@@ -77,16 +87,22 @@ class HeightTable:
             scale,
             np.hypot(settings.step_height_m, noise_m),
             settings.drop_height_m + 2 * noise_m,
+            noise_m,
         )
         return cls(*(table.astype(np.float32) for table in tables))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """mask: (R, W) uint8. above: (R, W) bool, what is matched above the floor."""
+    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off: what is
+    matched off it, in the mean of its neighbours, farther than noise explains; odd: what does not
+    look like floor.
+    """
 
     mask: NDArray[np.uint8]
     above: NDArray[np.bool_]
+    off: NDArray[np.bool_]
+    odd: NDArray[np.bool_]
 
 
 def judge(
@@ -123,7 +139,19 @@ def judge(
     low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    return Evidence(mask, height > 0)
+    nothing = np.zeros_like(above)
+    return Evidence(mask, height > 0, _off_floor(height / table.noise.take(index)), nothing)
+
+
+def _off_floor(sigmas: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell where heights (R, W), in sigmas, are off the floor in the mean of their neighbours."""
+    window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
+    known = np.isfinite(sigmas)
+    share = cv2.blur(known.astype(np.float32), window)
+    # One that is far off speaks for no more than a few.
+    bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
+    mean = cv2.blur(bounded, window)
+    return (np.abs(mean) > np.float32(_MEAN_SIGMAS) * share) & (share > _LEAST_KNOWN)
 
 
 def _below_contact(

@@ -72,30 +72,6 @@ class FloorView:
         offset = self.mount.T_base_left[:2, 3:4].astype(np.float32)
         return self.rays(rows, columns)[:2] * depth + offset
 
-    def floor_positions(
-        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
-    ) -> NDArray[np.float32]:
-        """Return where the rays of pixels meet the floor's plane, (2, N) in the base's plane;
-        very far where they do not.
-        """
-        rays = self.rays(rows, columns)
-        depth = np.float32(self.mount.height_m) / np.maximum(-rays[2], np.float32(1e-5))
-        return rays[:2] * depth + self.mount.T_base_left[:2, 3:4].astype(np.float32)
-
-    def pixels_of_floor(self, xy_base: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the view's pixels, (2, N) of row and column, of positions (2, N) on the floor's
-        plane; negative rows where they are behind the camera.
-        """
-        x, y, depth = self._in_camera(xy_base)
-        camera = self.camera
-        v = y / depth * np.float32(camera.fy) + np.float32(camera.cy - self.first_row)
-        u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
-        behind = depth > _FAR_M
-        pixels: NDArray[np.float32] = np.stack(
-            [np.where(behind, np.float32(-1), v), u / np.float32(self.step)]
-        )
-        return pixels
-
     def pixels_of_profile(
         self, xy_base: NDArray[np.float32], profile: FloorProfile
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:

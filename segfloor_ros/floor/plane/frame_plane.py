@@ -15,6 +15,7 @@ from segfloor_ros.floor.disparity.profile import HEIGHT_SIGMA, PITCH_SIGMA_RAD, 
 from segfloor_ros.floor.mask.runs import pixels_where
 from segfloor_ros.floor.mask.view import column_step
 from segfloor_ros.floor.plane.plane_fit import (
+    HEIGHT_RANGE_M,
     PlaneFit,
     Samples,
     angles_height_of,
@@ -49,15 +50,16 @@ _FLAT_WEIGHT = 0.1
 def expectations(mount: Mount, T_map_base: Array | None) -> Array:
     """Return what pitch, roll and height to expect, (P, 3), the likeliest first.
 
-    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the
-    map.
+    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map;
+    or, of a camera in a hand, as high as it is in the map.
     """
     mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
     if T_map_base is None:
         return mounted[None]
     T_map_left = T_map_base @ mount.T_base_left
-    level = angles_height_of(T_map_left[2, :3] / mount.height_m)
-    return np.stack([mounted, level])
+    # A height that nothing can have is none.
+    heights_m = np.maximum((mount.height_m, T_map_left[2, 3]), HEIGHT_RANGE_M[0])
+    return np.stack([mounted, *angles_height_of(T_map_left[2, :3] / heights_m[:, None])])
 
 
 def plane_of_frame(

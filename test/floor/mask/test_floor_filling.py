@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
-from segfloor_ros.floor.mask.filling import beside_something, beyond_texture, drop_islands
+from segfloor_ros.floor.mask.filling import beside_something, drop_islands
 from segfloor_ros.floor.mask.view import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
@@ -22,29 +22,6 @@ def test_patches_much_smaller_than_the_floor_are_dropped():
     others = np.ones(mask.shape, bool)
     others[90:100, 180:190] = False
     np.testing.assert_array_equal(dropped[others], mask[others])
-
-
-def blank_wall_on_floor(hole_rows, textured_share=1.0, top=NOT_FLOOR):
-    """Return a mask and where it has texture: floor from row 60 on, so many blank rows above it."""
-    mask = np.full((120, 40), top, np.uint8)
-    mask[60 - hole_rows : 60] = NO_EVIDENCE
-    mask[60:] = FLOOR
-    mask[70 : 70 + round(60 * (1 - textured_share))] = NO_EVIDENCE
-    return mask, mask == FLOOR
-
-
-def test_blank_rows_above_textured_floor_are_beyond_its_end():
-    mask, textured = blank_wall_on_floor(30)
-    np.testing.assert_array_equal(beyond_texture(mask, textured), mask == NO_EVIDENCE)
-
-
-def test_holes_and_floor_with_blank_parts_are_not():
-    for mask, textured in (
-        blank_wall_on_floor(10),  # no more than the window of texture
-        blank_wall_on_floor(30, textured_share=0.4),  # this floor has blank parts
-        blank_wall_on_floor(30, top=FLOOR),  # a wall would hide the floor behind it
-    ):
-        assert not beyond_texture(mask, textured).any()
 
 
 def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it():

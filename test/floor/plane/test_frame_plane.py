@@ -29,7 +29,17 @@ def pitched(pitch_deg: float):
 def test_the_floor_is_where_the_map_has_it_only_if_that_is_what_is_seen(share, pitch_deg, expected):
     known = expectations(MOUNT, pitched(pitch_deg))
     assert np.degrees(known[1, 0] - known[0, 0]) == pytest.approx(pitch_deg)
-    assert likeliest(np.array(share), known) == expected
+    # What is seen speaks as well for the height in the map, which is that of the mount here.
+    assert likeliest(np.array([*share, share[1]]), known) == expected
+
+
+def test_a_camera_in_a_hand_is_as_high_as_the_map_has_it():
+    pose = pitched(2.0)
+    pose[2, 3] = 0.2
+    height_m = (pose @ MOUNT.T_base_left)[2, 3]
+    known = expectations(MOUNT, pose)
+    np.testing.assert_allclose(known[:, 2], [MOUNT.height_m, MOUNT.height_m, height_m])
+    assert likeliest(np.array([0.0, 0.05, 0.4]), known) == 2
 
 
 @pytest.mark.filterwarnings('error')

@@ -1,0 +1,54 @@
+"""What does not look like floor is floor only where that was measured."""
+
+import numpy as np
+import pytest
+from floor_scenes import FLOORS, Scene, box, floor_patch, wall
+
+from segfloor_ros.floor.mask.appearance import unlike_floor
+from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.settings import FloorSegmentationSettings
+
+
+def floor_image(rng, sigma):
+    ramp = np.linspace(90, 150, 320)
+    return np.clip(ramp + rng.normal(0, sigma, (160, 320)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize('sigma', [2.0, 8.0])
+def test_a_dark_thing_is_odd_and_light_that_changes_slowly_is_not(sigma):
+    image = floor_image(np.random.default_rng(1), sigma)
+    image[60:100, 100:160] = 10
+    floor = np.ones(image.shape, bool)
+    floor[55:105, 95:165] = False
+    odd = unlike_floor(image, floor)
+    assert odd[65:95, 105:155].all()
+    assert odd[floor].mean() < 0.08
+
+
+def test_what_was_taken_for_floor_does_not_hide_itself():
+    image = floor_image(np.random.default_rng(2), 4.0)
+    image[60:80, 100:130] = 10
+    odd = unlike_floor(image, np.ones(image.shape, bool))
+    assert odd[63:77, 103:127].all()
+
+
+def test_where_no_floor_is_known_nothing_is_odd():
+    image = floor_image(np.random.default_rng(3), 4.0)
+    assert not unlike_floor(image, np.zeros(image.shape, bool)).any()
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_plain_dark_thing_right_ahead_is_not_filled_as_floor(floor_kind):
+    """It has no disparity of its own, and floor all around it."""
+    dark = {'contrast': 0.0, 'grey': 12.0}
+    things = [box(x_m, y_m, 0.2, 0.06, **dark) for x_m, y_m in ((0.8, 0.1), (1.3, -0.3))]
+    scene = Scene([floor_patch(**floor_kind), *(side for one in things for side in one), wall(4.0)])
+    left, right, floor, depth = scene.render()
+    stage = FloorSegmentation(scene.camera, FloorSegmentationSettings())
+    called = stage.process(left, right, scene.mount).mask == FLOOR
+    thing = ~floor & (depth < 1.6)
+    assert thing.sum() > 1000
+    assert (called & thing).sum() < 0.02 * thing.sum()
+    wanted = floor & (depth > 0.5) & (depth < 3.0)
+    assert (called & wanted).sum() > 0.9 * wanted.sum()
