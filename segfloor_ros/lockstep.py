@@ -342,6 +342,7 @@ class LockstepRun:
             frames_per_s=round(self._frames / wall_s, 2),
             **results_folder.mount_figures(self._known_mount),
             sensors=self._sensors_used(),
+            repeated_frames=sum(r.repeated and r.tracked for r in self._results),
             blind_frames=sum(result.blind for result in self._results),
             moving_frames=sum(_shows_motion(result) for result in self._results),
             sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],

@@ -60,6 +60,7 @@ class RunSummary:
     was lost and found again, lost_s and found_s. apart: the first_frame and last_frame of every
     stretch that was mapped without knowing where in the map it is, and whether it was `joined`
     later; what was not is in no map and no trajectory. sensors: messages used, by name.
+    repeated_frames: tracked although the camera delivered the image before again, bit for bit.
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
     found that moves. sensor_remarks: what seems wrong with sensors, in words. failed_frames,
     failed_keyframes: at which a stage failed; they are lost or not in the map. interrupted: whether
@@ -83,6 +84,7 @@ class RunSummary:
     camera_pitch_rad: float | None
     camera_roll_rad: float | None
     sensors: dict[str, int]
+    repeated_frames: int
     blind_frames: int
     moving_frames: int
     sensor_remarks: list[str]
@@ -284,11 +286,13 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the summary as (what, value with unit) for people."""
     tracked = f'{summary.tracked_frames} of {summary.frames}'
     lost = ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'
+    repeated = summary.repeated_frames
     used = ', '.join(f'{name} ({count})' for name, count in summary.sensors.items())
     rows: list[tuple[str, Any]] = [
         *([('sensors used (messages)', used)] if used else []),
         ('frames tracked', tracked),
         *([('of them on sensors alone', summary.blind_frames)] if used else []),
+        *([('frames repeated by the camera', repeated)] if repeated else []),
         ('frames lost', lost),
         *(('frames mapped apart', _apart_words(part)) for part in summary.apart),
         *(('remark', remark) for remark in summary.sensor_remarks),

@@ -258,6 +258,7 @@ class ReplaySession:
             frames_per_s=round(len(stamps) / wall_s, 2),
             **mount_figures(mount),
             sensors=_sensors_sent(finished),
+            repeated_frames=sum(bool(s and s.values.get('repeated') == '1') for s in answers),
             blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
             moving_frames=sum(bool(s and int(s.values.get('moving', 0))) for s in answers),
             sensor_remarks=recorder.remarks,

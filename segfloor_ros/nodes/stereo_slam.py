@@ -282,6 +282,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
             blind=int(result.blind),
             apart=int(result.apart),
+            repeated=int(result.repeated and result.tracked),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
 

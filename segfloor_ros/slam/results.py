@@ -111,6 +111,7 @@ class FrameResult:
     is that of wheels or a gyroscope alone. keyframe: set when
     this frame became one. moving: what moves, where this frame was searched for it. apart: whether
     it was, at first, not known where in the map this is: `tracked` where it was recognised later.
+    repeated: whether the left image is the one before, bit for bit.
     """
 
     index: int
@@ -126,6 +127,7 @@ class FrameResult:
     moving: MovingPoints | None = None
     blind: bool = False
     apart: bool = False
+    repeated: bool = False
 
 
 @dataclass(frozen=True)

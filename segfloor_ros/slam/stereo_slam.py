@@ -40,6 +40,7 @@ HARDLY_BEGUN = 5
 ORB-SLAM2, 2017, does the same)."""
 
 HELD = 'held where the drive was broken off'
+REPEATED = 'tracking: the image is the one before; the motion is taken to go on'
 NOTHING_SEEN = 'too few known points in view'
 MAPPED_APART = ', mapped before the map was recognised'
 NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
@@ -154,6 +155,8 @@ class StereoSlam:
             self._front_end.consensus.mount = self.mount
             self._front_end.offset_px = self.disparity_offset_px
             fault = self._front_end.fault(frame)
+            if self._front_end.repeats.is_carried and not fault:
+                return self._hold(self._carried(frame))
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = (
                 self._front_end.track(frame, images) if self.map.keyframes and not fault else None
@@ -183,8 +186,25 @@ class StereoSlam:
         result = self._result(frame, track, fault, keyframe)
         if searched is not None:
             result = replace(result, moving=searched.points)
+        return self._hold(result)
+
+    def _hold(self, result: FrameResult) -> list[FrameResult]:
+        """Add a result to those that are held back, and return what is ready."""
         self._held.add(result)
         return [] if self.is_apart else self._held.release(self.mount)
+
+    def _carried(self, frame: StereoFrame) -> FrameResult:
+        """Return the outcome of a frame whose image is the one before: the motion goes on."""
+        motion = self._front_end.motion
+        expected = motion.expected(frame.stamp_ns)
+        result = self._result(frame, None, '', None)
+        return replace(
+            result,
+            tracked=True,
+            T_odom_base=invert(expected.T_camera_world @ motion.T_world_odom),
+            covariance=self._covariance() - motion.covariance + expected.covariance,
+            state=REPEATED,
+        )
 
     def finish(self) -> list[FrameResult]:
         """Return the results that are still held back after the last frame: as lost, for no place
@@ -387,6 +407,7 @@ class StereoSlam:
             keyframe,
             blind=motion.is_blind,
             apart=self.is_apart,
+            repeated=self._front_end.repeats.is_repeated,
         )
 
 

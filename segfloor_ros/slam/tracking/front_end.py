@@ -23,10 +23,10 @@ from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.firm_points import count_firm
 from segfloor_ros.slam.tracking.following import Follower
 from segfloor_ros.slam.tracking.images import (
-    FrozenCheck,
     ImageRotation,
     Images,
     Region,
+    RepeatCheck,
     expected_shift,
     image_fault,
     is_inside,
@@ -86,7 +86,7 @@ class FrontEnd:
         self._prior: PoseEstimate | None = None
         self._tells_less = False
         self._relocaliser = Relocaliser(sparse_map, self.places)
-        self._frozen = FrozenCheck()
+        self.repeats = RepeatCheck()
         self._rotation = ImageRotation(camera)
 
     @property
@@ -134,10 +134,10 @@ class FrontEnd:
             motion.T_camera_world,
             motion.predict(frame.stamp_ns),
         )
-        frozen = self._frozen.frozen(frame.left, shift)
+        frozen = self.repeats.is_frozen(frame.left, shift)
         fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
         if frozen and not fault:
-            return 'the image is the one before although the camera was moving'
+            return 'the image is again the one before although the camera was moving'
         return fault
 
     def track(self, frame: StereoFrame, images: Images) -> Track | None:

@@ -164,23 +164,31 @@ def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Ar
     return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
 
 
-class FrozenCheck:
-    """Tells a camera that delivers its last image again and again from a robot that stands still:
-    the robot would have had to stop at once, and noise differs from image to image.
+class RepeatCheck:
+    """Tells an image that a camera delivers twice, as a Kinect does, from a camera that is frozen:
+    it delivers the same one again and again. A robot that stands still shows the same view, too,
+    but then no motion was to be expected.
+
+    is_repeated: whether the last image is the one before. is_carried: whether its view should have
+    moved since, so that it tells nothing of this moment.
     """
 
     def __init__(self) -> None:
         self._last: NDArray[np.uint8] | None = None
-        self._frozen = False
+        self.is_repeated = self.is_carried = self._is_frozen = False
 
-    def frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
-        """Return whether the image (H, W) is the one before although it was to move by
-        expected_shift(), a share of its width, which is asked for only then.
+    def is_frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
+        """Return whether the image (H, W) is the one before for a second time although it was to
+        move by expected_shift(), a share of its width, which is asked for only then.
         """
-        same = self._last is not None and np.array_equal(left, self._last)
+        was_carried = self.is_carried
+        self.is_repeated = self._last is not None and np.array_equal(left, self._last)
         self._last = left
-        self._frozen = same and (self._frozen or expected_shift() > MIN_EXPECTED_SHIFT)
-        return self._frozen
+        self._is_frozen &= self.is_repeated
+        should_move = self.is_repeated and expected_shift() > MIN_EXPECTED_SHIFT
+        self._is_frozen |= should_move and was_carried
+        self.is_carried = should_move and not self._is_frozen
+        return self._is_frozen
 
 
 class ImageRotation:

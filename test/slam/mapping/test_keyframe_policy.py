@@ -6,7 +6,7 @@ import pytest
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.slam.places.known_views import View, is_keyframe, novelty
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.tracking.images import FrozenCheck, image_fault
+from segfloor_ros.slam.tracking.images import RepeatCheck, image_fault
 
 SETTINGS = StereoSlamSettings(
     keyframe_max_frames=30,
@@ -64,11 +64,20 @@ def test_image_faults_are_named():
     assert 'left image incomplete' in image_fault(half, good)
 
 
-def test_an_image_is_frozen_when_it_repeats_although_the_camera_was_moving():
+def test_an_image_is_repeated_once_and_frozen_then_where_the_camera_was_moving():
     one, two = np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
-    check = FrozenCheck()
-    assert not check.frozen(one, lambda: 0.05)  # nothing came before
-    assert check.frozen(one.copy(), lambda: 0.05)
-    assert check.frozen(one.copy(), lambda: 0.0)  # still the same one
-    assert not check.frozen(two, lambda: 0.05)
-    assert not check.frozen(two.copy(), lambda: 0.0005)  # it stands still
+    check = RepeatCheck()
+
+    def see(image, shift):
+        return check.is_frozen(image.copy(), lambda: shift), check.is_repeated, check.is_carried
+
+    assert see(one, 0.05) == (False, False, False)  # nothing came before
+    assert see(one, 0.05) == (False, True, True)
+    assert see(one, 0.05) == (True, True, False)
+    assert see(one, 0.0) == (True, True, False)  # still the same one
+    assert see(two, 0.05) == (False, False, False)
+    assert see(two, 0.0005) == (False, True, False)  # it stands still
+    assert see(one, 0.05) == (False, False, False)
+    assert see(one, 0.05) == (False, True, True)
+    assert see(two, 0.05) == (False, False, False)
+    assert see(two, 0.05) == (False, True, True)
