@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.blank_border import blank_border
 from segfloor_ros.camera.depth import is_disparity
+from segfloor_ros.camera.images import blank_border
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
 from segfloor_ros.floor.disparity.matching import (

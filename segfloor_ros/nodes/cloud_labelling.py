@@ -20,8 +20,7 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.node_settings import CloudLabellingNodeSettings
-from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin
-from segfloor_ros.nodes.shared.map_part import MapPart
+from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 from segfloor_ros.settings import RobotSettings

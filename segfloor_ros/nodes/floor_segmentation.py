@@ -13,7 +13,7 @@ from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
-from segfloor_ros.floor.plane.mount_check import MountCheck
+from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.messages.floor import disparity_message, free_scan_message, scan_message
 from segfloor_ros.messages.headers import to_ns

@@ -18,8 +18,7 @@ from segfloor_ros.messages.floor import scan_arrays
 from segfloor_ros.messages.map_files import grid_message
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.node_settings import OccupancyGridNodeSettings
-from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin
-from segfloor_ros.nodes.shared.map_part import MapPart
+from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 

@@ -28,7 +28,7 @@ from camera_recordings import (
 )
 
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
-from segfloor_ros.camera.sources.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
+from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
 from segfloor_ros.errors import CalibrationError, InputError
 
 STAMPS = [1_700_000_000_000_000_000 + i * 100 * MS for i in range(4)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segfloor_ros.camera.blank_border import blank_border, matched_in
+from segfloor_ros.camera.images import blank_border, matched_in
 
 
 def bordered(seed=0):

@@ -33,7 +33,7 @@ from segfloor_ros.camera.depth import (
     seen_from_right,
 )
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources.bag_topics import IMAGE, find_depth_topics
+from segfloor_ros.camera.sources.bag_file import IMAGE, find_depth_topics
 from segfloor_ros.errors import InputError
 
 SCALE = FX * VIRTUAL_BASELINE_M

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
-from segfloor_ros.camera.deblocking import deblocked
+from segfloor_ros.camera.calibration.rectification import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.floor.disparity.profile import FloorLine

@@ -17,7 +17,7 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.calibration.rectification import rows_apart_px
-from segfloor_ros.floor.plane.mount_check import MountCheck
+from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from segfloor_ros.nodes.shared.pacing import (
+from segfloor_ros.nodes.stereo_camera import (
     MAX_FRAMES_UNDER_WAY,
     MAX_KEYFRAMES_UNDER_WAY,
     PATIENCE_S,

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.demo import DRIVE, demo
-from segfloor_ros.cli.simulate import simulate as simulate_command
+from segfloor_ros.cli.recordings import simulate as simulate_command
 from segfloor_ros.evaluation.truth import load_truth
 from segfloor_ros.simulation.renderer import RenderingError
 

@@ -17,7 +17,7 @@ from segfloor_ros.camera.images import Grey, depth_image, grey_image
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.camera.ros_messages import eye_calibration, stamp_ns
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources import bag_topics
+from segfloor_ros.camera.sources import bag_file as bag_topics
 from segfloor_ros.camera.sources.bag_file import BagFile, open_bag_file
 from segfloor_ros.camera.sources.bag_sensors import bag_sensors
 from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, rate_of

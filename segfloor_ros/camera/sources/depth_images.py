@@ -16,7 +16,7 @@ from segfloor_ros.camera.calibration.files import given_left_calibration, read_e
 from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources import files
+from segfloor_ros.camera.sources import pairing as files
 from segfloor_ros.camera.sources.pairing import Stamped
 from segfloor_ros.camera.sources.sensor_files import DEPTH, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource

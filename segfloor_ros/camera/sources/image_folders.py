@@ -1,30 +1,60 @@
-"""Two folders of images, or one folder with both sides, with ROS calibration files."""
+"""Two folders of images, or one folder with both sides, with ROS calibration files.
+
+EuRoC ASL folders: cam0 and cam1, each with data.csv, sensor.yaml and data/.
+
+KITTI odometry folders: image_0 and image_1 (grey) or image_2 and image_3 (colour), calib.txt,
+times.txt.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from segfloor_ros.camera.calibration.files import (
     find_calibration,
+    given_calibration,
     given_left_calibration,
+    read_body_pose,
+    read_calibration,
     read_eye_calibration,
+    read_kitti_calibration,
+    read_kitti_eye,
 )
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources import files
+from segfloor_ros.camera.sources import pairing as files
 from segfloor_ros.camera.sources.depth_images import DEPTH, MONO, with_depth
-from segfloor_ros.camera.sources.pairing import check_times, read_times, stamps_of_rate
-from segfloor_ros.camera.sources.sensor_files import folder_sensors
-from segfloor_ros.camera.sources.sides import is_side, side_pairs
+from segfloor_ros.camera.sources.pairing import (
+    Stamped,
+    check_times,
+    is_side,
+    read_times,
+    side_pairs,
+    stamps_of_rate,
+)
+from segfloor_ros.camera.sources.sensor_files import IMU, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.tables import whole_nanoseconds
+from segfloor_ros.geometry import invert, make_transform
+from segfloor_ros.measurements import RecordedSensor
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
 NANOSECOND_DIGITS = 16
 """A name that is a number of so many digits is taken for a stamp in ns."""
+
+EUROC_CAMERAS = ('cam0', 'cam1')
+IMU_FOLDER = 'imu0'
+INDEX = 'data.csv'
+SENSOR = 'sensor.yaml'
+
+KITTI_CAMERAS = ((0, 1), (2, 3))
 
 
 def has_image_sides(folder: Path) -> bool:
@@ -124,3 +154,130 @@ def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
         with contextlib.suppress(ValueError):
             return [whole_nanoseconds(path.stem) for path in left]
     return stamps_of_rate(len(left), rate_hz)
+
+
+def is_euroc(folder: Path) -> bool:
+    """Whether `folder` (or its `mav0`) looks like an EuRoC sequence."""
+    root = _root(folder)
+    return any((root / cam / name).exists() for cam in EUROC_CAMERAS for name in (INDEX, SENSOR))
+
+
+def open_euroc(folder: Path, settings: StereoCameraSettings) -> StereoSource:
+    """Open an EuRoC ASL folder. Left and right are paired by their stamps.
+
+    Raises InputError or CalibrationError.
+    """
+    root = _root(folder)
+    left, right = (_read_index(root / camera) for camera in EUROC_CAMERAS)
+    names = (str(root / EUROC_CAMERAS[0]), str(root / EUROC_CAMERAS[1]))
+    pairs = files.pairs_by_stamp(left, right, settings.pairing_tolerance_s, names)
+    sides = (root / camera / SENSOR for camera in EUROC_CAMERAS)
+    calibration = given_calibration(settings) or read_calibration(*sides)
+    sensors = _sensors(root, calibration, settings)
+    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
+
+
+def _root(folder: Path) -> Path:
+    return folder / 'mav0' if (folder / 'mav0').is_dir() else folder
+
+
+def _sensors(
+    root: Path, calibration: StereoCalibration, settings: StereoCameraSettings
+) -> list[RecordedSensor]:
+    """The IMU of imu0 is in the rectified left optical frame where both `T_BS` have it."""
+    imu, ignored = root / IMU_FOLDER / INDEX, settings.ignored_sensors
+    if not imu.exists() or IMU in ignored:
+        return folder_sensors(root, ignored, None, imu)
+    T_body_left, T_body_imu = (
+        read_body_pose(root / n / SENSOR) for n in (EUROC_CAMERAS[0], IMU_FOLDER)
+    )
+    T_left_raw = make_transform(calibration.left.R, np.zeros(3))
+    T_left_imu = T_left_raw @ invert(T_body_left) @ T_body_imu
+    return folder_sensors(root, ignored, T_left_imu, imu)
+
+
+def _read_index(camera: Path) -> list[Stamped[Path]]:
+    """Return the images of one camera with their stamps; without data.csv their names tell them."""
+    if not (camera / 'data').is_dir():
+        raise InputError(f'{camera / "data"}: no such folder; a stereo pair is cam0 and cam1')
+    index = camera / INDEX
+    if not index.exists():
+        return [*_named_by_stamp(files.images_in(camera / 'data'))]
+    return files.read_index(index, partial(_entry, camera / 'data'))
+
+
+def _entry(folder: Path, line: str, where: str) -> Stamped[Path]:
+    stamp, _, name = line.partition(',')
+    try:
+        stamp_ns = whole_nanoseconds(stamp.strip())
+    except ValueError as error:
+        raise InputError(f'{where}: expected a stamp in ns and a file name ({error})') from None
+    image = folder / (name.strip() or f'{stamp.strip()}.png')
+    if not image.exists():
+        raise InputError(f'{where}: {image} does not exist; complete the copy, or remove the line')
+    return Stamped(stamp_ns, image)
+
+
+def _named_by_stamp(images: Iterable[Path]) -> Iterator[Stamped[Path]]:
+    for path in images:
+        with contextlib.suppress(ValueError):
+            yield Stamped(whole_nanoseconds(path.stem), path)
+
+
+def is_kitti(folder: Path) -> bool:
+    """Whether `folder` looks like a KITTI odometry sequence."""
+    has_index = (folder / 'calib.txt').exists() or (folder / 'times.txt').exists()
+    return has_index and any((folder / f'image_{i}').is_dir() for i in range(4))
+
+
+def open_kitti(folder: Path, settings: StereoCameraSettings) -> StereoSource:
+    """Open a KITTI odometry folder. Raises InputError or CalibrationError."""
+    camera, partner = _cameras(folder)
+    has_right = partner is not None and not settings.depth
+    left = files.images_in(folder / f'image_{camera}')
+    right = files.images_in(folder / f'image_{partner}') if has_right else left
+    files.check_equal_numbers(str(folder), left, right)
+    indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
+    pairs = [files.FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
+    calib, size = folder / 'calib.txt', files.first_image_size(left, str(folder))
+    if partner is None or not has_right:
+        eye = given_left_calibration(settings) or read_kitti_eye(calib, *size, camera)
+        return with_depth(folder, pairs, eye, settings)
+    calibration = given_calibration(settings)
+    calibration = calibration or read_kitti_calibration(calib, *size, (camera, partner))
+    sensors = folder_sensors(folder, settings.ignored_sensors)
+    return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
+
+
+def _cameras(folder: Path) -> tuple[int, int | None]:
+    """Return the numbers of the left and the right camera; None for the latter where there are
+    depth images.
+    """
+    for cameras in KITTI_CAMERAS:
+        if all((folder / f'image_{camera}').is_dir() for camera in cameras):
+            return cameras
+    for camera, _ in KITTI_CAMERAS:
+        if (folder / f'image_{camera}').is_dir() and (folder / DEPTH).is_dir():
+            return camera, None
+    found = ', '.join(path.name for path in sorted(folder.glob('image_*')))
+    raise InputError(
+        f'{folder}: has {found}, but a stereo pair is image_0 with image_1, or image_2 with '
+        f'image_3; {MONO}'
+    )
+
+
+def _indices_and_stamps(
+    times: Path, left: Sequence[Path], rate_hz: float
+) -> tuple[list[int], list[int]]:
+    """Line k of times.txt belongs to the image whose name is the number k; names that are no such
+    numbers are matched in order.
+    """
+    indices = list(range(len(left)))
+    if not times.exists():
+        return indices, stamps_of_rate(len(left), rate_hz)
+    stamps = read_times(times)
+    numbers = [int(path.stem) for path in left if path.stem.isdecimal()]
+    if len(numbers) == len(left) and numbers[-1] < len(stamps):
+        return numbers, [stamps[number] for number in numbers]
+    check_times(times, stamps, left)
+    return indices, stamps

@@ -9,9 +9,14 @@ from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag import open_bag
 from segfloor_ros.camera.sources.bag_file import is_bag
 from segfloor_ros.camera.sources.depth_images import is_tum_rgbd, open_tum_rgbd
-from segfloor_ros.camera.sources.euroc import is_euroc, open_euroc
-from segfloor_ros.camera.sources.image_folders import has_image_sides, open_image_folders
-from segfloor_ros.camera.sources.kitti import is_kitti, open_kitti
+from segfloor_ros.camera.sources.image_folders import (
+    has_image_sides,
+    is_euroc,
+    is_kitti,
+    open_euroc,
+    open_image_folders,
+    open_kitti,
+)
 from segfloor_ros.camera.sources.source import MaskFolder, StereoSource
 from segfloor_ros.camera.sources.video import is_device, is_video, open_device, open_video
 from segfloor_ros.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.blank_border import matched_in
+from segfloor_ros.camera.images import matched_in
 from segfloor_ros.floor.observation import NO_EVIDENCE
 
 

@@ -1,4 +1,7 @@
-"""The camera's height, pitch and roll, measured from the floor it sees."""
+"""The camera's height, pitch and roll, measured from the floor it sees.
+
+Compares the camera's mount in use with the one that the first keyframes show of the floor.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from segfloor_ros.floor.plane.mirror import (
     mirror_candidates,
     mirrored_share,
 )
-from segfloor_ros.floor.plane.mount_view import MountViewer
+from segfloor_ros.floor.plane.mount_view import MountViewer, PlaneSearch
 from segfloor_ros.floor.plane.plane_fit import (
     PlaneFit,
     Samples,
@@ -24,8 +27,7 @@ from segfloor_ros.floor.plane.plane_fit import (
     plausible,
     shares,
 )
-from segfloor_ros.floor.plane.plane_search import PlaneSearch
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, invert
 from segfloor_ros.measurements import Up
 
 _USUAL = np.array([0.0, 0.0, 0.3])
@@ -61,6 +63,9 @@ _MIRROR_FIRST, _MIRROR_EVERY = 3, 4
 """A mirror is looked for in so many keyframes, and then in every so-manyth until one is found."""
 _NEARER = 0.8
 """A mirror at so much of the height of what looks like the floor lies clearly above it."""
+
+MAX_KEYFRAMES = 20
+"""Where so many do not show the floor well enough, nothing is said."""
 
 
 def disagreement(used: Mount, seen: Mount) -> str | None:
@@ -285,3 +290,29 @@ def _rests(
     spread = np.ptp(recent, axis=0)
     limits = (pitch_rad, roll_rad, height * recent[-1, 2])
     return len(recent) == count and bool((spread < limits).all())
+
+
+class MountCheck:
+    """Measures the mount beside its use, once. A wrong one tilts the map or shifts its heights."""
+
+    def __init__(self, camera: StereoCamera, mount: Mount) -> None:
+        self._mount = mount
+        self._estimator = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m)
+        self._T_first_map: Array | None = None
+        self._keyframes = 0
+        self.is_done = False
+
+    def add(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_map_base: Array
+    ) -> str | None:
+        """Use a keyframe: rectified images (H, W) and the base's pose (4, 4). Returns in words how
+        both mounts differ, with the numbers, once that is known.
+        """
+        T_map_left = T_map_base @ self._mount.T_base_left
+        if self._T_first_map is None:
+            self._T_first_map = invert(T_map_left)
+        self._estimator.add(left, right, self._T_first_map @ T_map_left)
+        self._keyframes += 1
+        seen = self._estimator.mount
+        self.is_done = seen is not None or self._keyframes >= MAX_KEYFRAMES
+        return None if seen is None else disagreement(self._mount, seen)
