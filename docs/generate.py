@@ -113,7 +113,7 @@ STATUS = {
     SLAM: 'One status per frame: OK while tracking, WARN while the mount is measured, ERROR while '
     'lost, with the reason. Values: `tracked`, `keyframe`, `matches`, `reference_keyframe_ns` (the '
     'keyframe a pose is relative to), `lost_s` (for how long), `recovered_after_s` (once), '
-    '`apart` (1: mapped, before it was known where in the map), '
+    '`submap` (1: mapped in a submap that was merged later), '
     '`processing_ms`, `rss_mb`.',
     FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',

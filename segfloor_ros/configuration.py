@@ -19,7 +19,7 @@ from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.node_settings import is_node_parameter
-from segfloor_ros.settings import RobotSettings, StageSettings, suggestion
+from segfloor_ros.settings import GONE, RobotSettings, StageSettings, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 
 # Parameters of every ROS node: allowed in a parameter file, no concern of the stages.
@@ -120,7 +120,8 @@ def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, di
             if any(spec.name == name for spec in cls.specs())
         ]
         if not owners and not any(is_node_parameter(stage, name) for stage in STAGE_SETTINGS):
-            raise SettingsError(f'{path}: no stage has a parameter {name}')
+            gone = suggestion(name, []) if name in GONE else ''
+            raise SettingsError(f'{path}: no stage has a parameter {name}{gone}')
         for owner in owners:
             values.setdefault(owner, {})[name] = value
     return values

@@ -28,6 +28,7 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.map_file import MapFile, is_map_file, read_map_file, write_map_file
 from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.timing import MemoryLog
@@ -210,8 +211,8 @@ class LockstepRun:
         if self.no_map:
             self.note = f'{save}: is not written, since there is no map'
             return
-        apart = not self._pipeline.slam.is_in_loaded_map
-        if apart and load is not None and save.resolve() == load.resolve():
+        is_outside = self._pipeline.slam.back_end.submap is Submap.OUTSIDE
+        if is_outside and load is not None and save.resolve() == load.resolve():
             self.note = (
                 f'{save}: stays as it was, since no place of it was recognised; give --save-map '
                 'another name to keep the map of this drive'
@@ -328,13 +329,13 @@ class LockstepRun:
             skipped_frames=self._source.skipped_frames,
             lost_intervals=results_folder.lost_intervals([r.index for r in self._results], tracked),
             keyframes=len(self._pipeline.slam.map.keyframes),
-            loops=self._pipeline.slam.loop_count,
+            loops=self._pipeline.slam.back_end.loop_count,
             relocalisations=results_folder.relocalisations(
                 [r.stamp_ns for r in self._results], tracked
             ),
-            apart=results_folder.apart_intervals(
+            submaps=results_folder.submap_intervals(
                 [r.index for r in self._results],
-                np.array([r.apart for r in self._results], bool),
+                np.array([r.in_submap for r in self._results], bool),
                 tracked,
             ),
             map_updates=self._pipeline.keyframe_stages.map_updates,

@@ -166,7 +166,7 @@ class Pipeline:
         not known.
         """
         if self.mount is None:
-            self.path_only, self.slam.mount = True, CAMERA_AS_BASE
+            self.path_only, self.slam.rig.mount = True, CAMERA_AS_BASE
         results = self.slam.finish()
         keyframes = [result.keyframe for result in results if result.keyframe is not None]
         if keyframes and self.path_only:

@@ -57,8 +57,8 @@ class RunSummary:
     map: the file, None where only a path came of the drive; camera_height_m, camera_pitch_rad and
     camera_roll_rad are None where the mount is not known. lost_intervals: first and last frame
     number of every stretch without a pose. relocalisations: the times in seconds at which tracking
-    was lost and found again, lost_s and found_s. apart: the first_frame and last_frame of every
-    stretch that was mapped without knowing where in the map it is, and whether it was `joined`
+    was lost and found again, lost_s and found_s. submaps: the first_frame and last_frame of every
+    stretch that was mapped without knowing where in the map it is, and whether it was `merged`
     later; what was not is in no map and no trajectory. sensors: messages used, by name.
     repeated_frames: tracked although the camera delivered the image before again, bit for bit.
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
@@ -76,7 +76,7 @@ class RunSummary:
     keyframes: int
     loops: int
     relocalisations: list[dict[str, float]]
-    apart: list[dict[str, int | bool]]
+    submaps: list[dict[str, int | bool]]
     map_updates: int
     wall_s: float
     frames_per_s: float
@@ -135,17 +135,17 @@ def lost_intervals(
     ]
 
 
-def apart_intervals(
-    frame_indices: Sequence[int], apart: NDArray[np.bool_], tracked: NDArray[np.bool_]
+def submap_intervals(
+    frame_indices: Sequence[int], in_submap: NDArray[np.bool_], tracked: NDArray[np.bool_]
 ) -> list[dict[str, int | bool]]:
-    """Return what was mapped apart, as in `RunSummary`; all inputs are (N,)."""
+    """Return the frames mapped in submaps, as in `RunSummary`; all inputs are (N,)."""
     return [
         {
             'first_frame': int(frame_indices[start]),
             'last_frame': int(frame_indices[end]),
-            'joined': bool(tracked[start : end + 1].any()),
+            'merged': bool(tracked[start : end + 1].any()),
         }
-        for start, end in lost_intervals(range(len(apart)), ~apart)
+        for start, end in lost_intervals(range(len(in_submap)), ~in_submap)
     ]
 
 
@@ -294,7 +294,7 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         *([('of them on sensors alone', summary.blind_frames)] if used else []),
         *([('frames repeated by the camera', repeated)] if repeated else []),
         ('frames lost', lost),
-        *(('frames mapped apart', _apart_words(part)) for part in summary.apart),
+        *(('frames in a submap', _submap_words(submap)) for submap in summary.submaps),
         *(('remark', remark) for remark in summary.sensor_remarks),
         ('frames skipped (unreadable)', summary.skipped_frames),
         *([('frames that failed', summary.failed_frames)] if summary.failed_frames else []),
@@ -324,6 +324,6 @@ def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[s
     ]
 
 
-def _apart_words(part: Mapping[str, int | bool]) -> str:
-    outcome = 'joined later' if part['joined'] else 'no place of the map recognised, left out'
-    return f'{part["first_frame"]}-{part["last_frame"]}, {outcome}'
+def _submap_words(submap: Mapping[str, int | bool]) -> str:
+    outcome = 'merged later' if submap['merged'] else 'no place of the map recognised, left out'
+    return f'{submap["first_frame"]}-{submap["last_frame"]}, {outcome}'

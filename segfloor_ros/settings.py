@@ -28,6 +28,22 @@ UNITS = {'_m': 'm', '_s': 's', '_px': 'px', '_hz': 'Hz', '_rad': 'rad', '_mps': 
 """Of a setting by the end of its name, unless it says otherwise."""
 
 
+GONE = {
+    'tracked_points': 'it is a constant now',
+    'keyframe_min_frames': 'it is a constant now',
+    'keyframe_motion_ratio': 'it is a constant now',
+    'keyframe_turn_rad': 'it is a constant now',
+    'disparity_offset_sigma_px': 'it is a constant now',
+    'level_ground': 'it brought no more than noise',
+    'height_sigma_m': 'it is a constant now',
+    'max_mask_log_odds': 'it is a constant now',
+    'max_height_log_odds': 'it is a constant now',
+    'max_hit_error_m': 'it follows from resolution_m',
+    'coarse_above_px': 'it is a constant now',
+}
+"""Settings of earlier versions, and what became of them."""
+
+
 def setting(default: Value, description: str, **facts: Any) -> Any:
     """Declare one setting of a stage. facts: of `SettingSpec`, beside name, type and default."""
     return dataclasses.field(default=default, metadata={'description': description, **facts})
@@ -144,7 +160,11 @@ def unit_of(name: str) -> str:
 
 
 def suggestion(name: str, known: list[str]) -> str:
-    """Return `: did you mean X?`, or the list of known names when nothing is near."""
+    """Return `: did you mean X?`, or the list of known names when nothing is near; of a setting of
+    earlier versions what became of it.
+    """
+    if name in GONE:
+        return f': it is gone, {GONE[name]}; remove it'
     near = difflib.get_close_matches(name, known, n=1)
     return f': did you mean {near[0]}?' if near else ': known are ' + ', '.join(sorted(known))
 

@@ -6,7 +6,7 @@ import pytest
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.results_folder import OutputFolder, apart_intervals, lost_intervals
+from segfloor_ros.results_folder import OutputFolder, lost_intervals, submap_intervals
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
@@ -22,12 +22,12 @@ def test_lost_intervals_are_closed_and_cover_the_ends():
     assert lost_intervals(range(3), np.ones(3, bool)) == []
 
 
-def test_stretches_that_were_mapped_apart_tell_whether_they_were_joined():
-    apart = np.array([False, True, True, False, True, True])
+def test_submaps_say_whether_they_were_merged():
+    in_submap = np.array([False, True, True, False, True, True])
     tracked = np.array([True, False, True, True, False, False])
-    assert apart_intervals(range(10, 16), apart, tracked) == [
-        {'first_frame': 11, 'last_frame': 12, 'joined': True},
-        {'first_frame': 14, 'last_frame': 15, 'joined': False},
+    assert submap_intervals(range(10, 16), in_submap, tracked) == [
+        {'first_frame': 11, 'last_frame': 12, 'merged': True},
+        {'first_frame': 14, 'last_frame': 15, 'merged': False},
     ]
 
 

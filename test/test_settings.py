@@ -65,6 +65,22 @@ def test_not_a_number_means_not_given_only_where_it_is_the_default():
     assert TwoWordSettings(height_m=0.3).height_m == 0.3
 
 
+@pytest.mark.parametrize(
+    ('stage', 'name', 'why'),
+    [
+        ('stereo_slam', 'keyframe_turn_rad', 'constant'),
+        ('cloud_labelling', 'height_sigma_m', 'constant'),
+        ('occupancy_grid', 'max_hit_error_m', 'follows from resolution_m'),
+    ],
+)
+def test_settings_of_earlier_versions_are_named_as_gone(tmp_path, stage, name, why):
+    file = tmp_path / 'old.yaml'
+    for node in (stage, '/**'):
+        file.write_text(f'{node}:\n  ros__parameters:\n    {name}: 0.1\n')
+        with pytest.raises(SettingsError, match=f'{name}: it is gone, .*{why}.*; remove it'):
+            resolve(file)
+
+
 def test_unknown_names_get_a_suggestion():
     with pytest.raises(SettingsError, match=r'two_word.siz_m: did you mean size_m'):
         TwoWordSettings.from_mapping({'siz_m': 1.0})

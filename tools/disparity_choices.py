@@ -156,5 +156,5 @@ def _enlarged() -> Match:
 def _halved(
     settings: FloorSegmentationSettings, left: NDArray[np.uint8], right: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    near = TwoScaleMatcher(NUM_DISPARITIES, settings.replaced(coarse_above_px=8.0))
+    near = TwoScaleMatcher(NUM_DISPARITIES, coarse_above_px=8.0)
     return near.compute(left, right, fine_rows=0)

@@ -25,13 +25,11 @@ from segfloor_ros.slam.map.map_arrays import fill_map
 from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
-from segfloor_ros.slam.mapping.disparity_offset import NO_OFFSET
 from segfloor_ros.slam.places.loop_closing import move_keyframes, plan_closing, solve_closing
 from segfloor_ros.slam.places.loops import path_lengths
 from segfloor_ros.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
-from segfloor_ros.slam.tracking.consensus import Consensus
+from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.tracking.features import Features
-from segfloor_ros.slam.tracking.map_tracking import Tracker
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
@@ -111,7 +109,7 @@ def measure(count: int) -> dict[str, float]:
     rng = np.random.default_rng(count)
     sparse_map = SparseMap()
     fill_map(sparse_map, made_up_map(count, rng))
-    places = PlaceRecognition(CAMERA, Tracker(CAMERA, Consensus(CAMERA)), sparse_map)
+    places = PlaceRecognition(Rig(CAMERA), sparse_map)
     words = rng.integers(0, NUM_WORDS, count * FEATURES)
     places.from_arrays({'words': words, 'word_count': np.full(count, FEATURES)})
     features = Features(

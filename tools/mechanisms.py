@@ -71,7 +71,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
     'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
-    'disparity offset': Mechanism(settings={'disparity_offset_sigma_px': 0.0}),
+    'disparity offset': Mechanism({'slam.rig.EXPECTED_SIGMA_PX': 0.0}),
     'depth check of matches': Mechanism(
         {'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}
     ),

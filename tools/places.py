@@ -125,7 +125,7 @@ def loops(
             followed.process(worse(source.frames(), every, noise, seed))
         _, truth = read_trajectory(drive / 'poses.txt')
         verdicts: Counter[str] = Counter()
-        for candidate in slam.loop_candidates:
+        for candidate in slam.back_end.loops.candidates:
             now, then = (
                 truth[slam.map.keyframes[k].frame_index]
                 for k in (candidate.keyframe, candidate.place)
@@ -140,7 +140,7 @@ def loops(
             f'{drive.name}: {score.path_length_m:.0f} m, {len(slam.map.keyframes)} keyframes, '
             f'tracked {sum(r.tracked for r in followed.results)} of {len(followed.results)}, '
             f'RMSE {score.ate_rmse_m:.4f} m, end {score.end_error_m:.3f} m, '
-            f'loops {slam.loop_count}; {dict(sorted(verdicts.items()))}',
+            f'loops {slam.back_end.loop_count}; {dict(sorted(verdicts.items()))}',
             flush=True,
         )
 
@@ -245,7 +245,7 @@ def again(
         f'{np.nanpercentile(errors, 95):.4f} m 95th percentile, {np.nanmax(errors):.3f} m at most; '
         f'frame {1e3 * np.median(followed.frame_s):.1f} ms in the median, '
         f'{1e3 * np.mean(followed.frame_s):.1f} on average; keyframes {len(slam.map.keyframes)}, '
-        f'loops {slam.loop_count}, memory {start_mb:.0f} to {rss_mb():.0f} MB'
+        f'loops {slam.back_end.loop_count}, memory {start_mb:.0f} to {rss_mb():.0f} MB'
     )
     again_data = to_bytes(save_slam(slam, source.camera))
     print(f'saved again: {len(again_data) / 1e6:.2f} MB, before {len(data) / 1e6:.2f} MB')

@@ -33,10 +33,10 @@ from segfloor_ros.results_folder import (
     MAP,
     RunResult,
     RunSummary,
-    apart_intervals,
     lost_intervals,
     mount_figures,
     relocalisations,
+    submap_intervals,
 )
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.slam.saved_slam import loaded_map, new_keyframes
@@ -248,9 +248,9 @@ class ReplaySession:
             keyframes=self._keyframe_count(recorder),
             loops=recorder.loops,
             relocalisations=relocalisations(stamps, tracked),
-            apart=apart_intervals(
+            submaps=submap_intervals(
                 [recorder.frame_index[s] for s in stamps],
-                np.array([bool(s and s.values.get('apart') == '1') for s in answers], bool),
+                np.array([bool(s and s.values.get('submap') == '1') for s in answers], bool),
                 tracked,
             ),
             map_updates=len(recorder.updated),

@@ -22,10 +22,12 @@ from segfloor_ros.floor.observation import NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
 
-_HEIGHT_SIGMA_PER_M = 0.01
-"""Growth of the error of a height with the distance, one sigma."""
-_MASK_LOG_ODDS = 0.6
-"""Evidence of one look at the floor mask."""
+_HEIGHT_SIGMA_M, _HEIGHT_SIGMA_PER_M = 0.02, 0.01
+"""Error of a height close to the robot, and its growth with the distance, one sigma."""
+_MASK_LOG_ODDS, _MAX_MASK_LOG_ODDS = 0.6, 3.0
+"""Evidence of one look at the floor mask, and of all: a label can still change after five."""
+_MAX_HEIGHT_LOG_ODDS = 2.0
+"""Evidence of a height; less than that of the mask, for the floor is not a plane."""
 _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
 
@@ -71,7 +73,7 @@ class CloudLabelling:
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, T_map_base)
-        table.look(row, looks, settings.max_mask_log_odds, floor_z, distance_m)
+        table.look(row, looks, _MAX_MASK_LOG_ODDS, floor_z, distance_m)
         z_m = cloud.xyz_map[:, 2]
         stale = table['judged_z_m'] != z_m
         stale[row] = True
@@ -108,7 +110,7 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         looked = table['looks'][row] > 0
         height_m = z_m[row] - table['floor_z_m'][row]
-        sigma_m = settings.height_sigma_m + _HEIGHT_SIGMA_PER_M * table['distance_m'][row]
+        sigma_m = _HEIGHT_SIGMA_M + _HEIGHT_SIGMA_PER_M * table['distance_m'][row]
         by_height = height_evidence(height_m, sigma_m, settings) * looked
         log_odds = table['mask_log_odds'][row] + by_height
         belief = table['belief'][row]
@@ -160,8 +162,7 @@ def height_evidence(height_m: Array, sigma_m: Array, settings: CloudLabellingSet
     tails, which is close to linear in the distance from the middle of the step.
     """
     log_odds = (height_m - settings.step_height_m) / sigma_m
-    limit = settings.max_height_log_odds
-    return np.clip(log_odds, -limit, limit)
+    return np.clip(log_odds, -_MAX_HEIGHT_LOG_ODDS, _MAX_HEIGHT_LOG_ODDS)
 
 
 class PointTable:

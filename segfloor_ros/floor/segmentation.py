@@ -15,6 +15,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
+    COARSE_ABOVE_PX,
     NOISE_PX,
     TwoScaleMatcher,
     disparity_range,
@@ -222,7 +223,7 @@ class FloorSegmentation:
 
     def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)
-        self._matcher = TwoScaleMatcher(-(-searched // 16) * 16, self._settings)
+        self._matcher = TwoScaleMatcher(-(-searched // 16) * 16)
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
@@ -241,7 +242,7 @@ class FloorSegmentation:
         assert self._mount is not None
         line = FloorLine.of(camera, self._mount)
         shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
-        last_fine = line.horizon + settings.coarse_above_px / line.slope + shear
+        last_fine = line.horizon + COARSE_ABOVE_PX / line.slope + shear
         fine_rows = int(np.clip(last_fine - top, _ROWS_ABOVE_HORIZON, camera.height - top))
         disparity = np.zeros(left.shape, np.float32)
         disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)

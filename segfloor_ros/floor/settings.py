@@ -17,11 +17,6 @@ class FloorSegmentationSettings(RobotSettings):
         unit='px',
         within=(0, 512),
     )
-    coarse_above_px: float = setting(
-        28.0,
-        'Where the floor has a larger disparity, images are matched at half the resolution.',
-        within=(8.0, 512.0),
-    )
     disparity_above_horizon: bool = setting(
         False, 'Match the rows above the horizon too; the floor does not need them.'
     )

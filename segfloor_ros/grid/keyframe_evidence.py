@@ -97,11 +97,11 @@ def gather_evidence(
 
 
 def hit_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
-    """Return up to which distance an obstacle is placed well enough to mark cells."""
+    """Return up to which distance an obstacle is placed to a cell, so that it marks cells."""
     limit_m = free_range_m(scan, settings)
     if scan.error_per_m == 0:
         return limit_m
-    return min(limit_m, math.sqrt(settings.max_hit_error_m / scan.error_per_m))
+    return min(limit_m, math.sqrt(settings.resolution_m / scan.error_per_m))
 
 
 def _sure_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:

@@ -22,12 +22,6 @@ class OccupancyGridSettings(StageSettings):
         within=(0.0, 50.0),
         live=True,
     )
-    max_hit_error_m: float = setting(
-        0.05,
-        'Obstacles whose distance is less certain than this mark no cell.',
-        within=(0.005, 1.0),
-        live=True,
-    )
     occupied_share: float = setting(
         0.2,
         'A cell into which an obstacle reaches by more than this share of its side is occupied.',

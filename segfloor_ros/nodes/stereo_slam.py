@@ -22,6 +22,7 @@ from segfloor_ros.nodes.slam.sensor_input import InitialPose, MaskInput, SensorI
 from segfloor_ros.nodes.slam.slam_maps import SlamMaps
 from segfloor_ros.nodes.slam.slam_outputs import CameraFrames, LostTime, SlamOutputs
 from segfloor_ros.nodes.slam.stereo_input import Pair, PairQueue, StereoInput
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.saved_slam import (
     LoadedMap,
@@ -37,7 +38,7 @@ LOOK_AGAIN_S = 0.2
 REMARK_AGAIN_S = 600.0
 NEXT_S, IDLE_S = 0.005, 0.05
 """Results that were held back are published one by one: others need time to take each of them."""
-MAPPING_APART = 'lost; maps on its own until it recognises a place of the map'
+MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 
 
 class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
@@ -213,7 +214,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._send_next()
         for about, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(about, remark, repeat_s=REMARK_AGAIN_S)
-        if self._mount is not None and not slam.is_adjusting:
+        if self._mount is not None and slam.back_end.idle:
             self._maps.keep(slam)
         if slam.last_pose is not None:
             self.kept_state.note(last_pose_values(slam.last_pose))
@@ -274,14 +275,14 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             result.state,
             milliseconds,
             tracked=int(result.tracked),
-            loops=slam.loop_count,
+            loops=slam.back_end.loop_count,
             keyframe=int(result.keyframe is not None),
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,
             **self._lost.note(result.stamp_ns, result.tracked),
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
             blind=int(result.blind),
-            apart=int(result.apart),
+            submap=int(result.in_submap),
             repeated=int(result.repeated and result.tracked),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
@@ -295,9 +296,9 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._provisional_ns = stamp_ns
             self._transforms.broadcast(result)
             self._outputs.publish(result, self._calibration, self._frames)
-        if slam.is_apart:
+        if slam.back_end.submap is Submap.LOST:
             lost = self._lost.note(stamp_ns, tracked=False)
-            self.reporter.report(stamp_ns, Level.ERROR, MAPPING_APART, tracked=0, apart=1, **lost)
+            self.reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
             return
         words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
         self.reporter.report_waiting(stamp_ns, words)

@@ -89,7 +89,7 @@ class Keyframe:
 @dataclass(frozen=True)
 class LastPose:
     """Where a drive was broken off: the last pose T_camera_world (4, 4) with its covariance (6, 6)
-    and velocity (6,), the correction of the odometry T_world_odom (4, 4), and what wheels told.
+    and velocity (6,), the correction of the odometry T_world_odom (4, 4), and what wheels measured.
     """
 
     stamp_ns: int
@@ -109,9 +109,9 @@ class FrameResult:
     frame. reference_keyframe: stamp of the keyframe the pose is expressed against, for
     correcting it later. state: words for people ('tracking', or why not). blind: whether the pose
     is that of wheels or a gyroscope alone. keyframe: set when
-    this frame became one. moving: what moves, where this frame was searched for it. apart: whether
-    it was, at first, not known where in the map this is: `tracked` where it was recognised later.
-    repeated: whether the left image is the one before, bit for bit.
+    this frame became one. moving: what moves, where this frame was searched for it. in_submap:
+    whether it was mapped in a submap beside the map: `tracked` where it was merged later. repeated:
+    whether the left image is the one before, bit for bit.
     """
 
     index: int
@@ -126,7 +126,7 @@ class FrameResult:
     keyframe: Keyframe | None = None
     moving: MovingPoints | None = None
     blind: bool = False
-    apart: bool = False
+    in_submap: bool = False
     repeated: bool = False
 
 
@@ -153,7 +153,9 @@ class Track:
 
     point_ids: (N,) the map points that were found and agree, and observations (N) of them as
     measured. visible_ids: those that were looked for. observed: set when the pose was found by
-    features.
+    features. is_poor: whether few points of many support the pose. sigma_m: how uncertain the image
+    leaves the place on the axis where it is most, 0 where it shows plenty. prior: the pose that
+    wheels measured, where the image does not contradict it; is_prior_better: in some direction.
     """
 
     estimate: PoseEstimate
@@ -161,6 +163,10 @@ class Track:
     observations: Observations
     visible_ids: NDArray[np.int32]
     observed: ObservedFeatures | None = None
+    is_poor: bool = False
+    sigma_m: float = 0.0
+    prior: PoseEstimate | None = None
+    is_prior_better: bool = False
 
     @property
     def T_camera_world(self) -> Array:

@@ -97,7 +97,7 @@ def last_pose_of(values: Mapping[str, Any]) -> LastPose:
         wheels = tuple(WheelPose(int(ns), np.array(T, float)) for ns, T in values['wheels'])
         return LastPose(int(values['stamp_ns']), wheels=wheels, **arrays)
     except (KeyError, ValueError, TypeError):
-        raise InputError('kept map: does not tell where the drive was broken off') from None
+        raise InputError('kept map: does not say where the drive was broken off') from None
 
 
 def saved_camera(saved: MapFile, name: str) -> StereoCamera:
@@ -105,7 +105,7 @@ def saved_camera(saved: MapFile, name: str) -> StereoCamera:
     try:
         return StereoCamera(**saved.header['camera'])
     except (KeyError, TypeError, CalibrationError):
-        raise InputError(f'{name}: does not tell its camera; save it anew') from None
+        raise InputError(f'{name}: does not say its camera; save it anew') from None
 
 
 def check_camera(saved: MapFile, camera: StereoCamera, name: str) -> None:

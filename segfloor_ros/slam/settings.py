@@ -46,11 +46,6 @@ class StereoSlamSettings(StageSettings):
         unit='grey levels',
         within=(2, 60),
     )
-    tracked_points: int = setting(
-        400,
-        'Map points, spread over the image, that are measured in a frame between keyframes.',
-        within=(50, 5000),
-    )
     max_speed_mps: float = setting(
         40.0,
         'A motion faster than this is implausible and ends tracking.',
@@ -64,27 +59,6 @@ class StereoSlamSettings(StageSettings):
     )
     keyframe_max_frames: int = setting(
         30, 'A new keyframe is due after this many frames (condition A1).', within=(1, 1000)
-    )
-    keyframe_min_frames: int = setting(
-        3,
-        'Frames between keyframes while the mapper is idle (condition A2).',
-        within=(1, 1000),
-    )
-    keyframe_motion_ratio: float = setting(
-        0.04,
-        'Motion since the last keyframe that makes a view new: as a fraction of the median depth.',
-        within=(0.001, 1.0),
-    )
-    keyframe_turn_rad: float = setting(
-        0.06,
-        'Rotation since the last keyframe that makes a view new.',
-        within=(0.005, 1.0),
-    )
-    disparity_offset_sigma_px: float = setting(
-        0.1,
-        'Error that all disparities may share where the rectification is imperfect; it is '
-        'estimated while driving. 0: disparities are taken as they are.',
-        within=(0.0, 1.0),
     )
 
     @property

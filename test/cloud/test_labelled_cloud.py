@@ -45,10 +45,13 @@ def test_mask_and_height_give_the_label() -> None:
     assert labelled.confidence.dtype == np.float32
 
 
+AT_THE_STEP_M = CloudLabellingSettings().step_height_m
+"""A height that speaks neither for floor nor for an obstacle."""
+
+
 def test_every_look_counts_and_one_wrong_mask_changes_nothing() -> None:
-    settings = CloudLabellingSettings(max_height_log_odds=0.0)
-    labelling = CloudLabelling(settings)
-    points = cloud({1: (1.0, 0.0, 0.0)})
+    labelling = CloudLabelling(CloudLabellingSettings())
+    points = cloud({1: (1.0, 0.0, AT_THE_STEP_M)})
     # One look, 0.6, is less than the 0.8 a label takes; two are enough.
     assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)) == {1: UNKNOWN}
     labelled = labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
@@ -61,21 +64,21 @@ def test_every_look_counts_and_one_wrong_mask_changes_nothing() -> None:
 
 
 def test_evidence_of_the_mask_is_bounded() -> None:
-    settings = CloudLabellingSettings(max_height_log_odds=0.0, max_mask_log_odds=1.2)
-    labelling = CloudLabelling(settings)
-    points = cloud({1: (1.0, 0.0, 0.0)})
+    labelling = CloudLabelling(CloudLabellingSettings())
+    points = cloud({1: (1.0, 0.0, AT_THE_STEP_M)})
     for _ in range(50):
         labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
-    for _ in range(4):
+    # From the bound, 3, seven looks of 0.6 lead beyond the 0.8 that a label takes.
+    for expected in [FLOOR] * 6 + [OBSTACLE]:
         labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK, HERE)
-    assert label_of(labelled) == {1: OBSTACLE}
+        assert label_of(labelled) == {1: expected}
 
 
 def test_borders_of_the_mask_say_nothing() -> None:
-    labelling = CloudLabelling(CloudLabellingSettings(max_height_log_odds=0.0))
+    labelling = CloudLabelling(CloudLabellingSettings())
     mask = np.full((40, 60), 0, np.uint8)
     mask[20:] = 255
-    points = cloud({1: (1.0, 0.0, 0.0), 2: (1.0, 0.2, 0.0)})
+    points = cloud({1: (1.0, 0.0, AT_THE_STEP_M), 2: (1.0, 0.2, AT_THE_STEP_M)})
     for _ in range(5):
         labelled = labelling.update(
             points, features({1: (30.0, 20.0), 2: (30.0, 21.0)}), mask, np.eye(4)
@@ -124,13 +127,6 @@ def test_heights_of_far_points_count_less() -> None:
     assert label_of(distant) == {1: UNKNOWN}
 
 
-@pytest.mark.parametrize(('sigma_m', 'expected'), [(0.02, OBSTACLE), (0.08, UNKNOWN)])
-def test_heights_that_are_less_certain_count_less(sigma_m: float, expected: int) -> None:
-    labelling = CloudLabelling(CloudLabellingSettings(height_sigma_m=sigma_m))
-    points, seen = cloud({1: (1.0, 0.0, 0.07)}), features({1: NOWHERE})
-    assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: expected}
-
-
 def test_empty_cloud() -> None:
     labelled = CloudLabelling(CloudLabellingSettings()).update(
         cloud({}), features({}), MASK, np.eye(4)
@@ -154,7 +150,7 @@ def test_labels_do_not_depend_on_which_points_were_judged_anew() -> None:
         xyz |= {200 + 10 * step + i: (2.0, 0.0, rng.uniform(0, 1)) for i in range(10)}
         pixels = {int(i): tuple(rng.uniform(0, (59, 39))) for i in rng.choice(list(xyz), 60, False)}
         one = sparing.update(cloud(xyz), features(pixels), MASK, HERE)
-        thorough.settings = dataclasses.replace(settings, max_mask_log_odds=10.0 + 0.1 * step)
+        thorough.settings = dataclasses.replace(settings, robot_height_m=5.0 + 0.1 * step)
         thorough.update(cloud(xyz), features({}), MASK, HERE)
         thorough.settings = settings
         other = thorough.update(cloud(xyz), features(pixels), MASK, HERE)

@@ -67,7 +67,7 @@ def test_faces_are_moved_by_the_same_distance_across_them() -> None:
     features = KeyframeFeatures(
         np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
     )
-    settings = OccupancyGridSettings(occupied_share=0.2, max_hit_error_m=1.0)
+    settings = OccupancyGridSettings(occupied_share=0.2)
     evidence: KeyframeEvidence = gather_evidence(points, features, np.eye(4), scan, settings)
     starts = evidence.positions_m[:, evidence.num_rays + evidence.num_contacts :]
     np.testing.assert_allclose(starts[1].astype(np.float64), 1.0 - 0.015, atol=0.003)

@@ -81,7 +81,7 @@ def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> 
     graph.add(StereoCameraNode())
 
     def places() -> list[list[float]]:
-        samples = slam._slam.sensors.gyroscope._samples if slam._slam else []
+        samples = slam._slam.sensors.gyroscope.samples if slam._slam else []
         return [sample.place_m.tolist() for sample in samples]
 
     graph.until(lambda: len(places()) > 100, 'a hundred samples of the IMU')

@@ -116,7 +116,7 @@ def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames
     for frame in frames[:12]:
         before = slam.process(frame)[-1]
     last = slam.map.keyframes[-1]
-    adjustment = slam._back_end.mapper.plan_adjustment(slam.map, last)
+    adjustment = slam.back_end.mapper.plan_adjustment(last)
     # Keyframes, those that hold them and points, all 10 cm to the side.
     problem = adjustment.problem
     poses = problem.T_camera_world.copy()
@@ -125,9 +125,9 @@ def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames
         problem, T_camera_world=poses, points_world=problem.points_world + np.array([0.1, 0.0, 0.0])
     )
     moved = replace(adjustment, problem=moved)
-    slam._back_end._local.submit(
-        partial(slam._back_end.mapper.solve, moved),
-        partial(slam._back_end.mapper.apply, slam.map, moved),
+    slam.back_end._local.submit(
+        partial(slam.back_end.mapper.solve, moved),
+        partial(slam.back_end.mapper.apply, moved),
     )
     old = last.T_camera_world
     same_view = replace(frames[11], left=frames[11].left ^ 1, index=12, stamp_ns=12 * 100_000_000)
@@ -265,7 +265,7 @@ def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
         assert slam.process(frame) == []
     keyframes = len(slam.map.keyframes)
     assert keyframes > 4
-    slam.mount = MOUNT
+    slam.rig.mount = MOUNT
     results = slam.process(frames[-1])
     assert len(results) == len(frames)
     assert all(result.tracked for result in results)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity, seen_from_right
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 SUBPIXEL = 16
 """Steps per pixel of the matcher's fixed-point disparities."""
@@ -39,6 +38,8 @@ _SAME_GAIN = 0.08
 _SAME_MEAN_GREY = 8.0
 """Within this the two cameras are exposed alike; what they see differs anyway."""
 COARSE_BLOCK_PX = 3
+COARSE_ABOVE_PX = 28.0
+"""Where the floor has a larger disparity, images are matched at half the resolution."""
 _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
 _RUN_OUT_ROWS = 8
@@ -158,8 +159,8 @@ class TwoScaleMatcher:
     num_disparities: searched, a multiple of 16; one more step of 16 where it takes two scales.
     """
 
-    def __init__(self, num_disparities: int, settings: FloorSegmentationSettings) -> None:
-        fine = math.ceil((settings.coarse_above_px + _OVERLAP_PX) / STEP) * STEP
+    def __init__(self, num_disparities: int, coarse_above_px: float = COARSE_ABOVE_PX) -> None:
+        fine = math.ceil((coarse_above_px + _OVERLAP_PX) / STEP) * STEP
         self._coarse: DisparityMatcher | None = None
         self.num_disparities = num_disparities
         if fine + STEP < num_disparities:

@@ -104,9 +104,9 @@ class MountEstimator:
         self._known = np.array([pitch_rad, roll_rad, height_m])
         self._offset = (forward_m, left_m)
         self._viewer = MountViewer(camera)
-        self.start_over()
+        self.reset()
 
-    def start_over(self) -> None:
+    def reset(self) -> None:
         """Forget all frames: the next ones are of another world."""
         self._views: list[MirrorView] = []
         self._feet: list[Samples] = []

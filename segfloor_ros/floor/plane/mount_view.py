@@ -47,7 +47,6 @@ from segfloor_ros.floor.plane.plane_fit import (
     scores,
     with_known,
 )
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import Up
 
@@ -100,7 +99,7 @@ class MountViewer:
         self._camera = camera
         searched = disparity_range(camera, None)
         self._first: DisparityMatcher | None = DisparityMatcher(searched)
-        self._matcher = TwoScaleMatcher(searched, FloorSegmentationSettings())
+        self._matcher = TwoScaleMatcher(searched)
         self._fine_rows = 0 if camera.width >= _LEAST_HALVED_PX else camera.height
 
     def view(

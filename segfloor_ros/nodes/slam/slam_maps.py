@@ -19,6 +19,7 @@ from segfloor_ros.messages.map_files import map_file_message, map_file_of
 from segfloor_ros.messages.topics import MAP_LOADED, MAP_PART, MAP_WANTED
 from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -132,8 +133,8 @@ class SlamMaps:
     def _refuse_to_overwrite(self, path: Path) -> None:
         """Raise MapError where a map would be replaced that the drive has not recognised."""
         known, load_map = self._known(), self._own.load_map
-        is_apart = known is not None and not known[0].is_in_loaded_map
-        if is_apart and load_map and Path(load_map).expanduser().resolve() == path.resolve():
+        is_outside = known is not None and known[0].back_end.submap is Submap.OUTSIDE
+        if is_outside and load_map and Path(load_map).expanduser().resolve() == path.resolve():
             raise MapError(
                 f'{path}: stays as it was, since no place of it was recognised; set save_map to '
                 'another name to keep the map of this drive'

@@ -1,7 +1,7 @@
 """The sparse map as arrays, for a file, and back.
 
-Features that show no point are left out, and so are the motions that sensors told; nothing is lost
-that tracking, relocalisation or the closing of loops need.
+Features that show no point are left out, and so are the motions that sensors measured; nothing is
+lost that tracking, relocalisation or the closing of loops need.
 """
 
 from __future__ import annotations

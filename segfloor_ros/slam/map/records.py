@@ -84,6 +84,20 @@ class PointRows:
         self.num_ever += count
         return rows
 
+    def note_tracking(self, visible: NDArray[np.integer], found: NDArray[np.integer]) -> None:
+        """Count that points should have been seen in a frame, and which of them were."""
+        self['visible_count'][visible] += 1
+        self['found_count'][found] += 1
+        self['seen_through_count'][found] = 0
+
+    def note_seen_through(self, rows: NDArray[np.integer]) -> None:
+        """Count that a keyframe saw what lies behind points."""
+        self['seen_through_count'][rows] += 1
+
+    def reliability(self, rows: NDArray[np.integer]) -> Array:
+        """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
+        return np.asarray(self['found_count'][rows] / (self['visible_count'][rows] + 2.0))
+
     def to_arrays(self, rows: NDArray[np.intp]) -> Arrays:
         """Return what a file holds of some rows (N,)."""
         arrays: Arrays = {
@@ -142,6 +156,39 @@ class GrowingArray:
         self._length = len(kept)
 
 
+class Edges:
+    """Observations (E,): the row of a point, the index of a keyframe, and its feature."""
+
+    def __init__(self) -> None:
+        self._columns = [GrowingArray((), np.int32) for _ in range(3)]
+
+    @property
+    def point(self) -> NDArray[np.int32]:
+        """The points, a writable view."""
+        return self._columns[0].rows
+
+    @property
+    def keyframe(self) -> NDArray[np.int32]:
+        """The keyframes that observe them."""
+        return self._columns[1].rows
+
+    @property
+    def row(self) -> NDArray[np.int32]:
+        """Their features in these."""
+        return self._columns[2].rows
+
+    def add(self, ids: NDArray[np.int32], keyframe: int, rows: NDArray[np.intp]) -> None:
+        """Add what a keyframe observes."""
+        columns: tuple[NDArray[Any], ...] = ids, np.full(len(ids), keyframe, np.int32), rows
+        for column, values in zip(self._columns, columns, strict=True):
+            column.extend(values)
+
+    def drop(self, dropped: NDArray[np.bool_]) -> None:
+        """Drop observations (E,)."""
+        for column in self._columns:
+            column.keep(~dropped)
+
+
 @dataclass(frozen=True)
 class Retirement:
     """Where a retired keyframe was seen from the keyframe (by index) that it follows."""
@@ -181,7 +228,7 @@ class KeyframeRecord:
     The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
-    motion: since the keyframe before, as the wheels tell it. up: in the camera, as it was felt.
+    motion: since the keyframe before, by wheels. up: in the camera, as it was measured.
     links: indices of earlier keyframes that it shared many points with when it was made.
     """
 

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array
 
-CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
+CHI2_95 = {2: 5.991, 3: 7.815, 6: 12.59}
 """95 % quantiles of the chi-squared distribution by degrees of freedom."""
 
 CHI2_50 = {2: 1.386, 3: 2.366}
 """Medians of the chi-squared distribution by degrees of freedom."""
+
+CHI2_999 = {3: 16.27, 6: 22.46}
+"""99.9 % quantiles of the chi-squared distribution by degrees of freedom."""
 
 MIN_DEPTH_M = 0.05
 
@@ -69,6 +72,13 @@ class Observations:
     def chi2_limit(self) -> Array:
         """The 95 % bound (N,) on the squared, normalised residual of each feature."""
         return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_95[3], CHI2_95[2])
+
+
+def is_gated(error: Array, covariance: Array) -> bool:
+    """Whether an error (D,) is no larger than its covariance (D, D) allows, with a probability of
+    99.9 % (Mahalanobis distance).
+    """
+    return float(error @ np.linalg.solve(covariance, error)) <= CHI2_999[len(error)]
 
 
 def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:

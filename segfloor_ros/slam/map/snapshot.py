@@ -58,16 +58,16 @@ def take_snapshot(
     )
 
 
-def in_joined_map(
+def in_merged_map(
     sparse_map: SparseMap, T_world_odom: Array
 ) -> Callable[[FrameResult], FrameResult]:
-    """Return what brings a result of a part of the map, in optical axes, up to date, now that the
-    part has become one with the map. T_world_odom: (4, 4), the correction since.
+    """Return what brings a result of a submap, in optical axes, up to date, now that it is merged
+    with the map. T_world_odom: (4, 4), the correction since.
     """
-    return partial(_in_joined_map, sparse_map.keyframes, _cloud(sparse_map), T_world_odom)
+    return partial(_in_merged_map, sparse_map.keyframes, _cloud(sparse_map), T_world_odom)
 
 
-def _in_joined_map(
+def _in_merged_map(
     keyframes: Sequence[KeyframeRecord],
     cloud: SparseCloud,
     T_world_odom: Array,
@@ -117,8 +117,8 @@ class HeldResults:
         self._thin_out()
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
-        """Change the results that are held of a part of the map."""
-        self._held = [change(result) if result.apart else result for result in self._held]
+        """Change the results that are held of a submap."""
+        self._held = [change(result) if result.in_submap else result for result in self._held]
 
     def release(self, mount: Mount | None) -> list[FrameResult]:
         """Return the results in ROS frames, oldest first; none while the mount is unknown."""

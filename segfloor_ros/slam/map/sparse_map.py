@@ -7,11 +7,14 @@ optical frame of the first frame.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import (
+    Edges,
     GrowingArray,
     KeyframeRecord,
     LoopEdge,
@@ -36,8 +39,33 @@ MAX_PATCH_ZOOM = 1.3
 """Change of a patch's size in the image at which it is taken anew."""
 
 
+def _column(name: str) -> Any:
+    """Return a property that is a column of the points, a writable view indexed by row."""
+    return property(lambda sparse_map: sparse_map.points[name])
+
+
 class SparseMap:
-    """Points, keyframes and who observes whom."""
+    """Points, keyframes and who observes whom.
+
+    Of the points (P): xyz_world: (P, 3) positions. stable_id: (P,), ascending with age and never
+    used again. alive: (P,) whether a point is part of the map. descriptor: (P, 32) as last seen by
+    a keyframe, from viewing_distance_m (P,) along viewing_direction (P, 3), a unit vector in world
+    axes, at the pyramid level viewing_octave (P,). patch: (P, SIDE_PX, SIDE_PX) grey levels around
+    it, from patch_distance_m (P,); kept as long as its size in the image stays about the same:
+    every change of patch adds an error to the position. observer_count: (P,) keyframes that observe
+    it. points: all of these; edges: the observations.
+    """
+
+    xyz_world: Array = _column('xyz_world')
+    stable_id: NDArray[np.int32] = _column('stable_id')
+    alive: NDArray[np.bool_] = _column('alive')
+    descriptor: NDArray[np.uint8] = _column('descriptor')
+    patch: NDArray[np.uint8] = _column('patch')
+    patch_distance_m: Array = _column('patch_distance_m')
+    viewing_distance_m: Array = _column('viewing_distance_m')
+    viewing_octave: Array = _column('viewing_octave')
+    viewing_direction: Array = _column('viewing_direction')
+    observer_count: NDArray[np.int32] = _column('observer_count')
 
     def __init__(self) -> None:
         self.reset()
@@ -47,77 +75,10 @@ class SparseMap:
         self.keyframes: list[KeyframeRecord] = []
         self.loops: list[LoopEdge] = []
         self._retired: list[KeyframeRecord] = []
-        self._points = PointRows(num_ever)
+        self.points = PointRows(num_ever)
         self._links = GrowingArray((2,), np.intp)
         self._linked = 0
-        self._edge_point = GrowingArray((), np.int32)
-        self._edge_keyframe = GrowingArray((), np.int32)
-        self._edge_row = GrowingArray((), np.int32)
-
-    @property
-    def xyz_world(self) -> Array:
-        """Positions (P, 3) of all points, a writable view indexed by row."""
-        return self._points['xyz_world']
-
-    @property
-    def stable_id(self) -> NDArray[np.int32]:
-        """The id (P,) of each point, ascending with its age and never used again."""
-        return self._points['stable_id']
-
-    @property
-    def alive(self) -> NDArray[np.bool_]:
-        """Whether each point (P,) is part of the map."""
-        return self._points['alive']
-
-    @property
-    def descriptor(self) -> NDArray[np.uint8]:
-        """Descriptors (P, 32) as last seen by a keyframe."""
-        return self._points['descriptor']
-
-    @property
-    def patch(self) -> NDArray[np.uint8]:
-        """Grey levels (P, SIDE_PX, SIDE_PX) around each point, kept as long as its size in the
-        image stays about the same: every change of patch adds an error to the point's
-        position.
-        """
-        return self._points['patch']
-
-    @property
-    def patch_distance_m(self) -> Array:
-        """Distance (P,) from which the patch was taken."""
-        return self._points['patch_distance_m']
-
-    @property
-    def viewing_distance_m(self) -> Array:
-        """Distance (P,) from which the descriptor was taken."""
-        return self._points['viewing_distance_m']
-
-    @property
-    def viewing_octave(self) -> Array:
-        """Pyramid level (P,) at which the descriptor was taken."""
-        return self._points['viewing_octave']
-
-    @property
-    def viewing_direction(self) -> Array:
-        """Unit vectors (P, 3) from the camera to the point, in world axes, when the descriptor
-        was taken.
-        """
-        return self._points['viewing_direction']
-
-    @property
-    def observer_count(self) -> NDArray[np.int32]:
-        """Number of keyframes (P,) that observe each point."""
-        return self._points['observer_count']
-
-    @property
-    def points(self) -> PointRows:
-        """All that is known of the points."""
-        return self._points
-
-    @property
-    def num_ever(self) -> int:
-        """How many points there have been: the next stable id."""
-        return self._points.num_ever
+        self.edges = Edges()
 
     def restore(self, keyframe: KeyframeRecord) -> None:
         """Add a keyframe whose points are there already."""
@@ -156,17 +117,17 @@ class SparseMap:
         sees take on its view of them.
         """
         self.keyframes.append(keyframe)
-        keyframe.point_id[new_rows] = self._new_points(new_xyz_world, keyframe.index)
+        keyframe.point_id[new_rows] = self.points.add(
+            len(new_xyz_world),
+            xyz_world=new_xyz_world,
+            born=keyframe.index,
+            seen_last=keyframe.index,
+        )
         self._link(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT), patches)
-
-    def _new_points(self, xyz_world: Array, born: int) -> NDArray[np.int32]:
-        return self._points.add(len(xyz_world), xyz_world=xyz_world, born=born, seen_last=born)
 
     def _add_edges(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
         ids = keyframe.point_id[rows]
-        self._edge_point.extend(ids)
-        self._edge_keyframe.extend(np.full(len(ids), keyframe.index, np.int32))
-        self._edge_row.extend(rows)
+        self.edges.add(ids, keyframe.index, rows)
         self.observer_count[ids] += 1
 
     def _link(
@@ -177,7 +138,7 @@ class SparseMap:
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
         self.descriptor[ids] = keyframe.features.descriptor[rows]
-        self._points['seen_last'][ids] = keyframe.index
+        self.points['seen_last'][ids] = keyframe.index
         self.viewing_distance_m[ids] = distance
         self.viewing_octave[ids] = keyframe.features.octave[rows]
         self.viewing_direction[ids] = sight / distance[:, None]
@@ -194,8 +155,8 @@ class SparseMap:
         keyframe.point_id[rows] = NO_POINT
         gone = np.zeros(len(self.alive), bool)
         gone[ids] = True
-        edges = gone[self._edge_point.rows] & (self._edge_keyframe.rows == keyframe.index)
-        self._drop_edges(edges)
+        edges = gone[self.edges.point] & (self.edges.keyframe == keyframe.index)
+        self.edges.drop(edges)
         self.observer_count[ids] -= 1
         self.alive[ids[self.observer_count[ids] <= 0]] = False
 
@@ -225,7 +186,7 @@ class SparseMap:
         """Take points out of the map; their rows are free for new ones."""
         self.alive[ids] = False
         gone = ~self.alive
-        self._drop_edges(gone[self._edge_point.rows])
+        self.edges.drop(gone[self.edges.point])
         for keyframe in self.keyframes:
             known = keyframe.point_id != NO_POINT
             known[known] = gone[keyframe.point_id[known]]
@@ -237,8 +198,8 @@ class SparseMap:
         """
         pair: NDArray[np.intp] = np.full((2, len(self.alive)), -1)
         pair[0, a] = pair[1, b] = np.arange(len(a))
-        of_pair = pair[:, self._edge_point.rows]
-        keyframe = self._edge_keyframe.rows
+        of_pair = pair[:, self.edges.point]
+        keyframe = self.edges.keyframe
         keys = [of[of >= 0] * len(self.keyframes) + keyframe[of >= 0] for of in of_pair]
         together = np.zeros(len(a), bool)
         together[np.intersect1d(*keys) // len(self.keyframes)] = True
@@ -249,13 +210,13 @@ class SparseMap:
         of. The better known one gives the position and the patch, the one seen last the look.
         """
         better = self.observer_count[gone] > self.observer_count[kept]
-        later = self._points['seen_last'][gone] > self._points['seen_last'][kept]
+        later = self.points['seen_last'][gone] > self.points['seen_last'][kept]
         for names, chosen in ((OF_POSITION, better), (OF_LOOK, later)):
             for name in names:
-                self._points[name][kept[chosen]] = self._points[name][gone[chosen]]
+                self.points[name][kept[chosen]] = self.points[name][gone[chosen]]
         for name in ('visible_count', 'found_count', 'observer_count'):
-            self._points[name][kept] += self._points[name][gone]
-        born = self._points['born']
+            self.points[name][kept] += self.points[name][gone]
+        born = self.points['born']
         born[kept] = np.minimum(born[kept], born[gone])
         self._rename(kept, gone)
         self.alive[gone] = False
@@ -264,38 +225,20 @@ class SparseMap:
         """Give the observations of points `gone` to points `kept`."""
         new_row = np.arange(len(self.alive), dtype=np.int32)
         new_row[gone] = kept
-        moved = np.flatnonzero(new_row[self._edge_point.rows] != self._edge_point.rows)
-        self._edge_point.rows[moved] = new_row[self._edge_point.rows[moved]]
-        for k in np.unique(self._edge_keyframe.rows[moved]):
-            mine = moved[self._edge_keyframe.rows[moved] == k]
-            self.keyframes[k].point_id[self._edge_row.rows[mine]] = self._edge_point.rows[mine]
-
-    def _drop_edges(self, dropped: NDArray[np.bool_]) -> None:
-        for edges in (self._edge_point, self._edge_keyframe, self._edge_row):
-            edges.keep(~dropped)
-
-    def note_tracking(self, visible: NDArray[np.integer], found: NDArray[np.integer]) -> None:
-        """Count that points should have been seen in a frame, and which of them were."""
-        self._points['visible_count'][visible] += 1
-        self._points['found_count'][found] += 1
-        self._points['seen_through_count'][found] = 0
-
-    def note_seen_through(self, ids: NDArray[np.integer]) -> None:
-        """Count that a keyframe saw what lies behind points."""
-        self._points['seen_through_count'][ids] += 1
-
-    def reliability(self, ids: NDArray[np.integer]) -> Array:
-        """Return how likely points (N,) are to be found when they should be seen, in (0, 1)."""
-        return self._points['found_count'][ids] / (self._points['visible_count'][ids] + 2.0)
+        moved = np.flatnonzero(new_row[self.edges.point] != self.edges.point)
+        self.edges.point[moved] = new_row[self.edges.point[moved]]
+        for k in np.unique(self.edges.keyframe[moved]):
+            mine = moved[self.edges.keyframe[moved] == k]
+            self.keyframes[k].point_id[self.edges.row[mine]] = self.edges.point[mine]
 
     def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
         saw although made before keyframe `settled_before`.
         """
-        found = self._points['found_count']
-        seldom = found < min_found_ratio * self._points['visible_count']
-        seldom |= self._points['seen_through_count'] >= GONE_AFTER
-        lonely = (self._points['born'] < settled_before) & (self.observer_count < 2)
+        found = self.points['found_count']
+        seldom = found < min_found_ratio * self.points['visible_count']
+        seldom |= self.points['seen_through_count'] >= GONE_AFTER
+        lonely = (self.points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
     def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -305,7 +248,7 @@ class SparseMap:
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
         shared = np.bincount(
-            self._edge_keyframe.rows[wanted[self._edge_point.rows]], minlength=len(self.keyframes)
+            self.edges.keyframe[wanted[self.edges.point]], minlength=len(self.keyframes)
         )
         order = np.lexsort((-np.arange(len(shared)), -shared))
         order = order[shared[order] > 0]
@@ -318,10 +261,6 @@ class SparseMap:
             observed[self.keyframes[k].point_id] = True
         return np.flatnonzero(observed[:-1]).astype(np.int32)
 
-    def edges(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return all observations as `edges_of`."""
-        return self._edge_point.rows, self._edge_keyframe.rows, self._edge_row.rows
-
     def edges_of(
         self, ids: NDArray[np.integer]
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
@@ -330,9 +269,9 @@ class SparseMap:
         """
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
-        edges = wanted[self._edge_point.rows]
+        edges = wanted[self.edges.point]
         return (
-            self._edge_point.rows[edges],
-            self._edge_keyframe.rows[edges],
-            self._edge_row.rows[edges],
+            self.edges.point[edges],
+            self.edges.keyframe[edges],
+            self.edges.row[edges],
         )

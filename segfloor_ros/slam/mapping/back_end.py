@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from enum import Enum, auto
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Up
@@ -21,7 +21,6 @@ from segfloor_ros.slam.map.map_arrays import fill_map, map_to_arrays
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
-from segfloor_ros.slam.mapping.disparity_offset import OffsetEstimate
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.places.loop_closing import (
     Closing,
@@ -31,35 +30,58 @@ from segfloor_ros.slam.places.loop_closing import (
 )
 from segfloor_ros.slam.places.loops import LoopDetector
 from segfloor_ros.slam.places.relocalisation import KnownMap
+from segfloor_ros.slam.results import Track
+from segfloor_ros.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images
 
 
+class Submap(Enum):
+    """Which part of the map the camera is in, and is mapped.
+
+    KNOWN: the map of the drive, or a loaded one that it was recognised in. LOADED: a loaded one
+    that it is not yet recognised in. The others are submaps beside a known map, until that is
+    recognised: OUTSIDE a loaded one, or LOST, of a camera that got lost.
+    """
+
+    KNOWN = auto()
+    LOADED = auto()
+    OUTSIDE = auto()
+    LOST = auto()
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether it is a submap beside the known map."""
+        return self in (Submap.OUTSIDE, Submap.LOST)
+
+
 class BackEnd:
     """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
-    timing. Tracking never waits for an adjustment of the whole map.
+    timing. Tracking never waits for an adjustment of the whole map. submap: what the map is.
     """
 
     def __init__(
         self,
-        camera: StereoCamera,
+        rig: Rig,
         settings: StereoSlamSettings,
         sparse_map: SparseMap,
         front_end: FrontEnd,
         background: bool,
     ) -> None:
-        self.mapper = LocalMapper(camera, settings)
+        self._front_end = front_end
+        self._longest_frames = settings.keyframe_max_frames
+        self.mapper = LocalMapper(rig, sparse_map)
         self.places = front_end.places
         self.loop_count = 0
+        self.submap = Submap.KNOWN
         self._known: KnownMap | None = None
-        self._camera = camera
-        self._tracker = front_end.tracker
+        self._rig = rig
         self._map = sparse_map
-        self.loops = LoopDetector(camera, sparse_map, self.places)
+        self.loops = LoopDetector(rig, sparse_map, self.places)
         self._local = AdjustmentRunner(background)
         self._global = AdjustmentRunner(background)
         self._background = background
@@ -71,28 +93,28 @@ class BackEnd:
         """Whether nothing is being solved that a new keyframe would have to wait for."""
         return self._local.idle
 
-    @property
-    def takes_keyframes(self) -> bool:
-        """Whether the map may grow: not while a loop is being closed."""
-        return self.idle or not self._is_closing
+    def wants_keyframe(self, track: Track | None) -> bool:
+        """Whether a frame is to become a keyframe: not while a loop is being closed."""
+        front_end = self._front_end
+        frames_since = front_end.frames_since_keyframe
+        if front_end.is_fixed or (self._is_closing and not self.idle):
+            return False
+        if track is None:
+            return not self._map.keyframes or front_end.is_new_place()
+        if track.is_poor and frames_since < self._longest_frames // 3:
+            return False
+        return front_end.local.wants_keyframe(track, frames_since, self.idle)
 
-    @property
-    def offset_px(self) -> float:
-        """The error that all disparities share, measured minus true, as estimated so far."""
-        return self.mapper.offset.value_px
-
-    def take_in(
-        self, keyframe: KeyframeRecord, images: Images, mount: Mount | None, up_world: Up | None
-    ) -> bool:
+    def take_in(self, keyframe: KeyframeRecord, images: Images, up_world: Up | None) -> bool:
         """Adjust the map to a new keyframe: close a loop where it sees a place again, and fit its
         neighbourhood. up_world: as an accelerometer has it. Returns whether the map has changed
         already.
         """
         self._up_world = up_world
         self.places.add(keyframe)
-        if self._join_known(keyframe, images, mount):
+        if self._merge(keyframe, images):
             return True
-        closed = self._close_loop(keyframe, images, mount)
+        closed = self._close_loop(keyframe, images)
         if self._background:
             if not closed:
                 self._adjust(keyframe)
@@ -101,52 +123,47 @@ class BackEnd:
         self._adjust(keyframe)
         return self.collect(wait=True) or closed
 
-    @property
-    def is_apart(self) -> bool:
-        """Whether the map is a part of its own, beside one that is known."""
-        return self._known is not None
-
-    def map_apart(self, of_drive: bool) -> None:
+    def start_submap(self) -> None:
         """Go on with an empty map, until the known one, which is all there is so far, is
-        recognised. of_drive: whether this drive made it, and got lost.
+        recognised.
         """
+        of_drive = self.submap is Submap.KNOWN
         known = map_to_arrays(self._map) | self.places.to_arrays()
-        self._known = KnownMap(self._camera, self._tracker, self._map, known, of_drive)
-        self.begin_again()
+        self._known = KnownMap(self._rig, self._map, known, of_drive)
+        self.reset()
+        self.submap = Submap.LOST if of_drive else Submap.OUTSIDE
 
-    def begin_again(self) -> None:
+    def reset(self) -> None:
         """Go on with an empty map; no id is given twice."""
-        self._map.reset(self._map.num_ever)
-        self._forget_places()
+        self._map.reset(self._map.points.num_ever)
+        self._reset_places()
 
     def sees_known(self, images: Images, features: Features, stamp_ns: int) -> bool:
-        """Whether a camera that is lost in a part of the map is seen to be in the known one."""
-        known = self._known
-        return known is not None and known.is_seen(images, features, self.offset_px, stamp_ns)
+        """Whether a camera that is lost in a submap is seen to be in the known map."""
+        return self._known is not None and self._known.is_seen(images, features, stamp_ns)
 
-    def give_up_part(self) -> None:
-        """Go back to the known map, and forget the part beside it."""
+    def drop_submap(self) -> None:
+        """Go back to the known map; what was mapped beside it is lost."""
         assert self._known is not None
-        known, self._known = self._known, None
+        known, self._known, self.submap = self._known, None, Submap.KNOWN
         arrays = known.to_arrays()
         known.restore(arrays)
-        self._forget_places()
-        self.places.from_arrays(arrays)
+        self._reset_places(arrays)
 
-    def _forget_places(self) -> None:
-        self._global.drop()
+    def _reset_places(self, words: Arrays | None = None) -> None:
+        self._global.reset()
         self.places.reset()
         self.loops.reset()
+        if words is not None:
+            self.places.from_arrays(words)
 
-    def _join_known(self, keyframe: KeyframeRecord, images: Images, mount: Mount | None) -> bool:
-        """Make the drive's own map a part of the known one, where that is recognised."""
+    def _merge(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Merge the submap into the known map, where that is recognised."""
         known = self._known
-        if known is None or not known.recognise(keyframe, images, self.offset_px, mount):
+        if known is None or not known.recognise(keyframe, images):
             return False
-        words = known.join(self.places.to_arrays())
-        self._forget_places()
-        self.places.from_arrays(words)
-        self._known = None
+        self._reset_places(known.merge(self.places.to_arrays()))
+        self._known, self.submap = None, Submap.KNOWN
         return True
 
     def collect(self, wait: bool) -> bool:
@@ -162,13 +179,13 @@ class BackEnd:
                 finished[1]()
         return any(apply is not None for apply in finished)
 
-    def to_arrays(self, of_known: bool) -> Arrays:
-        """Return the map and what belongs to it, for a file. of_known: of the known map, where the
-        present one is a part beside it.
+    def to_arrays(self) -> Arrays:
+        """Return the map and what belongs to it, for a file: of a camera that got lost the map
+        that it was lost in.
         """
-        offset = self.mapper.offset.estimate
+        offset = self._rig.offset.estimate
         measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
-        if of_known and self._known is not None:
+        if self.submap is Submap.LOST and self._known is not None:
             return self._known.to_arrays() | measured
         return map_to_arrays(self._map) | self.places.to_arrays() | measured
 
@@ -176,11 +193,11 @@ class BackEnd:
         """Go on with what `to_arrays` returned."""
         fill_map(self._map, arrays)
         self.places.from_arrays(arrays)
-        self.mapper.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+        self._rig.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
 
     def close(self) -> None:
         """End the background threads, if there are any."""
-        self._global.drop()
+        self._global.reset()
         self._local.close()
         self._global.close()
 
@@ -188,21 +205,21 @@ class BackEnd:
         """Adjust the neighbourhood of a new keyframe."""
         if keyframe.index == 0:
             return
-        adjustment = self.mapper.plan_adjustment(self._map, keyframe, self._up_world)
+        adjustment = self.mapper.plan_adjustment(keyframe, self._up_world)
         if adjustment is None:
             return
         self._local.submit(
             partial(self.mapper.solve, adjustment),
-            partial(self.mapper.apply, self._map, adjustment),
+            partial(self.mapper.apply, adjustment),
         )
 
-    def _close_loop(self, keyframe: KeyframeRecord, images: Images, mount: Mount | None) -> bool:
+    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Begin to close a loop where a keyframe sees a place again; returns whether it does."""
-        matches = self.loops.detect(keyframe, images, self.offset_px, mount)
+        matches = self.loops.detect(keyframe, images)
         if not matches:
             return False
         # It would bring back the map from before the loop.
-        self._global.drop()
+        self._global.reset()
         closing = plan_closing(self._map, matches)
         self._is_closing = True
         self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
@@ -210,12 +227,12 @@ class BackEnd:
 
     def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
         self._is_closing = False
-        if not apply_closing(self._camera, self._map, closing, result):
+        if not apply_closing(self._rig.camera, self._map, closing, result):
             return
         self.loop_count += 1
-        copied = copy_map(self._map, self.mapper.offset.estimate, self._up_world)
+        copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
         self._global.submit(
-            partial(solve_global, self._camera, copied, self._global.is_wanted()),
+            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()),
             partial(apply_global, self._map),
         )
 
@@ -244,12 +261,12 @@ class AdjustmentRunner:
         return self._apply is not None
 
     def is_wanted(self) -> Callable[[], bool]:
-        """Return what tells the next adjustment whether it was dropped."""
+        """Return whether the next adjustment is still wanted, to be asked while it runs."""
         number = self._dropped
         return lambda: self._dropped == number
 
-    def drop(self) -> None:
-        """Forget an adjustment; one that is running is asked to end."""
+    def reset(self) -> None:
+        """Drop an adjustment; one that is running is asked to end."""
         self._dropped += 1
         self._apply = None
 

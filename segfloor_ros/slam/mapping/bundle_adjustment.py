@@ -29,9 +29,9 @@ from segfloor_ros.slam.map.residuals import (
     squared_norms,
 )
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.disparity_offset import NO_OFFSET, OffsetEstimate
 from segfloor_ros.slam.mapping.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.places.loop_closing import move_keyframes
+from segfloor_ros.slam.rig import NO_OFFSET, OffsetEstimate
 from segfloor_ros.slam.sensors.motion_links import Factor, cost, factors_of, with_factors
 
 CONVERGED = 2e-3
@@ -235,15 +235,15 @@ def copy_map(
 ) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
-    point, keyframe, row = (edges.copy() for edges in sparse_map.edges())
+    edges = sparse_map.edges
     return MapCopy(
         np.stack([k.T_camera_world for k in keyframes]),
         sparse_map.xyz_world.copy(),
         sparse_map.stable_id.copy(),
         sparse_map.observer_count.copy(),
-        point,
-        keyframe,
-        row,
+        edges.point.copy(),
+        edges.keyframe.copy(),
+        edges.row.copy(),
         [k.observations for k in keyframes],
         keyframes,
         offset,

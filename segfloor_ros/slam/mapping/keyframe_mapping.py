@@ -12,18 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
-from segfloor_ros.slam.mapping.disparity_offset import DisparityOffset
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates, retire_redundant
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
 from segfloor_ros.slam.sensors.motion_links import factors_of
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.point_measurement import measure_disparity
 
@@ -43,10 +42,8 @@ MIN_FOUND_RATIO = 0.25
 MIN_KEPT_RATIO = 0.5
 """Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
 
-LOCAL_KEYFRAMES = 10
-FIXED_KEYFRAMES = 10
-"""Keyframes that move in a local adjustment, and those that hold them: what is solved well within
-the time between two keyframes."""
+FIXED_KEYFRAMES = LOCAL_KEYFRAMES
+"""Keyframes that hold those which move in a local adjustment."""
 
 BUNDLE_STEPS = 5
 """Steps of a local adjustment; it mostly converges in three."""
@@ -69,8 +66,8 @@ class Adjustment:
 
     newest: index of the keyframe that caused it. free: (K,) indices of the keyframes that move.
     ids: (P,) of the points. edge_keyframe, edge_row: (N,) of the observations. carried_ids,
-    carried_by: (C,) points that one keyframe alone sees, which tell nothing about poses and move
-    along with it.
+    carried_keyframe: (C,) points that one keyframe alone sees, which say nothing about poses and
+    move along with it.
     """
 
     newest: int
@@ -80,15 +77,16 @@ class Adjustment:
     edge_keyframe: NDArray[np.int32]
     edge_row: NDArray[np.int32]
     carried_ids: NDArray[np.int32]
-    carried_by: NDArray[np.int32]
+    carried_keyframe: NDArray[np.int32]
 
 
 class LocalMapper:
     """Adds keyframes and their points to the map and adjusts the neighbourhood."""
 
-    def __init__(self, camera: StereoCamera, settings: StereoSlamSettings) -> None:
-        self._camera = camera
-        self.offset = DisparityOffset(settings.disparity_offset_sigma_px, 1.0 / LOCAL_KEYFRAMES)
+    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
+        self._rig = rig
+        self._camera = rig.camera
+        self._map = sparse_map
 
     def measure_stereo(
         self, frame: StereoFrame, images: Images, observations: Observations
@@ -110,38 +108,36 @@ class LocalMapper:
             DISPARITY_REACH_PX,
         )
 
-    def insert(
-        self, sparse_map: SparseMap, keyframe: KeyframeRecord, patches: NDArray[np.uint8]
-    ) -> None:
+    def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
         """Add a keyframe and new points from its stereo features; points that turn out to be known
         are fused with the older ones.
         """
-        keyframe.point_id[self._contradicted(sparse_map, keyframe)] = NO_POINT
+        keyframe.point_id[self._contradicted(keyframe)] = NO_POINT
         rows, points = self._new_points(keyframe)
-        sparse_map.add_keyframe(keyframe, patches, rows, points)
-        fuse_duplicates(self._camera, sparse_map, keyframe)
-        keyframe.links = self._links(sparse_map, keyframe)
+        self._map.add_keyframe(keyframe, patches, rows, points)
+        fuse_duplicates(self._camera, self._map, keyframe)
+        keyframe.links = self._links(keyframe)
 
-    def _links(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> tuple[int, ...]:
+    def _links(self, keyframe: KeyframeRecord) -> tuple[int, ...]:
         """Return the earlier keyframes that share most points with a new one; the one before it
         where none does.
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        order, shared = sparse_map.covisible(own)
+        order, shared = self._map.covisible(own)
         enough = max(MIN_SHARED_POINTS, MIN_LINK_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
         before = [keyframe.index - 1] if keyframe.index > 0 else []
         return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
 
-    def _contradicted(self, sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+    def _contradicted(self, keyframe: KeyframeRecord) -> NDArray[np.intp]:
         """Return the features (N,) that were matched with a point at another depth: their pixels
         fit it, but their disparity does not.
         """
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-        points = sparse_map.xyz_world[keyframe.point_id[rows]]
+        points = self._map.xyz_world[keyframe.point_id[rows]]
         depth = np.maximum(transform_points(keyframe.T_camera_world, points)[:, 2], MIN_DEPTH_M)
         expected = self._camera.disparity_times_depth / depth
-        measured = keyframe.observations.uvd_px[rows, 2] - self.offset.value_px
+        measured = keyframe.observations.uvd_px[rows, 2] - self._rig.offset.value_px
         limit = np.maximum(DISPARITY_REACH_PX, CONTRADICTED_SHARE * expected)
         return rows[np.abs(measured - expected) > limit]
 
@@ -149,26 +145,26 @@ class LocalMapper:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
         uvd = keyframe.observations.uvd_px
         with np.errstate(invalid='ignore'):
-            measured = uvd[:, 2] - self.offset.value_px >= MIN_DISPARITY_PX
+            measured = uvd[:, 2] - self._rig.offset.value_px >= MIN_DISPARITY_PX
         rows = np.flatnonzero(measured & (keyframe.point_id == NO_POINT))
-        depth = self._camera.disparity_times_depth / (uvd[rows, 2] - self.offset.value_px)
+        depth = self._camera.disparity_times_depth / (uvd[rows, 2] - self._rig.offset.value_px)
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
     def plan_adjustment(
-        self, sparse_map: SparseMap, keyframe: KeyframeRecord, up_world: Up | None = None
+        self, keyframe: KeyframeRecord, up_world: Up | None = None
     ) -> Adjustment | None:
         """Copy the neighbourhood of a keyframe, not the first one, out of the map; None where no
         two keyframes share a point. up_world: where up is, if that is known.
         """
-        free, fixed = self._choose_keyframes(sparse_map, keyframe)
-        ids = sparse_map.points_of(free)
-        edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
+        free, fixed = self._choose_keyframes(keyframe)
+        ids = self._map.points_of(free)
+        edge_point, edge_keyframe, edge_row = self._map.edges_of(ids)
         chosen = np.concatenate([free, fixed])
-        slot = np.full(len(sparse_map.keyframes), -1)
+        slot = np.full(len(self._map.keyframes), -1)
         slot[chosen] = np.arange(len(chosen))
         taking_part = slot[edge_keyframe] >= 0
-        seen_by = np.bincount(edge_point[taking_part], minlength=len(sparse_map.alive))
+        seen_by = np.bincount(edge_point[taking_part], minlength=len(self._map.alive))
         ids = ids[seen_by[ids] > 1]
         alone = taking_part & (seen_by[edge_point] == 1)
         carried = edge_point[alone], edge_keyframe[alone]
@@ -179,14 +175,14 @@ class LocalMapper:
         if len(ids) == 0:
             return None
         problem = BundleProblem(
-            np.stack([sparse_map.keyframes[k].T_camera_world for k in chosen]),
+            np.stack([self._map.keyframes[k].T_camera_world for k in chosen]),
             len(free),
-            sparse_map.xyz_world[ids],
+            self._map.xyz_world[ids],
             slot[edge_keyframe],
             np.searchsorted(ids, edge_point),
-            _gather(sparse_map, edge_keyframe, edge_row),
-            self.offset.estimate,
-            factors_of(sparse_map.keyframes, slot, up_world),
+            _gather(self._map, edge_keyframe, edge_row),
+            self._rig.offset.estimate,
+            factors_of(self._map.keyframes, slot, up_world),
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 
@@ -194,7 +190,7 @@ class LocalMapper:
         """Adjust the copy; safe on another thread, since it shares nothing with the map."""
         return adjust(self._camera, adjustment.problem, BUNDLE_STEPS)
 
-    def apply(self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult) -> None:
+    def apply(self, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
         points. One that loses what the newest keyframe saw has followed something that moves, or a
         wrong match, and is left out.
@@ -202,29 +198,27 @@ class LocalMapper:
         kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
         if len(kept) and kept.mean() < MIN_KEPT_RATIO:
             return
-        self.offset.learn(result.offset)
-        self._write_back(sparse_map, adjustment, result)
-        self._drop_outliers(
-            sparse_map, adjustment.edge_keyframe, adjustment.edge_row, result.inliers
-        )
+        self._rig.offset.learn(result.offset)
+        self._write_back(adjustment, result)
+        self._drop_outliers(adjustment.edge_keyframe, adjustment.edge_row, result.inliers)
         settled = adjustment.newest - SETTLING_KEYFRAMES
-        sparse_map.remove_points(sparse_map.poor_points(settled, MIN_FOUND_RATIO))
-        retire_redundant(sparse_map, adjustment.free)
-        sparse_map.follow()
+        self._map.remove_points(self._map.poor_points(settled, MIN_FOUND_RATIO))
+        retire_redundant(self._map, adjustment.free)
+        self._map.follow()
 
     def _choose_keyframes(
-        self, sparse_map: SparseMap, keyframe: KeyframeRecord
+        self, keyframe: KeyframeRecord
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the covisible keyframes that move and those that hold them; the first one
         never moves.
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        order, shared = sparse_map.covisible(own)
+        order, shared = self._map.covisible(own)
         near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
-        near = np.concatenate([near, np.setdiff1d(_linked(sparse_map, keyframe), near)[::-1]])
+        near = np.concatenate([near, np.setdiff1d(_linked(self._map, keyframe), near)[::-1]])
         free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
         free = free[free != 0]
-        around, _ = sparse_map.covisible(sparse_map.points_of(free))
+        around, _ = self._map.covisible(self._map.points_of(free))
         if keyframe.motion is not None:
             # What wheels tie to the oldest that moves holds it.
             around = np.append(around, max(int(free.min()) - 1, 0))
@@ -233,28 +227,25 @@ class LocalMapper:
             fixed, free = free[-1:], free[:-1]
         return free, fixed
 
-    def _write_back(
-        self, sparse_map: SparseMap, adjustment: Adjustment, result: BundleResult
-    ) -> None:
-        sparse_map.xyz_world[adjustment.ids] = result.points_world
+    def _write_back(self, adjustment: Adjustment, result: BundleResult) -> None:
+        self._map.xyz_world[adjustment.ids] = result.points_world
         for slot, k in enumerate(adjustment.free):
-            keyframe, T_camera_world = sparse_map.keyframes[k], result.T_camera_world[slot]
-            carried = adjustment.carried_ids[adjustment.carried_by == k]
-            sparse_map.xyz_world[carried] = transform_points(
-                invert(T_camera_world) @ keyframe.T_camera_world, sparse_map.xyz_world[carried]
+            keyframe, T_camera_world = self._map.keyframes[k], result.T_camera_world[slot]
+            carried = adjustment.carried_ids[adjustment.carried_keyframe == k]
+            self._map.xyz_world[carried] = transform_points(
+                invert(T_camera_world) @ keyframe.T_camera_world, self._map.xyz_world[carried]
             )
             keyframe.T_camera_world = T_camera_world
 
     def _drop_outliers(
         self,
-        sparse_map: SparseMap,
         edge_keyframe: NDArray[np.int32],
         edge_row: NDArray[np.int32],
         inliers: NDArray[np.bool_],
     ) -> None:
         for k in np.unique(edge_keyframe[~inliers]):
             rows = edge_row[~inliers & (edge_keyframe == k)]
-            sparse_map.unlink(sparse_map.keyframes[k], rows)
+            self._map.unlink(self._map.keyframes[k], rows)
 
 
 def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:

@@ -20,7 +20,13 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.settings import StereoSlamSettings
+
+NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
+"""Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
+some tens of pixels, and their patches still look alike."""
+
+MIN_FRAMES = 3
+"""Frames between keyframes while the mapper is idle (condition A2)."""
 
 REACH_RATIO = 0.5
 """Distance, as a share of the depth of what is seen, up to which a keyframe sees much the same."""
@@ -75,15 +81,14 @@ def views_near(
     cosine = (np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     turned_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
-    apart = np.maximum(moved_m / (REACH_RATIO * depth_m), turned_rad / REACH_RAD)
-    order = np.argsort(apart, kind='stable')
-    near = order[apart[order] < 1.0][:limit]
+    distance = np.maximum(moved_m / (REACH_RATIO * depth_m), turned_rad / REACH_RAD)
+    order = np.argsort(distance, kind='stable')
+    near = order[distance[order] < 1.0][:limit]
     return np.array([active[k].index for k in near], np.intp)
 
 
 def view_novelty(
     camera: StereoCamera,
-    settings: StereoSlamSettings,
     sparse_map: SparseMap,
     ids: NDArray[np.int32],
     T_camera_world: Array,
@@ -103,9 +108,7 @@ def view_novelty(
     around = views_near(sparse_map, T_camera_world, depth_m, len(sparse_map.keyframes))
     earlier = around[around <= latest - RECENT]
     new = {
-        int(k): novelty(
-            sparse_map.keyframes[k].T_camera_world @ invert(T_camera_world), depth_m, settings
-        )
+        int(k): novelty(sparse_map.keyframes[k].T_camera_world @ invert(T_camera_world), depth_m)
         for k in (latest, *recent, *earlier)
     }
     nearest = min(value for k, value in new.items() if k > latest - RECENT)
@@ -164,27 +167,24 @@ class View:
     found_share: float = 1.0
 
 
-def is_keyframe(view: View, settings: StereoSlamSettings) -> bool:
+def is_keyframe(view: View, max_frames: int) -> bool:
     """Decide by the published conditions; A1 and A2 also ask for a view that is new, so that a
-    robot that stands still adds nothing.
+    robot that stands still adds nothing. max_frames: after which one is due (A1).
     """
     new_view = view.novelty > 1
-    due = view.frames_since >= settings.keyframe_min_frames
+    due = view.frames_since >= MIN_FRAMES
     due |= view.novelty > MUCH_NEW or view.found_share < FEW_FOUND
-    a1 = view.frames_since >= settings.keyframe_max_frames and new_view
+    a1 = view.frames_since >= max_frames and new_view
     a2 = view.mapper_idle and due and new_view
     a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable
     b = view.num_tracked > MIN_TRACKED
     return b and (a1 or a2 or a3)
 
 
-def novelty(T_known_now: Array, median_depth_m: float, settings: StereoSlamSettings) -> float:
+def novelty(T_known_now: Array, median_depth_m: float) -> float:
     """Return the motion (4, 4) from a known view in units of what makes a view new.
     median_depth_m: of what is seen.
     """
     moved = float(np.linalg.norm(T_known_now[:3, 3]))
     turned = rotation_angle(T_known_now[:3, :3])
-    return max(
-        moved / (settings.keyframe_motion_ratio * median_depth_m),
-        turned / settings.keyframe_turn_rad,
-    )
+    return max(moved / (NEW_MOTION_RATIO * median_depth_m), turned / NEW_TURN_RAD)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import Rig
 
 MAX_DRIFT = 0.04
 """Drift of a path, m per m: stereo odometry drifts by one per cent or less."""
@@ -68,7 +68,7 @@ differs from the next."""
 
 AGREE_M = 0.05
 AGREE_RAD = 0.02
-"""Keyframes in a row must tell the same drift up to this and a share of the depth of the view."""
+"""Keyframes in a row must show the same drift up to this and a share of the depth of the view."""
 
 AGREE_DEPTH_SHARE = 0.02
 NEAREST_M = 0.5
@@ -77,10 +77,9 @@ NEAREST_M = 0.5
 class LoopChecks:
     """Judges whether a keyframe can see a place: of its own map again, or of another, known one."""
 
-    def __init__(
-        self, camera: StereoCamera, sparse_map: SparseMap, known: SparseMap | None = None
-    ) -> None:
-        self._camera = camera
+    def __init__(self, rig: Rig, sparse_map: SparseMap, known: SparseMap | None = None) -> None:
+        self._rig = rig
+        self._camera = rig.camera
         self._map = sparse_map
         self._known = known or sparse_map
 
@@ -109,9 +108,9 @@ class LoopChecks:
         lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
         return bool(np.linalg.norm(way[:3, 3]) <= FREE_WAY_M + greatest_speed_mps(known) * lost_s)
 
-    def objection(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> str:
+    def objection(self, keyframe: KeyframeRecord, match: Match) -> str:
         """Return what else speaks against a match, '' for nothing."""
-        if not self.is_level(match, mount):
+        if not self.is_level(match):
             return 'another floor'
         if not self._holds_back(keyframe, match):
             return 'not seen from the other side'
@@ -119,8 +118,9 @@ class LoopChecks:
             return 'free space through obstacles'
         return ''
 
-    def is_level(self, match: Match, mount: Mount | None) -> bool:
+    def is_level(self, match: Match) -> bool:
         """Whether the robot stands on the floor of the place, as far as the mount is known."""
+        mount = self._rig.mount
         if mount is None:
             return True
         place = self._known.keyframes[match.place]
@@ -146,8 +146,8 @@ class LoopChecks:
         T_place_world = place.T_camera_world @ invert(match.T_camera_world)
         local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
         uv, _ = self._project(transform_points(T_place_world, local))
-        apart = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
-        return float((apart < MAX_BACK_PX).mean()) >= MIN_BACK_SHARE
+        gap = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
+        return float((gap < MAX_BACK_PX).mean()) >= MIN_BACK_SHARE
 
     def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
         """Return the larger share of the points of one side that the other sees through, were both
@@ -176,8 +176,8 @@ class LoopChecks:
         visible = np.isfinite(uv_seen).all(axis=1)
         if not valid.any() or not visible.any():
             return 0.0
-        apart, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=BESIDE_PX)
-        beside = np.isfinite(apart)
+        gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=BESIDE_PX)
+        beside = np.isfinite(gap)
         if beside.sum() < MIN_COMPARED:
             return 0.0
         behind = disparity_seen[visible][np.asarray(near)[beside]]
@@ -223,8 +223,8 @@ def are_certain(sparse_map: SparseMap, matches: list[Match], times: int = 1) -> 
     limit_m = AGREE_M + AGREE_DEPTH_SHARE * median_depth_m(sparse_map, keyframe)
     for match in matches[:-1]:
         # Both drifts, at the latest keyframe.
-        apart = keyframe.T_camera_world @ drift(sparse_map, match) @ invert(latest.T_camera_world)
-        if np.linalg.norm(apart[:3, 3]) > limit_m or rotation_angle(apart[:3, :3]) > AGREE_RAD:
+        gap = keyframe.T_camera_world @ drift(sparse_map, match) @ invert(latest.T_camera_world)
+        if np.linalg.norm(gap[:3, 3]) > limit_m or rotation_angle(gap[:3, :3]) > AGREE_RAD:
             return False
     return True
 

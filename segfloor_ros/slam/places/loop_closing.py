@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
 from segfloor_ros.slam.map.records import LoopEdge, Match
+from segfloor_ros.slam.map.residuals import CHI2_95
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates
 from segfloor_ros.slam.results import NO_POINT
@@ -37,9 +38,8 @@ MIN_LOOP_WEIGHT = 0.25
 
 STEPS = 20
 CONVERGED = 1e-4
-LOOP_KERNEL = 12.6
-"""Squared error of a loop at which it begins to lose weight: the 95 % quantile of chi-squared with
-six degrees of freedom."""
+LOOP_KERNEL = CHI2_95[6]
+"""Squared error of a loop at which it begins to lose weight."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> Non
 
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
     """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
-    point, holder, _ = sparse_map.edges()
+    edges = sparse_map.edges
     last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
-    last[point] = holder
+    last[edges.point] = edges.keyframe
     before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
     motion = invert(T_camera_world) @ before
     R, t = motion[last, :3, :3], motion[last, :3, 3]
@@ -149,8 +149,8 @@ def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np
     own, old = own[pairs], old[pairs]
     _, first = np.unique(own, return_index=True)
     own, old = own[first], old[first]
-    apart = ~np.isin(own, old) & ~sparse_map.seen_together(own, old)
-    own, old = own[apart], old[apart]
+    separate = ~np.isin(own, old) & ~sparse_map.seen_together(own, old)
+    own, old = own[separate], old[separate]
     older = sparse_map.stable_id[own] < sparse_map.stable_id[old]
     sparse_map.merge(np.where(older, own, old), np.where(older, old, own))
 

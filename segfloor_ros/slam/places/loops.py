@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
@@ -30,14 +29,15 @@ from segfloor_ros.slam.places.loop_checks import (
 )
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import NO_POINT, Track
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.images import Images
 
 RECENT = 20
 """The latest keyframes, which a path leaves behind it, are no place that is seen again."""
 
 MIN_SHARED = 15
-MIN_SHARED_PART = 0.25
-"""Keyframes that share so many points are joined already; fewer are shared by chance."""
+MIN_SHARED_SHARE = 0.25
+"""Keyframes that share so many points are linked already; fewer are shared by chance."""
 
 CANDIDATES = 2
 MAX_MISSES = 1
@@ -60,13 +60,11 @@ class Candidate:
 class LoopDetector:
     """Looks for loops, keyframe by keyframe."""
 
-    def __init__(
-        self, camera: StereoCamera, sparse_map: SparseMap, places: PlaceRecognition
-    ) -> None:
+    def __init__(self, rig: Rig, sparse_map: SparseMap, places: PlaceRecognition) -> None:
         self.candidates: deque[Candidate] = deque(maxlen=REMEMBERED)
         self._map = sparse_map
         self._places = places
-        self._checks = LoopChecks(camera, sparse_map)
+        self._checks = LoopChecks(rig, sparse_map)
         self.reset()
 
     def reset(self) -> None:
@@ -74,9 +72,7 @@ class LoopDetector:
         self._matches: list[Match] = []
         self._misses = 0
 
-    def detect(
-        self, keyframe: KeyframeRecord, images: Images, offset_px: float, mount: Mount | None
-    ) -> list[Match]:
+    def detect(self, keyframe: KeyframeRecord, images: Images) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
         lengths = path_lengths(self._map, keyframe.index)
         near, far = self._sides(keyframe, lengths)
@@ -85,10 +81,10 @@ class LoopDetector:
             return []
         known = self._map.points_of(np.flatnonzero(near))
         if self._matches:
-            match = self._follow(keyframe, images, offset_px, far, known)
+            match = self._follow(keyframe, images, far, known)
         else:
-            match = self._find(keyframe, images, offset_px, far, known)
-        if match is not None and self._is_sound(keyframe, match, lengths, mount):
+            match = self._find(keyframe, images, far, known)
+        if match is not None and self._is_sound(keyframe, match, lengths):
             self._matches.append(match)
             self._misses = 0
         elif self._matches:
@@ -102,12 +98,10 @@ class LoopDetector:
         self.reset()
         return matches
 
-    def _is_sound(
-        self, keyframe: KeyframeRecord, match: Match, lengths: Array, mount: Mount | None
-    ) -> bool:
+    def _is_sound(self, keyframe: KeyframeRecord, match: Match, lengths: Array) -> bool:
         length_m = float(lengths[match.place])
         objection = self._checks.objection_to_drift(keyframe, match, length_m)
-        objection = objection or self._checks.objection(keyframe, match, mount)
+        objection = objection or self._checks.objection(keyframe, match)
         self._note(match, objection or 'seen')
         return not objection
 
@@ -119,14 +113,14 @@ class LoopDetector:
     def _sides(
         self, keyframe: KeyframeRecord, lengths: Array
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which keyframes (K,) a view is joined to already, and which of the others it may
+        """Return which keyframes (K,) a view is linked to already, and which of the others it may
         have come back to.
         """
         keyframes = self._map.keyframes
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
-        joined, shared = self._map.covisible(own)
+        linked, shared = self._map.covisible(own)
         near = np.arange(len(keyframes)) > keyframe.index - RECENT
-        near[joined[shared > max(MIN_SHARED, MIN_SHARED_PART * len(own))]] = True
+        near[linked[shared > max(MIN_SHARED, MIN_SHARED_SHARE * len(own))]] = True
         retired = np.array([k.retired is not None for k in keyframes])
         return near, ~near & ~retired & self._within_drift(keyframe, lengths)
 
@@ -145,7 +139,6 @@ class LoopDetector:
         self,
         keyframe: KeyframeRecord,
         images: Images,
-        offset_px: float,
         far: NDArray[np.bool_],
         known: NDArray[np.int32],
     ) -> Match | None:
@@ -153,7 +146,7 @@ class LoopDetector:
         score = self._places.score(keyframe.features) * far
         for group in self._places.groups(score, CANDIDATES):
             ids = np.setdiff1d(self._map.points_of(group), known).astype(np.int32)
-            track = self._places.locate(images, keyframe.features, ids, offset_px)
+            track = self._places.locate(images, keyframe.features, ids)
             if track is not None:
                 return self._match(keyframe, track, far)
         return None
@@ -162,7 +155,6 @@ class LoopDetector:
         self,
         keyframe: KeyframeRecord,
         images: Images,
-        offset_px: float,
         far: NDArray[np.bool_],
         known: NDArray[np.int32],
     ) -> Match | None:
@@ -173,7 +165,7 @@ class LoopDetector:
         )
         around = around[far[around]][:RECENT]
         ids = np.setdiff1d(self._map.points_of(around), known).astype(np.int32)
-        track = self._places.confirm(images, keyframe.features, ids, pose, offset_px)
+        track = self._places.confirm(images, keyframe.features, ids, pose)
         return None if track is None else self._match(keyframe, track, far)
 
     def _match(

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import Track
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker
@@ -56,9 +56,9 @@ NUM_WORDS = BRANCHES**LEVELS
 class PlaceRecognition:
     """The places of a map by their look."""
 
-    def __init__(self, camera: StereoCamera, tracker: Tracker, sparse_map: SparseMap) -> None:
-        self._camera = camera
-        self._tracker = tracker
+    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
+        self._camera = rig.camera
+        self._tracker = Tracker(rig, sparse_map)
         self._map = sparse_map
         self._vocabulary = Vocabulary.load()
         self._index = PlaceIndex()
@@ -122,16 +122,14 @@ class PlaceRecognition:
         others = others[score[others] > 0][: GROUP_KEYFRAMES - 1]
         return np.append(index, others).astype(np.intp)
 
-    def locate(
-        self, images: Images, features: Features, ids: NDArray[np.int32], offset_px: float
-    ) -> Track | None:
+    def locate(self, images: Images, features: Features, ids: NDArray[np.int32]) -> Track | None:
         """Find a camera among points `ids` (N,); None unless it sees them."""
         observations = self._tracker.pixel_observations(features)
         tree = cKDTree(features.uv_px)
-        estimate = self._tracker.locate(features, tree, observations, self._map, ids)
+        estimate = self._tracker.locate(features, tree, observations, ids)
         if estimate is None:
             return None
-        return self.confirm(images, features, ids, estimate.T_camera_world, offset_px)
+        return self.confirm(images, features, ids, estimate.T_camera_world)
 
     def confirm(
         self,
@@ -139,12 +137,11 @@ class PlaceRecognition:
         features: Features,
         ids: NDArray[np.int32],
         T_camera_world: Array,
-        offset_px: float,
     ) -> Track | None:
         """Find a camera that should be at a pose from which points `ids` (N,) are seen; None
         unless it sees them.
         """
-        track = self._tracker.track_at(images, features, self._map, ids, T_camera_world, offset_px)
+        track = self._tracker.track_at(images, features, ids, T_camera_world)
         return track if track is not None and self.is_same_place(track) else None
 
     def is_same_place(self, track: Track) -> bool:
@@ -208,7 +205,7 @@ class PlaceIndex:
 
     def score(self, words: NDArray[np.int32], count: int) -> Array:
         """Return how much of a view with words (N,) each keyframe (count,) holds, in [0, 1]: words
-        weigh as much as they tell, log(keyframes / keyframes that hold the word).
+        weigh the more the rarer they are, log(keyframes / keyframes that hold the word).
         """
         own = [self._keyframes[word] for word in np.unique(words).tolist()]
         holders = np.array([len(keyframes) for keyframes in own], np.intp)

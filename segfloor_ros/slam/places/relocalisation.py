@@ -2,7 +2,7 @@
 
 A known map that the camera is not found in: the drive maps on its own until it recognises it.
 
-It was saved by another drive, or made by this one before it got lost. The two maps are kept apart.
+It was saved by another drive, or made by this one before it got lost. The two maps stay separate.
 Several keyframes in a row must see the known map and agree on where it lies; then the drive's own
 map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging).
 """
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.slam.map.map_arrays import fill_map, map_to_arrays, moved
@@ -32,12 +31,12 @@ from segfloor_ros.slam.places.loop_checks import (
 from segfloor_ros.slam.places.loop_closing import fuse_latest, merge_pairs
 from segfloor_ros.slam.places.place_recognition import BEST_KEYFRAMES, PlaceRecognition
 from segfloor_ros.slam.results import NO_POINT, Track
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
-from segfloor_ros.slam.tracking.map_tracking import Tracker
 
 BEST_GROUPS = 2
-"""Places tried with every frame; one more is tried in turn: words alone do not tell for sure."""
+"""Places tried with every frame; one more is tried in turn: words alone are not sure."""
 
 SAME_M = 0.5
 SAME_RAD = 0.3
@@ -61,7 +60,7 @@ MAX_VIEW_TURN_RAD = 1.0
 NEIGHBOURS = 20
 MAX_MISSES = 1
 TIMES_A_LOOP = 2
-"""No drift tells where the known map can be: so many times the sightings of a loop are asked for.
+"""No drift limits where the known map can be: so many times the sightings of a loop are asked for.
 With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
 be no further away than it can have driven, too.
 """
@@ -97,7 +96,6 @@ class Relocaliser:
         self,
         images: Images,
         features: Features,
-        offset_px: float,
         stamp_ns: int,
         is_possible: Callable[[Array], bool] | None = None,
         lost_at: Array | None = None,
@@ -106,7 +104,7 @@ class Relocaliser:
         there, or one around a given pose or where the camera was lost (T_camera_world, (4, 4)).
         """
         given = self.is_narrow
-        found = self.find(images, features, offset_px, is_possible)
+        found = self.find(images, features, is_possible)
         expected = found is not None and (given or _follows(found, lost_at, SAME_M))
         if found is None or not (expected or self._places.agreement(found) >= MIN_AGREEMENT):
             self._last_found, self._in_a_row = None, 0
@@ -124,7 +122,6 @@ class Relocaliser:
         self,
         images: Images,
         features: Features,
-        offset_px: float,
         is_possible: Callable[[Array], bool] | None = None,
     ) -> Track | None:
         """Return a frame with its pose; None where no place of the map is seen, or two that look
@@ -139,12 +136,12 @@ class Relocaliser:
         found = []
         for group in chosen:
             ids = self._map.points_of(group)
-            track = self._places.locate(images, features, ids, offset_px)
+            track = self._places.locate(images, features, ids)
             if track is None or not self._is_near(track):
                 continue
             if is_possible is None or is_possible(track.T_camera_world):
                 found.append(track)
-        if not found or any(_apart(found[0], other) for other in found[1:]):
+        if not found or any(_differ(found[0], other) for other in found[1:]):
             return None
         return max(found, key=lambda track: len(track.point_ids))
 
@@ -180,7 +177,7 @@ def _follows(found: Track, T_camera_world: Array | None, reach_m: float) -> bool
     return is_within(found.T_camera_world @ invert(T_camera_world), reach_m, STEP_RAD)
 
 
-def _apart(a: Track, b: Track) -> bool:
+def _differ(a: Track, b: Track) -> bool:
     return not is_within(a.T_camera_world @ invert(b.T_camera_world), SAME_M, SAME_RAD)
 
 
@@ -200,30 +197,27 @@ class KnownMap:
 
     def __init__(
         self,
-        camera: StereoCamera,
-        tracker: Tracker,
+        rig: Rig,
         own: SparseMap,
         arrays: Arrays,
         of_drive: bool,
     ) -> None:
         self._own = own
         self._of_drive = of_drive
-        self._camera = camera
+        self._camera = rig.camera
         self._map = SparseMap()
         fill_map(self._map, arrays)
-        self._places = PlaceRecognition(camera, tracker, self._map)
+        self._places = PlaceRecognition(rig, self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._checks = LoopChecks(camera, own, self._map)
+        self._checks = LoopChecks(rig, own, self._map)
         self._sightings: list[Sighting] = []
         self._misses = 0
 
-    def recognise(
-        self, keyframe: KeyframeRecord, images: Images, offset_px: float, mount: Mount | None
-    ) -> bool:
+    def recognise(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
-        match = self._look(keyframe, images, offset_px)
-        if match is not None and self._is_possible(keyframe, match, mount):
+        match = self._look(keyframe, images)
+        if match is not None and self._is_possible(keyframe, match):
             self._sightings.append(self._sighting(keyframe, match))
             self._misses = 0
         else:
@@ -233,26 +227,26 @@ class KnownMap:
         matches = [sighting.match for sighting in self._sightings]
         return are_certain(self._own, matches, TIMES_A_LOOP)
 
-    def _is_possible(self, keyframe: KeyframeRecord, match: Match, mount: Mount | None) -> bool:
+    def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
         if self._of_drive and not self._checks.is_within_reach(match):
             return False
-        return not self._checks.objection(keyframe, match, mount)
+        return not self._checks.objection(keyframe, match)
 
-    def is_seen(self, images: Images, features: Features, offset_px: float, stamp_ns: int) -> bool:
+    def is_seen(self, images: Images, features: Features, stamp_ns: int) -> bool:
         """Whether enough frames in a row see the known map, this one the last of them."""
-        found = self._relocaliser.find_surely(images, features, offset_px, stamp_ns)
+        found = self._relocaliser.find_surely(images, features, stamp_ns)
         return found is not None
 
-    def _look(self, keyframe: KeyframeRecord, images: Images, offset_px: float) -> Match | None:
+    def _look(self, keyframe: KeyframeRecord, images: Images) -> Match | None:
         """Look for the view where the keyframes before saw it, else in the whole known map."""
         features = keyframe.features
         if self._sightings:
             pose = keyframe.T_camera_world @ drift(self._own, self._sightings[-1].match)
             depth_m = median_depth_m(self._own, keyframe)
             around = self._map.points_of(views_near(self._map, pose, depth_m, NEIGHBOURS))
-            track = self._places.confirm(images, features, around, pose, offset_px)
+            track = self._places.confirm(images, features, around, pose)
         else:
-            track = self._relocaliser.find(images, features, offset_px)
+            track = self._relocaliser.find(images, features)
         if track is None or track.observed is None:
             return None
         rows = np.flatnonzero(track.observed.point_id != NO_POINT)
@@ -266,9 +260,9 @@ class KnownMap:
         both = own != NO_POINT
         return Sighting(match, self._own.stable_id[own[both]].copy(), match.stable_ids[both])
 
-    def join(self, own_words: Arrays) -> Arrays:
-        """Bring the drive's own map into the known one, of which it becomes a part, with the same
-        ids and stamps. Returns the words of all keyframes.
+    def merge(self, own_words: Arrays) -> Arrays:
+        """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
+        words of all keyframes.
         """
         latest = self._sightings[-1].match
         T_known_own = invert(drift(self._own, latest))
@@ -296,7 +290,7 @@ class KnownMap:
         fill_map(self._own, known)
 
     def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
-        """Return the rows (N,) of points in the joined map, -1 for those that are gone."""
+        """Return the rows (N,) of points in the merged map, -1 for those that are gone."""
         rows = np.searchsorted(self._own.stable_id, stable_ids)
         rows = np.minimum(rows, len(self._own.stable_id) - 1)
         there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]

@@ -1,4 +1,4 @@
-"""The motion of the camera between two frames as wheels and gyroscope tell it."""
+"""The motion of the camera between two frames as wheels and gyroscope measure it."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from segfloor_ros.slam.sensors.wheel_odometry import (
 )
 
 SIGMA_ROOT_M = 0.01
-"""Error of a way told by wheels, per root metre, in any direction of the floor."""
+"""Error of a way measured by wheels, per root metre, in any direction of the floor."""
 
 SIGMA_ROOT_UP_M, SIGMA_ROOT_TILT_RAD = 0.01, 0.02
 """How far a floor that wheels take for a plane goes up and tilts, per root metre."""
 
 SIGMA_TURN_SHARE = 0.03
-"""Error of a turn told by wheels, as a share of it."""
+"""Error of a turn measured by wheels, as a share of it."""
 
 SIGMA_ROOT_TURN_RAD = 0.01
-"""Error of the heading told by wheels, per root metre."""
+"""Error of the heading measured by wheels, per root metre."""
 
 SLIP_M_S = 0.5
-"""Error of a speed told by wheels that slip."""
+"""Error of a speed measured by wheels that slip."""
 
 SLIP_NS = 1_000_000_000
 """Wheels that slipped are not believed for so long."""
@@ -55,18 +55,18 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class RelativeMotion:
     """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
-    twist in exp(twist) T_now_before, translation first. told_by: wheels, an IMU, a gyroscope alone
+    twist in exp(twist) T_now_before, translation first. source: wheels, an IMU, a gyroscope alone
     with a speed that is taken for constant, or nothing at all: the last pose is held.
     """
 
     T_now_before: Array
     covariance: Array
-    told_by: Literal['wheels', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
+    source: Literal['wheels', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
 
     @property
     def by_wheels(self) -> bool:
-        """Whether wheels told it."""
-        return self.told_by == 'wheels'
+        """Whether wheels measured it."""
+        return self.source == 'wheels'
 
     @classmethod
     def none(cls) -> RelativeMotion:
@@ -79,12 +79,13 @@ class RelativeMotion:
         return RelativeMotion(
             later.T_now_before @ self.T_now_before,
             A @ self.covariance @ A.T + later.covariance,
-            later.told_by if self.by_wheels else self.told_by,
+            later.source if self.by_wheels else self.source,
         )
 
 
 class BodyMotion:
-    """Tells the motion between frames, and learns from the images what is wrong with the sensors.
+    """Measures the motion between frames, and learns from the images what is wrong with the
+    sensors.
 
     T_base_left: (4, 4), the mount; without it wheels cannot be used. messages: used, by sensor.
     slips: stretches in which the wheels did not agree with the images. remarks: what seems wrong
@@ -123,11 +124,11 @@ class BodyMotion:
 
     @property
     def latest_wheels(self) -> list[WheelPose]:
-        """The last poses that the wheels told: enough for the motion since."""
+        """The last poses that the wheels measured: enough for the motion since."""
         return self._wheels.latest
 
     def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
-        """Return R_now_before (3, 3) of the camera as the gyroscope tells it, and the standard
+        """Return R_now_before (3, 3) of the camera as the gyroscope measures it, and the standard
         deviation of its angles in radians.
         """
         turn = self.gyroscope.turn(before_ns, now_ns)
@@ -139,22 +140,22 @@ class BodyMotion:
         return max(0, round(1e9 * max(self.gyroscope.lag_s, self._calibrator.current.lag_s)))
 
     def between(self, before_ns: int, now_ns: int) -> RelativeMotion | None:
-        """Return the motion of the camera between two times; None where wheels tell nothing."""
+        """Return the motion of the camera between two times; None where wheels measure nothing."""
         lag_ns = round(self._calibrator.current.lag_s * 1e9)
-        told = self._wheels.stretch(before_ns + lag_ns, now_ns + lag_ns)
-        if told is None or self.T_base_left is None:
+        measured = self._wheels.stretch(before_ns + lag_ns, now_ns + lag_ns)
+        if measured is None or self.T_base_left is None:
             return None
         R_base_left = self.T_base_left[:3, :3]
         seconds = (now_ns - before_ns) * 1e-9
         turn = self.gyroscope.turn(before_ns, now_ns)
         R = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
         way_m, turn_rad = self._calibrator.current.base_motion(
-            told.T_before_now, None if R is None else yaw_of(R)
+            measured.T_before_now, None if R is None else yaw_of(R)
         )
         if R is None:
             R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
         T_before_now = make_transform(R, np.append(way_m, 0.0))
-        variance = self._variance(told, None if turn is None else turn[1])
+        variance = self._variance(measured, None if turn is None else turn[1])
         if self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS:
             variance[:2] += (SLIP_M_S * seconds) ** 2
         A = adjoint(invert(self.T_base_left))
@@ -163,23 +164,23 @@ class BodyMotion:
             A @ np.diag(variance) @ A.T,
         )
 
-    def _variance(self, told: Stretch, sigma_turn: float | None) -> Array:
+    def _variance(self, measured: Stretch, sigma_turn: float | None) -> Array:
         """Return the variances (6,) of a motion in the base's axes."""
         calibration = self._calibrator.current
-        length_m = float(np.linalg.norm(told.T_before_now[:3, 3]))
+        length_m = float(np.linalg.norm(measured.T_before_now[:3, 3]))
         on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
         up = SIGMA_ROOT_UP_M**2 * length_m
         tilt = SIGMA_ROOT_TILT_RAD**2 * length_m
         yaw = SIGMA_ROOT_TURN_RAD**2 * length_m
-        yaw += (SIGMA_TURN_SHARE * yaw_of(told.T_before_now)) ** 2
-        yaw += (calibration.lag_sigma_s * told.turning_up_rad_s) ** 2
-        on_floor += float(calibration.lag_sigma_s * np.linalg.norm(told.speeding_up_m_s)) ** 2
+        yaw += (SIGMA_TURN_SHARE * yaw_of(measured.T_before_now)) ** 2
+        yaw += (calibration.lag_sigma_s * measured.turning_up_rad_s) ** 2
+        on_floor += float(calibration.lag_sigma_s * np.linalg.norm(measured.speeding_up_m_s)) ** 2
         if sigma_turn is not None:
             tilt = yaw = sigma_turn**2
         return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
 
     def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Learn from the pose of a frame that the images tell well."""
+        """Learn from the pose of a frame that the images show well."""
         self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
         self._inertial.see(stamp_ns, T_odom_camera, R_world_odom)
         rate_before, rate_rad_s = self._window_rate_rad_s, self._turn_rate(stamp_ns, T_odom_camera)
@@ -209,10 +210,10 @@ class BodyMotion:
         turned = self.T_base_left[:3, :3] @ before[1][:3, :3].T @ T_odom_camera[:3, :3]
         return yaw_of(turned @ self.T_base_left[:3, :3].T) * 1e9 / max(stamp_ns - before[0], 1)
 
-    def felt(
+    def by_inertia(
         self, before_ns: int, now_ns: int, T_odom_before: Array, R_world_odom: Array
     ) -> RelativeMotion | None:
-        """Return the motion of the camera since the last pose as an IMU alone tells it."""
+        """Return the motion of the camera since the last pose as an IMU alone measures it."""
         turn, way = self.turn(before_ns, now_ns), self._inertial.way(now_ns, R_world_odom)
         if turn is None or way is None:
             return None
@@ -222,13 +223,13 @@ class BodyMotion:
         return RelativeMotion(
             make_transform(R_now_before, moved_m),
             np.diag(variance),
-            'IMU' if way.is_felt else 'gyroscope',
+            'IMU' if way.is_measured else 'gyroscope',
         )
 
     def carry(
         self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array, on_wheels: bool
     ) -> None:
-        """Note the pose of a frame that no image tells, but wheels or an IMU alone."""
+        """Note the pose of a frame that no image shows, but wheels or an IMU alone."""
         self._window = self._last_seen = None
         if on_wheels:
             self.gravity.see(stamp_ns, T_odom_camera, R_world_odom)
@@ -236,25 +237,25 @@ class BodyMotion:
         else:
             self._inertial.carry(stamp_ns, T_odom_camera, R_world_odom)
 
+    def reset(self) -> None:
+        """Begin anew after a frame without a pose; what is known of the sensors stays."""
+        self._window = self._last_seen = None
+        self.gravity.reset()
+        self._inertial.reset()
+
     def reset_world(self) -> None:
         """Forget where up is: the world is another one."""
         self.gravity = Gravity(self.gyroscope)
         self._inertial = InertialOdometry(self.gyroscope, self.gravity)
 
-    def stop(self) -> None:
-        """Note that there is a frame without a pose."""
-        self._window = self._last_seen = None
-        self.gravity.stop()
-        self._inertial.stop()
-
     def _learn_wheels(
         self, T_before_now: Array, before_ns: int, now_ns: int, turning_up_rad_s: float
     ) -> None:
-        told = self._wheels.stretch(before_ns, now_ns)
-        if told is None or self.T_base_left is None:
+        measured = self._wheels.stretch(before_ns, now_ns)
+        if measured is None or self.T_base_left is None:
             return
         seen = self.T_base_left @ T_before_now @ invert(self.T_base_left)
-        window = Window(seen[:2, 3], yaw_of(seen), turning_up_rad_s, told)
+        window = Window(seen[:2, 3], yaw_of(seen), turning_up_rad_s, measured)
         if not self._calibrator.add(window):
             self.slips += 1
             in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS

@@ -6,7 +6,10 @@ By how much the stamps of a sensor are later than those of the images.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +23,8 @@ MAX_AHEAD_NS = 60_000_000
 """Messages may be so late; until then the camera is taken to turn on as it did."""
 
 RESTART_NS = 1_000_000_000
+"""Stamps that jump back by more begin a new recording."""
+
 SIGMA_ROOT_S = 3e-4
 """Error of an angle, rad per root second: consumer gyroscopes have 0.005 to 0.02 degrees."""
 
@@ -34,10 +39,10 @@ FIRST_LAG_SIGMA_S, LAG_DRIFT = 0.02, 1e-5
 """By how much the stamps of an IMU are late: clocks of drivers differ by hundredths of a second."""
 
 STEADY_RAD_S = 0.02
-"""Noise alone shows smaller changes of the rate: they tell nothing of a lag."""
+"""Noise alone shows smaller changes of the rate: they say nothing of a lag."""
 
 SIGMA_SEEN_RAD = 1e-3
-"""Error of a turn as the images tell it."""
+"""Error of a turn as the images show it."""
 
 OUTLIER_SIGMAS = 4.0
 
@@ -45,9 +50,64 @@ SAID_S = 0.01
 """A lag that is worth a word; less is what a driver may be off."""
 
 
+class Stamped(Protocol):
+    """What a sensor measured at a time."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When."""
+
+
+Sample = TypeVar('Sample', bound=Stamped)
+
+
+class TimedSeries(Generic[Sample]):
+    """The latest samples of a sensor, in the order of their stamps."""
+
+    def __init__(self, history: int, max_gap_ns: int, max_ahead_ns: int) -> None:
+        self._history, self._max_gap_ns, self._max_ahead_ns = history, max_gap_ns, max_ahead_ns
+        self._samples: list[Sample] = []
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self._samples)
+
+    def add(self, sample: Sample) -> None:
+        """Take in a sample; one that comes late is put where it belongs."""
+        if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns - RESTART_NS:
+            self._samples.clear()
+        insort(self._samples, sample, key=_stamp)
+        if len(self._samples) > 2 * self._history:
+            del self._samples[: -self._history]
+
+    def latest(self, count: int) -> list[Sample]:
+        """Return so many of the samples."""
+        return self._samples[-count:]
+
+    def window(self, before_ns: int, now_ns: int) -> list[Sample]:
+        """Return the samples from the last one before a time to the first one after another; none
+        where they have gaps or do not reach so far. Where the last comes before the end, or before
+        a gap, there are at least two, to go on from.
+        """
+        first = max(bisect_right(self._samples, before_ns, key=_stamp) - 1, 0)
+        last = bisect_left(self._samples, now_ns, key=_stamp)
+        around = self._samples[max(last - 1, 0) : last + 1]
+        gap_ns = around[-1].stamp_ns - around[0].stamp_ns if around else 0
+        if last == len(self._samples) or (
+            gap_ns > self._max_gap_ns and around[-1].stamp_ns > now_ns
+        ):
+            last -= 1
+            first = max(min(first, last - 1), 0)
+        samples = self._samples[first : last + 1]
+        stamps = [before_ns, *(sample.stamp_ns for sample in samples)]
+        if not samples or now_ns - stamps[-1] > self._max_ahead_ns:
+            return []
+        gap_ns = max(later - one for one, later in pairwise(stamps))
+        return samples if gap_ns <= self._max_gap_ns else []
+
+
 @dataclass(frozen=True)
-class Felt:
-    """What an IMU felt between two times, in the axes of the first: R_before_now (3, 3) and the
+class Preintegrated:
+    """What an IMU measured between two times, in the axes of the first: R_before_now (3, 3) and the
     standard deviation of its angles, and the acceleration of the camera, gravity's included,
     integrated once (3,) in m/s and twice (3,) in m.
     """
@@ -78,7 +138,7 @@ class _Path:
     @property
     def circle(self) -> tuple[Array, Array]:
         """The speed and the way (3,) that an IMU beside the camera has because it turns: what is
-        felt of them is the difference of both ends, whatever happens between.
+        measured of them is the difference of both ends, whatever happens between.
         """
         first, last = np.cross(self.rates_rad_s[[0, -1]], self.place_m)
         swept = self.turns[-1] @ self.place_m - self.place_m
@@ -112,17 +172,13 @@ class Gyroscope:
         self.bias_rad_s: Array = np.zeros(3)
         self.lag_s = 0.0
         self._covariance: Array = np.diag([FIRST_BIAS_SIGMA**2] * 3 + [FIRST_LAG_SIGMA_S**2])
-        self._samples: list[ImuSample] = []
+        self.samples: TimedSeries[ImuSample] = TimedSeries(HISTORY, MAX_GAP_NS, MAX_AHEAD_NS)
         self._latest: tuple[tuple[int, int], _Path | None] | None = None
 
     def add(self, sample: ImuSample) -> None:
-        """Take in a sample; one that comes late is put where it belongs."""
+        """Take in a sample."""
         self._latest = None
-        if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns - RESTART_NS:
-            self._samples.clear()
-        insort(self._samples, sample, key=_stamp)
-        if len(self._samples) > 2 * HISTORY:
-            del self._samples[:-HISTORY]
+        self.samples.add(sample)
 
     def turn(self, before_ns: int, now_ns: int) -> tuple[Array, float] | None:
         """Return R_before_now (3, 3) of the left optical frame, freed of the bias, and the standard
@@ -131,8 +187,8 @@ class Gyroscope:
         path = self._path(before_ns, now_ns)
         return None if path is None else (path.turns[-1], path.sigma_rad(self._sigma))
 
-    def felt(self, before_ns: int, now_ns: int) -> Felt | None:
-        """Return what was felt between two times; None where samples are missing."""
+    def preintegrated(self, before_ns: int, now_ns: int) -> Preintegrated | None:
+        """Return what was measured between two times; None where samples are missing."""
         path = self._path(before_ns, now_ns)
         if path is None:
             return None
@@ -143,10 +199,10 @@ class Gyroscope:
         way = ((before + speed) / 2 * step_s).sum(axis=0)
         turning, swept = path.circle
         sigma_rad = path.sigma_rad(self._sigma)
-        return Felt(path.turns[-1], sigma_rad, speed[-1] - turning, way - swept)
+        return Preintegrated(path.turns[-1], sigma_rad, speed[-1] - turning, way - swept)
 
     def _path(self, before_ns: int, now_ns: int) -> _Path | None:
-        """Return what was felt between two times; many ask for the motion of the same frame."""
+        """Return what was measured between two times; many ask for the motion of the same frame."""
         if self._latest is None or self._latest[0] != (before_ns, now_ns):
             self._latest = (before_ns, now_ns), self._integrated(before_ns, now_ns)
         return self._latest[1]
@@ -157,15 +213,10 @@ class Gyroscope:
         """
         lag_ns = round(self.lag_s * 1e9)
         before_ns, now_ns = before_ns + lag_ns, now_ns + lag_ns
-        first = bisect_right(self._samples, before_ns, key=_stamp) - 1
-        last = bisect_left(self._samples, now_ns, key=_stamp)
-        samples = self._samples[max(first, 0) : last + 1]
-        if not samples or samples[0].stamp_ns - before_ns > MAX_GAP_NS:
+        samples = self.samples.window(before_ns, now_ns)
+        if not samples:
             return None
         times_ns = np.array([sample.stamp_ns for sample in samples], np.int64)
-        late_ns = now_ns - times_ns[-1]
-        if late_ns > MAX_AHEAD_NS or np.diff(times_ns).max(initial=0) > MAX_GAP_NS:
-            return None
         measured = np.stack([[*sample.gyro_rad_s, *sample.accel_m_s2] for sample in samples])
         inner = times_ns[(times_ns > before_ns) & (times_ns < now_ns)]
         nodes = (np.concatenate([[before_ns], inner, [now_ns]]) - before_ns) * 1e-9
@@ -179,14 +230,15 @@ class Gyroscope:
         return _Path(nodes, np.stack(turns), rates, at_nodes[:, 3:], samples[-1].place_m)
 
     def learn(self, seen: Array, before_ns: int, now_ns: int) -> None:
-        """Learn bias and lag from R_before_now (3, 3) as the images tell it (a Kalman filter)."""
+        """Learn bias and lag from R_before_now (3, 3) as the images show it (a Kalman filter)."""
         path = self._path(before_ns, now_ns)
         if path is None or now_ns <= before_ns:
             return
         seconds = float(path.seconds[-1])
         excess = Rotation.from_matrix(seen.T @ path.turns[-1]).as_rotvec()
         noise = SIGMA_SEEN_RAD + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
-        # What is told is late by what is left of the lag: by its rate of the turn at either end.
+        # What is measured is late by what is left of the lag: by its rate of the turn at either
+        # end.
         speeding_up = path.speeding_up
         speeding_up = speeding_up * (np.linalg.norm(speeding_up) > STEADY_RAD_S)
         H = np.column_stack([seconds * np.eye(3), -speeding_up])
@@ -213,7 +265,7 @@ class Gyroscope:
         return np.sqrt(np.diag(self._covariance))
 
 
-def _stamp(sample: ImuSample) -> int:
+def _stamp(sample: Stamped) -> int:
     return sample.stamp_ns
 
 

@@ -1,10 +1,11 @@
-"""How the camera moves as an accelerometer feels it, where images and wheels tell nothing.
+"""How the camera moves by an accelerometer, where images and wheels show nothing.
 
-Where up is, as an accelerometer feels it.
+Where up is, by an accelerometer.
 
-What is felt is integrated twice between three poses that the images tell (preintegration; Forster
-et al., On-Manifold Preintegration, IEEE T-RO 2017). The speeds drop out, as in the alignment of Qin
-et al., VINS-Mono, IEEE T-RO 2018, section V-B: no acceleration of the robot is taken for gravity.
+What it measures is integrated twice between three poses that the images show (preintegration;
+Forster et al., On-Manifold Preintegration, IEEE T-RO 2017). The speeds drop out, as in the
+alignment of Qin et al., VINS-Mono, IEEE T-RO 2018, section V-B: no acceleration of the robot is
+taken for gravity.
 """
 
 from __future__ import annotations
@@ -16,27 +17,28 @@ import numpy as np
 
 from segfloor_ros.geometry import Array, rotation_angle
 from segfloor_ros.measurements import Up
+from segfloor_ros.slam.map.residuals import is_gated
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 
 SIGMA_SEEN_M = 0.003
-"""Error of the place of a frame as the images tell it."""
+"""Error of the place of a frame as the images show it."""
 
 FIRST_SPEED_SIGMA_M_S = 0.3
 SIGMA_STEADY = 0.5
 """How much a speed that is taken for constant changes, m/s per root second."""
 
-SIGMA_FELT = 0.01
-"""Error of a speed that is felt, m/s per root second: noise and shaking."""
+SIGMA_INTEGRATED = 0.01
+"""Error of a speed that is integrated, m/s per root second: noise and shaking."""
 
 FIRST_ERROR_SIGMA_M_S2, ERROR_DRIFT = 0.1, 0.01
-"""Error of what is felt once gravity is taken off, m/s², and its drift, m/s² per root second."""
+"""Error of the acceleration freed of gravity, m/s², and its drift, m/s² per root second."""
 
 STEP_NS, MAX_STEP_NS = 500_000_000, 1_000_000_000
 """Time between two of the poses: errors of millimetres in their place are little then, and little
 is lost where the images fail."""
 
 MAX_TURN_RAD = 0.5
-"""Turn between two of the poses: in a fast one the IMU feels its own circle."""
+"""Turn between two of the poses: in a fast one the IMU measures its own circle."""
 
 SIGMA_LIFT_M_S2 = 0.08
 """Error of what is found of three poses: of their places and of the camera's shaking."""
@@ -45,23 +47,20 @@ SIGMA_BIAS_M_S2 = 0.2
 """Bias of a cheap accelerometer."""
 
 SIGMA_ANY_M_S2 = 100.0
-OUTLIER_CHI2 = 16.27
-"""The 99.9 % quantile of the chi-squared distribution with three degrees of freedom."""
-
 MIN_MEASURED = 3
 GRAVITY_M_S2, MAX_OFF_M_S2 = 9.81, 1.0
-"""An accelerometer that feels another gravity measures something else, or nothing."""
+"""An accelerometer with another gravity measures something else, or nothing."""
 
 
 @dataclass(frozen=True)
 class Way:
     """A way (3,) in metres in the axes of odom, the variance of each of its components, and whether
-    it was felt; else its speed is taken for constant.
+    it was measured; else its speed is taken for constant.
     """
 
     moved_m: Array
     variance_m2: float
-    is_felt: bool
+    is_measured: bool
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class _State:
 
 class InertialOdometry:
     """A Kalman filter of place, speed and error of the acceleration; speed is taken for constant
-    where no accelerometer is felt or gravity is unknown.
+    where there is no accelerometer or gravity is unknown.
     """
 
     def __init__(self, gyroscope: Gyroscope, gravity: Gravity) -> None:
@@ -87,7 +86,7 @@ class InertialOdometry:
         self._state: _State | None = None
 
     def see(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Take in the pose of a frame that images or wheels tell."""
+        """Take in the pose of a frame that images or wheels show."""
         predicted = self._predicted(stamp_ns, R_world_odom)
         if predicted is None:
             sigma = (SIGMA_SEEN_M, FIRST_SPEED_SIGMA_M_S, FIRST_ERROR_SIGMA_M_S2)
@@ -100,17 +99,17 @@ class InertialOdometry:
         self._state = _State(stamp_ns, T_odom_camera[:3, :3], mean, P)
 
     def carry(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Go on without a pose, as felt."""
+        """Go on without a pose, as predicted."""
         predicted = self._predicted(stamp_ns, R_world_odom)
         R_odom_camera = T_odom_camera[:3, :3]
         self._state = None if predicted is None else _State(stamp_ns, R_odom_camera, *predicted)
 
-    def stop(self) -> None:
-        """Note that nothing tells where the camera is."""
+    def reset(self) -> None:
+        """Forget the latest pose and speed."""
         self._state = None
 
     def way(self, stamp_ns: int, R_world_odom: Array) -> Way | None:
-        """Return the way since the last frame; None where the IMU tells nothing."""
+        """Return the way since the last frame; None where the IMU measures nothing."""
         predicted = self._predicted(stamp_ns, R_world_odom)
         if predicted is None or self._state is None:
             return None
@@ -124,8 +123,8 @@ class InertialOdometry:
         before = self._state
         if before is None or stamp_ns <= before.stamp_ns:
             return None
-        felt = self._gyroscope.felt(before.stamp_ns, stamp_ns)
-        if felt is None:
+        integrated = self._gyroscope.preintegrated(before.stamp_ns, stamp_ns)
+        if integrated is None:
             return None
         s = (stamp_ns - before.stamp_ns) * 1e-9
         F = np.array([[1.0, s, -(s**2) / 2], [0.0, 1.0, -s], [0.0, 0.0, 1.0]])
@@ -138,20 +137,21 @@ class InertialOdometry:
             grown = SIGMA_STEADY
         else:
             against = R_world_odom.T @ lift
-            way = before.R_odom_camera @ felt.way - against * s**2 / 2
-            mean = mean + np.stack([way, before.R_odom_camera @ felt.speed - against * s, 0 * way])
-            grown = SIGMA_FELT
-        error_variance = ERROR_DRIFT**2 * s + (GRAVITY_M_S2 * felt.sigma_rad) ** 2
+            way = before.R_odom_camera @ integrated.way - against * s**2 / 2
+            speed = before.R_odom_camera @ integrated.speed - against * s
+            mean = mean + np.stack([way, speed, 0 * way])
+            grown = SIGMA_INTEGRATED
+        error_variance = ERROR_DRIFT**2 * s + (GRAVITY_M_S2 * integrated.sigma_rad) ** 2
         noise = np.diag([grown**2 * s**3 / 3, grown**2 * s, error_variance])
         noise[0, 1] = noise[1, 0] = grown**2 * s**2 / 2
         return F @ before.mean + (mean - before.mean), F @ P @ F.T + noise
 
 
 class Gravity:
-    """Tells where up is in the world, and how the camera stands to it.
+    """Estimates where up is in the world, and how the camera stands to it.
 
     The lift L in world axes and the bias b in the camera's are what the measurements y = L + R b
-    fit best (recursive least squares): they come apart where the camera turns.
+    fit best (recursive least squares): they are separated where the camera turns.
     """
 
     def __init__(self, gyroscope: Gyroscope) -> None:
@@ -174,7 +174,9 @@ class Gravity:
         return self._measured >= MIN_MEASURED and off_m_s2 < MAX_OFF_M_S2
 
     def lift(self, R_world_camera: Array) -> Array | None:
-        """Return what is felt at rest (3,), in axes of the world; None before enough is known."""
+        """Return what is measured at rest (3,), in axes of the world; None before enough is
+        known.
+        """
         return _design(R_world_camera) @ self._state if self._is_known else None
 
     def up_camera(self, T_odom_camera: Array) -> Up | None:
@@ -191,11 +193,11 @@ class Gravity:
         return _up(R_camera_odom @ lift_odom - self._state[3:], covariance)
 
     def see(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
-        """Take in the pose of a frame that images or wheels tell."""
+        """Take in the pose of a frame that images or wheels show."""
         if self._poses and stamp_ns - self._poses[-1][0] < STEP_NS:
             return
         if self._poses and stamp_ns - self._poses[-1][0] > MAX_STEP_NS:
-            self.stop()
+            self.reset()
         self._poses.append((stamp_ns, T_odom_camera))
         lift_odom = self._lift()
         if lift_odom is None:
@@ -204,18 +206,18 @@ class Gravity:
         if self._learn(R_world_odom @ lift_odom, _design(R_world_camera)):
             self._latest = lift_odom, R_world_odom
 
-    def stop(self) -> None:
-        """Note that there is a frame without a pose."""
+    def reset(self) -> None:
+        """Forget the latest poses; what is known of gravity stays."""
         self._poses.clear()
 
     def _lift(self) -> Array | None:
         """Return what carries the camera against gravity (3,), in axes of odom, from the last three
-        poses; None where they are too few or the IMU tells too little.
+        poses; None where they are too few or the IMU measures too little.
         """
         if len(self._poses) < 3:
             return None
         (t0, T0), (t1, T1), (t2, T2) = self._poses
-        first, then = self._gyroscope.felt(t0, t1), self._gyroscope.felt(t1, t2)
+        first, then = self._gyroscope.preintegrated(t0, t1), self._gyroscope.preintegrated(t1, t2)
         if first is None or then is None:
             return None
         if max(rotation_angle(one.turn) for one in (first, then)) > MAX_TURN_RAD:
@@ -224,14 +226,14 @@ class Gravity:
         R0, R1 = T0[:3, :3], T1[:3, :3]
         p0, p1, p2 = (T[:3, 3] for T in (T0, T1, T2))
         moved = (p2 - p1) - (b / a) * (p1 - p0)
-        felt = R1 @ then.way + R0 @ (b * first.speed - (b / a) * first.way)
-        return np.asarray((felt - moved) / (b * (a + b) / 2))
+        integrated = R1 @ then.way + R0 @ (b * first.speed - (b / a) * first.way)
+        return np.asarray((integrated - moved) / (b * (a + b) / 2))
 
     def _learn(self, lift: Array, H: Array) -> bool:
         """Take in a measurement of L + R b; returns whether it agrees with those before."""
         P, noise = self._covariance, SIGMA_LIFT_M_S2**2 * np.eye(3)
         error, S = lift - H @ self._state, H @ self._covariance @ H.T + noise
-        if float(error @ np.linalg.solve(S, error)) > OUTLIER_CHI2:
+        if not is_gated(error, S):
             return False
         gain = P @ H.T @ np.linalg.inv(S)
         self._state = self._state + gain @ error

@@ -1,9 +1,9 @@
-"""What wheels and an accelerometer tell of keyframes, as part of a bundle adjustment.
+"""What wheels and an accelerometer measure of keyframes, as part of a bundle adjustment.
 
 With e = log(T_now T_before^-1 Z^-1) for a measured motion Z, twists of both poses change it, to
 first order, by d_now - Ad(T_now T_before^-1) d_before (Barfoot 2017, section 8.3.2). With e = u x z
-for up in the camera as its pose has it, u, and as it was felt, z, a turn d of the pose changes it
-by (d x u) x z. The cost is Huber's: wheels that slip lie by much more than they are taken to.
+for up in the camera as its pose has it, u, and as it was measured, z, a turn d of the pose changes
+it by (d x u) x z. The cost is Huber's: wheels that slip lie by much more than they are taken to.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
+from segfloor_ros.slam.map.residuals import CHI2_95, huber_cost, huber_weights
 from segfloor_ros.slam.mapping.normal_equations import System
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-
-CHI2_95 = 12.59
-"""The 95 % quantile of the chi-squared distribution with six degrees of freedom."""
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
@@ -68,25 +66,29 @@ class Link:
 
 @dataclass(frozen=True)
 class Level:
-    """Up in the camera of a keyframe as it was felt, and up_world (3,), as it is in the world."""
+    """Up in the camera of a keyframe as it was measured, and up_world (3,), as it is in the
+    world.
+    """
 
     keyframe: int
-    felt: Up
+    measured: Up
     up_world: Array
 
     @property
     def information(self) -> Array:
         """The inverse covariance (3, 3) of the error."""
-        return np.eye(3) / self.felt.sigma_rad**2
+        return np.eye(3) / self.measured.sigma_rad**2
 
     def error(self, T_camera_world: Array) -> Array:
         """Return the tilt (3,) in radians, about the axes of the camera."""
-        return np.cross(T_camera_world[self.keyframe, :3, :3] @ self.up_world, self.felt.direction)
+        up = T_camera_world[self.keyframe, :3, :3] @ self.up_world
+        return np.cross(up, self.measured.direction)
 
     def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
         """Return the keyframe, and the derivative (3, 6) of the error by its twist."""
-        up, felt = T_camera_world[self.keyframe, :3, :3] @ self.up_world, self.felt.direction
-        by_turn = np.outer(up, felt) - float(up @ felt) * np.eye(3)
+        up = T_camera_world[self.keyframe, :3, :3] @ self.up_world
+        measured = self.measured.direction
+        by_turn = np.outer(up, measured) - float(up @ measured) * np.eye(3)
         return [(self.keyframe, np.hstack([np.zeros((3, 3)), by_turn]))]
 
 
@@ -98,11 +100,11 @@ def factors_of(
     """
     found: list[Factor] = []
     for k in np.flatnonzero(slot >= 0).tolist():
-        motion, felt = keyframes[k].motion, keyframes[k].up
+        motion, measured = keyframes[k].motion, keyframes[k].up
         if k > 0 and motion is not None and slot[k - 1] >= 0:
             found.append(Link(int(slot[k - 1]), int(slot[k]), motion))
-        if felt is not None and up_world is not None:
-            found.append(Level(int(slot[k]), felt, up_world.direction))
+        if measured is not None and up_world is not None:
+            found.append(Level(int(slot[k]), measured, up_world.direction))
     return tuple(found)
 
 
@@ -114,8 +116,7 @@ def chi2(factor: Factor, T_camera_world: Array) -> float:
 
 def cost(factor: Factor, T_camera_world: Array) -> float:
     """Return the Huber cost of the error."""
-    squared = chi2(factor, T_camera_world)
-    return squared if squared <= CHI2_95 else 2 * float(np.sqrt(CHI2_95 * squared)) - CHI2_95
+    return huber_cost(np.array([chi2(factor, T_camera_world)]), np.array([CHI2_95[6]]))
 
 
 def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor]) -> System:
@@ -127,8 +128,8 @@ def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor
     U, rhs, between = system.U.copy(), system.camera_rhs.copy(), []
     for factor in factors:
         error = factor.error(T_camera_world)
-        squared = chi2(factor, T_camera_world)
-        weighted = factor.information * min(1.0, float(np.sqrt(CHI2_95 / max(squared, 1e-12))))
+        squared = np.array(chi2(factor, T_camera_world))
+        weighted = factor.information * float(huber_weights(squared, np.array(CHI2_95[6])))
         terms = [(k, J) for k, J in factor.jacobians(T_camera_world) if k < len(U)]
         for k, J in terms:
             U[k] += J.T @ weighted @ J

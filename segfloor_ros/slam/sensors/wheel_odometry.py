@@ -1,8 +1,7 @@
-"""Wheel odometry: how far the base went between two times, and what is wrong with what it tells."""
+"""Wheel odometry: how far the base went between two times, and what is wrong with it."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.frames import between
 from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.measurements import WheelPose
-from segfloor_ros.slam.sensors.gyroscope import is_late, lag_in_words
+from segfloor_ros.slam.sensors.gyroscope import TimedSeries, is_late, lag_in_words
 
 HISTORY, NEEDED = 2000, 20
 """Poses that are kept, and those that a drive needs to go on after it was broken off."""
@@ -23,36 +22,29 @@ MAX_AHEAD_NS = 100_000_000
 SPEED_NS = 100_000_000
 """Time over which the speed is taken."""
 
-RESTART_NS = 1_000_000_000
-"""Stamps that jump back by more begin a new recording."""
-
 
 class WheelOdometry:
-    """The latest poses that the wheels told."""
+    """The latest poses that the wheels measured."""
 
     def __init__(self) -> None:
-        self._poses: list[WheelPose] = []
+        self._poses: TimedSeries[WheelPose] = TimedSeries(HISTORY, MAX_GAP_NS, MAX_AHEAD_NS)
 
     def add(self, pose: WheelPose) -> None:
-        """Take in a pose; one that comes late is put where it belongs."""
-        if self._poses and pose.stamp_ns < self._poses[-1].stamp_ns - RESTART_NS:
-            self._poses.clear()
-        insort(self._poses, pose, key=_stamp)
-        if len(self._poses) > 2 * HISTORY:
-            del self._poses[:-HISTORY]
+        """Take in a pose."""
+        self._poses.add(pose)
 
     @property
     def latest(self) -> list[WheelPose]:
         """The poses of the last moments."""
-        return self._poses[-NEEDED:]
+        return self._poses.latest(NEEDED)
 
     def motion(self, before_ns: int, now_ns: int) -> Array | None:
-        """Return T_before_now (4, 4) of the base as told; None where too little was told."""
+        """Return T_before_now (4, 4) of the base; None where too little was measured."""
         before, now = self._at(before_ns), self._at(now_ns)
         return None if before is None or now is None else invert(before) @ now
 
     def stretch(self, before_ns: int, now_ns: int) -> Stretch | None:
-        """Return what was told between two times; None where too little was."""
+        """Return what was measured between two times; None where too little was."""
         T_before_now = self.motion(before_ns, now_ns)
         if T_before_now is None:
             return None
@@ -67,32 +59,20 @@ class WheelOdometry:
         return Stretch(T_before_now, sped_up * 1e9 / SPEED_NS, turned_up * 1e9 / SPEED_NS)
 
     def _at(self, stamp_ns: int) -> Array | None:
-        place = bisect_left(self._poses, stamp_ns, key=_stamp)
-        if place < len(self._poses) and self._poses[place].stamp_ns == stamp_ns:
-            return self._poses[place].T_wheels_base
-        if place == 0 or len(self._poses) < 2:
+        poses = self._poses.window(stamp_ns, stamp_ns)
+        if poses and poses[0].stamp_ns == stamp_ns:
+            return poses[0].T_wheels_base
+        if len(poses) < 2 or poses[0].stamp_ns > stamp_ns:
             return None
-        before_ns = self._poses[place - 1].stamp_ns
-        is_gap = place == len(self._poses) or self._poses[place].stamp_ns - before_ns > MAX_GAP_NS
-        if is_gap:
-            if place < 2 or stamp_ns - before_ns > MAX_AHEAD_NS:
-                return None
-            place -= 1
-        one, other = self._poses[place - 1 : place + 1]
-        if other.stamp_ns - one.stamp_ns > MAX_GAP_NS:
-            return None
+        one, other = poses
         share = (stamp_ns - one.stamp_ns) / max(other.stamp_ns - one.stamp_ns, 1)
         return between(one.T_wheels_base, other.T_wheels_base, share)
 
 
-def _stamp(pose: WheelPose) -> int:
-    return pose.stamp_ns
-
-
 @dataclass(frozen=True)
 class Stretch:
-    """What wheels told between two times: T_before_now (4, 4) of the base, and by how much it sped
-    up meanwhile: (2,) in m/s in the axes of the beginning, and in rad/s.
+    """What wheels measured between two times: T_before_now (4, 4) of the base, and by how much it
+    sped up meanwhile: (2,) in m/s in the axes of the beginning, and in rad/s.
     """
 
     T_before_now: Array
@@ -100,7 +80,7 @@ class Stretch:
     turning_up_rad_s: float
 
     def without_lag(self, lag_s: float) -> Stretch:
-        """Return what was told had the stamps not been late."""
+        """Return what was measured had the stamps not been late."""
         turn = yaw_of(self.T_before_now) + lag_s * self.turning_up_rad_s
         way = self.T_before_now[:2, 3] + lag_s * self.speeding_up_m_s
         R = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
@@ -110,31 +90,32 @@ class Stretch:
 @dataclass(frozen=True)
 class Window:
     """A stretch of the drive as the images see it: translation (2,) in metres in the base's plane
-    and turn in radians, by how much the rate of the turn grew meanwhile, and what the wheels tell.
+    and turn in radians, by how much the rate of the turn grew meanwhile, and what the wheels
+    measure.
     """
 
     seen_m: Array
     seen_rad: float
     turning_up_rad_s: float
-    told: Stretch
+    measured: Stretch
 
     @property
-    def told_m(self) -> Array:
-        """The translation (2,) that the wheels tell."""
-        return np.asarray(self.told.T_before_now[:2, 3])
+    def measured_m(self) -> Array:
+        """The translation (2,) that the wheels measure."""
+        return np.asarray(self.measured.T_before_now[:2, 3])
 
     @property
-    def told_rad(self) -> float:
-        """The turn that the wheels tell."""
-        return yaw_of(self.told.T_before_now)
+    def measured_rad(self) -> float:
+        """The turn that the wheels measure."""
+        return yaw_of(self.measured.T_before_now)
 
 
 @dataclass(frozen=True)
 class WheelCalibration:
-    """What is wrong with wheel odometry. scale: metres told per metre driven; turn_scale: radians
-    told per radian turned. yaw_rad, offset_m (2,): of the base as the camera's mount has it in the
-    base whose motion the wheels tell. lag_s: by how much their stamps are later than those of the
-    images. sigma: (6,) of scale, yaw, offset x, y, turn_scale and lag.
+    """What is wrong with wheel odometry. scale: metres measured per metre driven; turn_scale:
+    radians measured per radian turned. yaw_rad, offset_m (2,): of the base as the camera's mount
+    has it in the base whose motion the wheels measure. lag_s: by how much their stamps are later
+    than those of the images. sigma: (6,) of scale, yaw, offset x, y, turn_scale and lag.
     """
 
     scale: float = 1.0
@@ -149,15 +130,16 @@ class WheelCalibration:
         """The standard deviation of the lag."""
         return self.sigma[5]
 
-    def base_motion(self, told: Array, turn_rad: float | None) -> tuple[Array, float]:
+    def base_motion(self, measured: Array, turn_rad: float | None) -> tuple[Array, float]:
         """Return translation (2,) and turn of the base of the camera's mount.
 
-        told: (4, 4) as the wheels tell it. turn_rad: as a gyroscope tells it, which is better.
+        measured: (4, 4) as the wheels measure it. turn_rad: as a gyroscope measures it, which is
+        better.
         """
-        told_rad = yaw_of(told) / self.turn_scale
-        turn = told_rad if turn_rad is None else turn_rad
+        measured_rad = yaw_of(measured) / self.turn_scale
+        turn = measured_rad if turn_rad is None else turn_rad
         # The chord of an arc points half the turn to the side.
-        way_m = rotation_2d((turn - yaw_of(told)) / 2) @ told[:2, 3] / self.scale
+        way_m = rotation_2d((turn - yaw_of(measured)) / 2) @ measured[:2, 3] / self.scale
         lever_m = (rotation_2d(turn) - np.eye(2)) @ np.array(self.offset_m)
         return rotation_2d(-self.yaw_rad) @ (way_m + lever_m), turn
 
@@ -167,13 +149,13 @@ class WheelCalibration:
         said = {}
         if abs(self.scale - 1) > max(0.02, 3 * scale_sigma):
             said['scale'] = (
-                f'wheel odometry tells {self.scale:.3f} m for each metre driven; correct the '
+                f'wheel odometry measures {self.scale:.3f} m for each metre driven; correct the '
                 'radius of the wheels'
             )
         if abs(self.turn_scale - 1) > max(0.03, 3 * turn_sigma):
             said['turn_scale'] = (
-                f'wheel odometry tells {self.turn_scale:.3f} rad for each radian turned; correct '
-                'the track of the wheels'
+                f'wheel odometry measures {self.turn_scale:.3f} rad for each radian turned; '
+                'correct the track of the wheels'
             )
         if abs(self.yaw_rad) > max(np.radians(1.0), 3 * yaw_sigma):
             side = 'left' if self.yaw_rad > 0 else 'right'
@@ -202,10 +184,10 @@ ROUNDS = 4
 
 
 class WheelCalibrator:
-    """Estimates what is wrong with wheel odometry from stretches that the images tell, too.
+    """Estimates what is wrong with wheel odometry from stretches that the images show, too.
 
-    With the base's motion (R, t) as seen and t' as told, t' = s R(yaw) t - (R - I) s x: linear in
-    s cos(yaw), s sin(yaw) and s x (after Censi et al., Simultaneous calibration of odometry and
+    With the base's motion (R, t) as seen and t' as measured, t' = s R(yaw) t - (R - I) s x: linear
+    in s cos(yaw), s sin(yaw) and s x (after Censi et al., Simultaneous calibration of odometry and
     sensor parameters for mobile robots, IEEE T-RO 2013), and in the lag of the stamps. Stretches
     with slip are outliers, whose weight falls with their error (Geman-McClure).
     """
@@ -225,15 +207,15 @@ class WheelCalibrator:
         return agrees
 
     def _chi2(self, window: Window) -> float:
-        """Return the squared, normalised error of the way and the turn that the wheels tell."""
-        told = window.told.without_lag(self.current.lag_s).T_before_now
-        way_m, turn_rad = self.current.base_motion(told, None)
+        """Return the squared, normalised error of the way and the turn that the wheels measure."""
+        measured = window.measured.without_lag(self.current.lag_s).T_before_now
+        way_m, turn_rad = self.current.base_motion(measured, None)
         length_m = float(np.linalg.norm(window.seen_m))
         unsure_m = length_m * self.current.sigma[0]
         sigma_m, _, sigma_rad = _sigmas(window)
         way = np.linalg.norm(way_m - window.seen_m) / np.hypot(sigma_m, unsure_m)
         unsure_rad = abs(window.seen_rad) * self.current.sigma[4]
-        unsure_rad += abs(window.told.turning_up_rad_s) * self.current.lag_sigma_s
+        unsure_rad += abs(window.measured.turning_up_rad_s) * self.current.lag_sigma_s
         turn = (turn_rad - window.seen_rad) / np.hypot(sigma_rad, unsure_rad)
         return float(max(way, abs(turn)) ** 2)
 
@@ -254,37 +236,37 @@ class WheelCalibrator:
 
 def _equations(window: Window) -> Array:
     """Return the normalised equations (3, 7) of way and turn of a stretch: the factors of s
-    cos(yaw), s sin(yaw), s x, turn scale and lag, and what the wheels tell.
+    cos(yaw), s sin(yaw), s x, turn scale and lag, and what the wheels measure.
     """
     x, y = window.seen_m
     rows = np.zeros((3, 7))
     rows[:2, :2] = [[x, -y], [y, x]]
     rows[:2, 2:4] = np.eye(2) - rotation_2d(window.seen_rad)
     rows[2, 4] = window.seen_rad
-    # Of a lag only turns tell: the way that the images see is a little too long or too short.
+    # Only turns show a lag: the way that the images see is a little too long or too short.
     rows[2, 5] = -window.turning_up_rad_s
-    rows[:, 6] = np.append(window.told_m, window.told_rad)
+    rows[:, 6] = np.append(window.measured_m, window.measured_rad)
     return rows / _sigmas(window)[:, None]
 
 
 def _sigmas(window: Window) -> Array:
-    way_m = SIGMA_REST_M + SIGMA_ROOT_M * float(np.sqrt(np.linalg.norm(window.told_m)))
-    turn_rad = SIGMA_REST_RAD + SIGMA_ROOT_RAD * float(np.sqrt(abs(window.told_rad)))
+    way_m = SIGMA_REST_M + SIGMA_ROOT_M * float(np.sqrt(np.linalg.norm(window.measured_m)))
+    turn_rad = SIGMA_REST_RAD + SIGMA_ROOT_RAD * float(np.sqrt(abs(window.measured_rad)))
     return np.array([way_m, way_m, turn_rad])
 
 
-def _robust(rows: Array, told: Array, prior: Array, sigma: Array) -> tuple[Array, Array]:
+def _robust(rows: Array, measured: Array, prior: Array, sigma: Array) -> tuple[Array, Array]:
     """Solve weighted least squares with a prior, outliers weighed down; returns solution and
     standard deviations.
     """
     solution = prior
     information = np.diag(sigma**-2)
     for _ in range(ROUNDS):
-        chi2 = (told - rows @ solution) ** 2
+        chi2 = (measured - rows @ solution) ** 2
         weight = 1 / (1 + chi2 / OUTLIER_CHI2) ** 2
         weighted = rows * weight[:, None]
         H = information + weighted.T @ rows
-        solution = np.linalg.solve(H, information @ prior + weighted.T @ told)
+        solution = np.linalg.solve(H, information @ prior + weighted.T @ measured)
     return solution, np.sqrt(np.diag(np.linalg.inv(H)))
 
 

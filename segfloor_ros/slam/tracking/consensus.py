@@ -1,8 +1,8 @@
-"""The pose that what stands still tells, where something that moves fills much of the image.
+"""The pose by what stands still, where something that moves fills much of the image.
 
 Most points agreeing is no proof: someone who walks by shows more of them than a plain wall behind.
 So two motions are compared, that of the majority and that of the points which have a record of
-standing still. They are told apart, not averaged, where they contradict each other.
+standing still. They are distinguished, not averaged, where they contradict each other.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, se3_log, transform_points
-from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.map.residuals import Observations, is_gated
 from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.pose import (
     MAX_NOISE_FACTOR,
     PoseEstimate,
@@ -44,10 +45,6 @@ LEAST_VARIANCE = 1e-12
 CONTRADICTED_SHARE = 0.5
 """The majority's motion is contradicted where it fits less than this share of what has a record."""
 
-DIFFERENT_CHI2 = 22.46
-"""Squared, normalised difference of two poses that are not the same: 99.9 % of six degrees."""
-
-
 KNOWN_NOISE = 2.0
 """Corners of an image are worse by no more than this factor than patches of the same image."""
 
@@ -71,32 +68,32 @@ class Agreement:
 
 
 class Consensus:
-    """Finds poses from matched points. mount: tells where the floor is, once it is known."""
+    """Finds poses from matched points of a map."""
 
-    def __init__(self, camera: StereoCamera) -> None:
-        self.mount: Mount | None = None
-        self._camera = camera
+    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
+        self._rig = rig
+        self._camera = rig.camera
+        self._map = sparse_map
 
     def refine(
         self,
         T_start: Array,
-        sparse_map: SparseMap,
         ids: NDArray[np.int32],
         observations: Observations,
         max_noise_factor: float = MAX_NOISE_FACTOR,
         known: PoseEstimate | None = None,
     ) -> Agreement:
         """Refine a pose by points `ids` (N,) and their observations (N). known: the pose of the
-        same image as told by other measurements.
+        same image by other measurements.
         """
-        points = sparse_map.xyz_world[ids]
+        points = self._map.xyz_world[ids]
         if known is not None:
             max_noise_factor = min(max_noise_factor, KNOWN_NOISE * known.noise_factor)
         of_most = refine_pose(self._camera, T_start, points, observations, max_noise_factor)
         problem = _Problem(self._camera, points, observations, of_most)
         if known is not None and differ(of_most, known):
             return problem.near(known.T_camera_world, max_noise_factor)
-        proven = self.proven(sparse_map, ids, T_start)
+        proven = self.proven(ids, T_start)
         if proven.sum() < MIN_PROVEN or _fits(of_most, proven):
             return problem.of_everyone()
         measured = observations.take(proven)
@@ -109,29 +106,26 @@ class Consensus:
     def at(
         self,
         known: PoseEstimate,
-        sparse_map: SparseMap,
         ids: NDArray[np.int32],
         observations: Observations,
     ) -> Agreement:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
-        problem = _Problem(self._camera, sparse_map.xyz_world[ids], observations, known)
+        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, known)
         fitting = problem.fitting(known.T_camera_world, KNOWN_NOISE * known.noise_factor)
         return Agreement(replace(known, inliers=fitting), fitting)
 
-    def proven(
-        self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
-    ) -> NDArray[np.bool_]:
+    def proven(self, ids: NDArray[np.int32], T_camera_world: Array) -> NDArray[np.bool_]:
         """Return which points (N,) have a record of standing still, or belong to the floor."""
-        proven = sparse_map.observer_count[ids] >= RECORD_KEYFRAMES
-        if self.mount is not None:
-            points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
-            proven |= np.abs(self.mount.heights_m(points)) < FLOOR_M
+        proven = self._map.observer_count[ids] >= RECORD_KEYFRAMES
+        if self._rig.mount is not None:
+            points = transform_points(T_camera_world, self._map.xyz_world[ids])
+            proven |= np.abs(self._rig.mount.heights_m(points)) < FLOOR_M
         return proven
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """Points (N, 3), their observations (N), and the pose that most of them tell."""
+    """Points (N, 3), their observations (N), and the pose that most of them fit."""
 
     camera: StereoCamera
     points: Array
@@ -192,4 +186,4 @@ def differ(a: PoseEstimate, b: PoseEstimate) -> bool:
     """Whether two poses differ by more than their joint uncertainty."""
     error = se3_log(a.T_camera_world @ invert(b.T_camera_world))
     covariance = a.covariance + b.covariance + LEAST_VARIANCE * np.eye(6)
-    return bool(error @ np.linalg.solve(covariance, error) > DIFFERENT_CHI2)
+    return not is_gated(error, covariance)

@@ -1,5 +1,5 @@
-"""How many points of an image tell the pose: those on edges slide along them, and neighbours err
-together.
+"""How many points of an image determine the pose: those on edges slide along them, and neighbours
+err together.
 """
 
 from __future__ import annotations

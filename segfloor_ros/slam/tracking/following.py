@@ -1,8 +1,8 @@
 """Tracking of ordinary frames: the points of the last frame are followed into this one.
 
 Corners and descriptors are only needed where nothing is known of the motion, or where new points
-are wanted. Between keyframes optical flow of some points tells the pose to a pixel, and the patches
-of a spread selection of map points tell the rest (Forster et al., SVO: Semidirect Visual Odometry,
+are wanted. Between keyframes optical flow of some points gives the pose to a pixel, and the patches
+of a spread selection of map points give the rest (Forster et al., SVO: Semidirect Visual Odometry,
 ICRA 2014). The patches come from keyframes: errors do not add up from frame to frame.
 """
 
@@ -11,15 +11,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import MIN_TRACKED, Track
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.consensus import MIN_AGREEMENT, Agreement, Consensus
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import Images, Region, follow_pixels, is_inside
-from segfloor_ros.slam.tracking.map_tracking import Prediction, predict_points
+from segfloor_ros.slam.tracking.map_tracking import TRACKED_POINTS, Prediction, predict_points
 from segfloor_ros.slam.tracking.point_measurement import align_pixels, measure_disparity
 
 MAX_FOLLOWED = 250
@@ -31,10 +31,11 @@ MIN_FOUND = 0.15
 class Follower:
     """Finds the pose of a frame from the one before."""
 
-    def __init__(self, camera: StereoCamera, consensus: Consensus, tracked_points: int) -> None:
-        self._camera = camera
-        self._consensus = consensus
-        self._tracked_points = tracked_points
+    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
+        self._rig = rig
+        self._camera = rig.camera
+        self._map = sparse_map
+        self._consensus = Consensus(rig, sparse_map)
         self.reset()
 
     def reset(self) -> None:
@@ -57,37 +58,33 @@ class Follower:
         outside = ~is_inside(region, self._uv_px)
         self._ids, self._uv_px = self._ids[outside], self._uv_px[outside]
 
-    def drop_dead(self, sparse_map: SparseMap) -> None:
+    def drop_dead(self) -> None:
         """Forget points that are not part of the map any more."""
-        alive = sparse_map.alive[self._ids]
+        alive = self._map.alive[self._ids]
         self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
 
     def follow(
         self,
         images: Images,
-        sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         T_predicted: Array,
-        offset_px: float,
     ) -> Track | None:
-        """Find the pose of a frame; None where too little of the last one is found again.
-
-        offset_px: the known error of all disparities, measured minus true.
-        """
-        roughly = self._by_flow(images, sparse_map, T_predicted)
+        """Find the pose of a frame; None where too little of the last one is found again."""
+        offset_px = self._rig.offset.value_px
+        roughly = self._by_flow(images, T_predicted)
         if roughly is None:
             return None
         pose = roughly.estimate.T_camera_world
-        seen = self._select(sparse_map, local_ids, pose, images.excluded)
+        seen = self._select(local_ids, pose, images.excluded)
         observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
-        rows = rows[align_pixels(images.left, observations, rows, sparse_map, seen.ids, pose)]
+        rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
         measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
         if len(rows) < MIN_TRACKED:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
-        found = self._consensus.refine(pose, sparse_map, ids, measured.without_offset(offset_px))
+        found = self._consensus.refine(pose, ids, measured.without_offset(offset_px))
         if not self._believable(found, len(seen.ids)):
             return None
         estimate = found.estimate
@@ -101,7 +98,6 @@ class Follower:
     def _by_flow(
         self,
         images: Images,
-        sparse_map: SparseMap,
         T_predicted: Array,
     ) -> Agreement | None:
         """Find the pose to about a pixel from where the last frame's points went."""
@@ -109,7 +105,7 @@ class Follower:
             return None
         step = -(-len(self._ids) // MAX_FOLLOWED)
         ids, uv_last = self._ids[::step], self._uv_px[::step]
-        points = transform_points(T_predicted, sparse_map.xyz_world[ids])
+        points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
         if len(ids) < MIN_TRACKED:
@@ -122,25 +118,23 @@ class Follower:
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
-        agreement = self._consensus.refine(T_predicted, sparse_map, ids[found], observations)
+        agreement = self._consensus.refine(T_predicted, ids[found], observations)
         return agreement if self._believable(agreement, len(ids)) else None
 
     def _select(
         self,
-        sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
         excluded: Region | None,
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, excluded)
-        budget = self._tracked_points
-        if len(seen.ids) <= budget:
+        seen = predict_points(self._camera, self._map, local_ids, T_camera_world, excluded)
+        if len(seen.ids) <= TRACKED_POINTS:
             return seen
         area = self._camera.width * self._camera.height
-        cell_px = max(1, int(np.sqrt(area / budget)))
-        reliability = sparse_map.reliability(seen.ids).astype(np.float32)
-        return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, budget))
+        cell_px = max(1, int(np.sqrt(area / TRACKED_POINTS)))
+        reliability = self._map.points.reliability(seen.ids).astype(np.float32)
+        return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, TRACKED_POINTS))
 
     def _believable(self, found: Agreement, looked_for: int) -> bool:
         """Whether enough points agree: a wrong pose has followers too, but not most."""

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from segfloor_ros.camera.depth import is_disparity
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
@@ -16,9 +16,10 @@ from segfloor_ros.slam.places.loop_checks import greatest_speed_mps
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.places.relocalisation import Relocaliser, is_within
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, LastPose, ObservedFeatures, Track
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.tracking.consensus import Consensus, differ
+from segfloor_ros.slam.tracking.consensus import differ
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.firm_points import count_firm
 from segfloor_ros.slam.tracking.following import Follower
@@ -33,9 +34,13 @@ from segfloor_ros.slam.tracking.images import (
     join,
 )
 from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
-from segfloor_ros.slam.tracking.motion import MAX_BLIND_SIGMA_M, CameraMotion, sigma_m
-from segfloor_ros.slam.tracking.pose import PoseEstimate
-from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer
+from segfloor_ros.slam.tracking.motion import (
+    MAX_BLIND_SIGMA_M,
+    CameraMotion,
+    TrackingState,
+    sigma_m,
+)
+from segfloor_ros.slam.tracking.pose_information import PoseInformation, with_patch_noise
 
 RECOVERY_RATIO = 0.15
 """Share of the points expected in view that a camera which was lost must find: far points alone
@@ -49,7 +54,7 @@ CARRY_ON = 0.6
 """A poor pose gives way to the motion so far, where that explains this share of its points."""
 
 FEW_POINTS, RESUMING_POINTS = 50, 60
-"""Wheels tell the pose better than fewer points, spread over the image, that do not slide along
+"""Wheels measure the pose better than fewer points, spread over the image, that do not slide along
 edges, and an IMU alone better than half as many. A few more end a blind stretch."""
 
 PLENTY = 100
@@ -59,48 +64,44 @@ PLENTY = 100
 class FrontEnd:
     """Tracks frames against the map, and looks for a camera that was lost.
 
-    offset_px: the error that all disparities share. is_fixed: whether the map stays as it is.
-    is_poor: whether the last pose was told by few points of many. seen_sigma_m: how uncertain the
-    last image leaves the place of the camera, 0 where it shows plenty or nothing.
+    is_fixed: whether the map stays as it is.
     """
 
     def __init__(
         self,
-        camera: StereoCamera,
+        rig: Rig,
         settings: StereoSlamSettings,
         sparse_map: SparseMap,
         body: BodyMotion,
     ) -> None:
-        self.consensus = Consensus(camera)
         self.motion = CameraMotion(settings.max_speed_mps, body)
-        self.local = LocalMap(camera, settings, sparse_map)
-        self.follower = Follower(camera, self.consensus, settings.tracked_points)
-        self.tracker = Tracker(camera, self.consensus)
+        self.local = LocalMap(rig.camera, sparse_map, settings.keyframe_max_frames)
+        self.follower = Follower(rig, sparse_map)
+        self.tracker = Tracker(rig, sparse_map)
         self.extractor = FeatureExtractor(settings)
-        self.places = PlaceRecognition(camera, self.tracker, sparse_map)
-        self.offset_px = self.seen_sigma_m = 0.0
-        self.is_fixed = self.is_poor = False
+        self.places = PlaceRecognition(rig, sparse_map)
+        self.is_fixed = False
         self.frames_since_keyframe = 0
-        self._camera = camera
+        self._rig = rig
+        self._camera = rig.camera
         self._map = sparse_map
-        self._prior: PoseEstimate | None = None
-        self._tells_less = False
         self._relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
-        self._rotation = ImageRotation(camera)
+        self._rotation = ImageRotation(rig.camera)
 
     @property
     def is_searching(self) -> bool:
         """Whether the camera is looked for in the whole map."""
-        motion = self.motion
-        return (motion.is_lost or motion.is_held) and not self._relocaliser.is_narrow
+        state = self.motion.state
+        is_searched = state.is_lost or state is TrackingState.HELD
+        return is_searched and not self._relocaliser.is_narrow
 
-    def leave_map(self) -> None:
-        """Forget what was seen of the map: another one takes its place."""
-        self.motion.stop()
+    def reset(self) -> None:
+        """Begin anew in a map in which the camera must be found."""
         self.local.point_ids = np.zeros(0, np.int32)
         self.follower.reset()
         self._relocaliser.reset()
+        self.motion.lose()
 
     def resume(self, last: LastPose) -> None:
         """Go on with a map whose drive was broken off."""
@@ -112,16 +113,16 @@ class FrontEnd:
     def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
         """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
         here = is_within(self.motion.T_camera_world @ T_world_camera, reach_m, reach_rad)
-        if here and not self.motion.is_lost:
+        if here and not self.motion.state.is_lost:
             return
-        self.leave_map()
+        self.reset()
         self._relocaliser.search_near(T_world_camera, reach_m, reach_rad)
 
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
         self.motion.move_map(T_reference_before, T_reference_after)
         self.local.drop_dead()
-        self.follower.drop_dead(self._map)
+        self.follower.drop_dead()
 
     def fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
@@ -143,75 +144,77 @@ class FrontEnd:
     def track(self, frame: StereoFrame, images: Images) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features."""
         predictions = self._predict_poses(frame, images)
-        self.is_poor, self.seen_sigma_m = False, 0.0
-        self._prior = self.motion.prior(frame.stamp_ns)
-        track = self.follower.follow(
-            images, self._map, self.local.point_ids, predictions[0], self.offset_px
-        )
+        track = self.follower.follow(images, self.local.point_ids, predictions[0])
         if track is None:
             track = self._search(frame, images, predictions)
         if track is None or not self.is_believable(track, images, frame.stamp_ns):
             self.follower.reset()
             return None
-        T_seen, track = track.T_camera_world, self._weighed(track, images)
+        if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
+            covariance = self._information(track, images).covariance(track.T_camera_world)
+            track = replace(track, sigma_m=sigma_m(covariance))
+        T_seen = track.T_camera_world
+        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
         self.follower.see(images, track.point_ids, track.uv_px)
         self.local.move_to(track.point_ids, track.T_camera_world)
         if not self.is_fixed:
-            self._map.note_tracking(track.visible_ids, track.point_ids)
+            self._map.points.note_tracking(track.visible_ids, track.point_ids)
         self.frames_since_keyframe += 1
         return track
 
     def is_believable(self, track: Track, images: Images, stamp_ns: int) -> bool:
         """Whether the camera can have come to where the images have it."""
         motion, pose = self.motion, track.T_camera_world
-        if motion.is_lost:
-            return motion.may_face(pose, stamp_ns)
-        few = RESUMING_POINTS if motion.is_blind else FEW_POINTS
-        few = few if motion.prior(stamp_ns) else few // 2 if motion.is_felt(stamp_ns) else 0
+        if motion.state.is_lost:
+            return motion.is_heading_possible(pose, stamp_ns)
+        measured = motion.measured(stamp_ns)
+        few = RESUMING_POINTS if motion.state.is_blind else FEW_POINTS
+        few = (
+            few
+            if motion.prior(stamp_ns)
+            else few // 2
+            if measured and measured.source == 'IMU'
+            else 0
+        )
         if few and count_firm(images.left, track.uv_px) < few:
             return False
-        if len(track.point_ids) < PLENTY:
-            self.seen_sigma_m = self._sigma_m(track, images)
         if motion.is_consistent(pose, track.covariance, stamp_ns):
-            return motion.is_resuming or motion.is_plausible(pose, stamp_ns)
-        if motion.is_resuming:
+            return motion.state.is_resuming or motion.is_plausible(pose, stamp_ns)
+        if motion.state.is_resuming:
             return False
-        least, ratio = CONTRARY_WHEN_BLIND if motion.is_blind else CONTRARY
+        least, ratio = CONTRARY_WHEN_BLIND if motion.state.is_blind else CONTRARY
         return len(track.point_ids) >= least and _recognised(track, ratio)
-
-    def _sigma_m(self, track: Track, images: Images) -> float:
-        """Return how uncertain an image leaves the place along the axis on which it is most."""
-        return sigma_m(self._information(track, images).covariance(track.T_camera_world))
 
     def _information(self, track: Track, images: Images) -> PoseInformation:
         return PoseInformation(
             self._camera,
             images.left,
             self._map.xyz_world[track.point_ids],
-            track.observations.without_offset(self.offset_px),
+            track.observations.without_offset(self._rig.offset.value_px),
             track.estimate.noise_factor,
         )
 
     def _weighed(self, track: Track, images: Images) -> Track:
-        """Return a track with the pose that images and sensors tell together; that of the images
-        where the sensors contradict it.
+        """Return a track with the likeliest pose by images and prior; that of the images where the
+        prior contradicts it.
         """
-        self._tells_less = False
-        if self._prior is not None and differ(track.estimate, self._prior):
-            self._prior = None
-        if self._prior is None:
-            return track
+        prior = track.prior
+        if prior is None or differ(track.estimate, prior):
+            return replace(track, prior=None, is_prior_better=False)
         information = self._information(track, images)
-        self._tells_less = information.tells_less(track.T_camera_world, self._prior)
-        return replace(track, estimate=information.fused(track.estimate, self._prior))
+        return replace(
+            track,
+            estimate=information.fused(track.estimate, prior),
+            is_prior_better=information.is_prior_better(track.T_camera_world, prior),
+        )
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
         if self.motion.bridge(frame.stamp_ns):
             self.local.move_to(np.zeros(0, np.int32), self.motion.T_camera_world)
             self.frames_since_keyframe += 1
-        elif not fault or self.motion.is_blind or self.motion.is_lost:
+        elif not fault or self.motion.state is not TrackingState.TRACKING:
             self.motion.lose(frame.stamp_ns)
 
     def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
@@ -225,15 +228,8 @@ class FrontEnd:
     def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
         """Find the pose by the features of the frame, without its predecessor."""
         features = self.extractor.extract(frame.left, images.excluded)
-        track = self.tracker.track(
-            images,
-            features,
-            self._map,
-            self.local.point_ids,
-            predictions,
-            self.offset_px,
-        )
-        if not (self.motion.is_lost or self.motion.is_blind or self.motion.is_resuming):
+        track = self.tracker.track(images, features, self.local.point_ids, predictions)
+        if self.motion.state is TrackingState.TRACKING:
             return self._carry_on(images, features, frame.stamp_ns, track)
         if track is not None and _recognised(track, RECOVERY_RATIO):
             return track
@@ -246,50 +242,47 @@ class FrontEnd:
         a record of standing still, or where a pose is poor, nearly as many: what comes close and
         fills the image has the most points, and takes the pose along.
         """
-        self.is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
+        is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
         steady = self.motion.expected(stamp_ns)
         close = self.tracker.track_at(
             images,
             features,
-            self._map,
             self.local.point_ids,
             steady.T_camera_world,
-            self.offset_px,
             steady,
             is_given=True,
         )
+        found = None if track is None else replace(track, is_poor=is_poor)
         if close is None or len(close.point_ids) < MIN_TRACKED:
-            return track
-        if track is not None:
-            told, explained = (self._count_proven(t) for t in (track, close))
-            if explained <= (CARRY_ON if self.is_poor else 1.0) * told:
-                return track
-        self.is_poor = True
-        return close
-
-    def _count_proven(self, track: Track) -> int:
-        proven = self.consensus.proven(self._map, track.point_ids, track.T_camera_world)
-        return int(proven.sum())
+            return found
+        if found is not None:
+            by_images, explained = (
+                self.tracker.consensus.proven(t.point_ids, t.T_camera_world).sum()
+                for t in (found, close)
+            )
+            if explained <= (CARRY_ON if is_poor else 1.0) * by_images:
+                return found
+        return replace(close, is_poor=True)
 
     def _relocalise(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
         """Look for the view in the whole map."""
         motion = self.motion
-        is_possible = partial(motion.may_face, stamp_ns=stamp_ns)
-        lost_at = motion.T_camera_world if motion.lost_here else None
-        lost_at = motion.steady(stamp_ns) if motion.is_resuming else lost_at
-        found = self._relocaliser.find_surely(
-            images, features, self.offset_px, stamp_ns, is_possible, lost_at
-        )
+        is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
+        lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
+        lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
+        found = self._relocaliser.find_surely(images, features, stamp_ns, is_possible, lost_at)
         if found is None:
             return None
         pose = found.T_camera_world
         around = self.local.points_around(found.point_ids, pose)
-        return self.tracker.track_at(images, features, self._map, around, pose, self.offset_px)
+        return self.tracker.track_at(images, features, around, pose)
 
     def is_new_place(self) -> bool:
         """Whether the sensors have the camera somewhere new: the map goes on from there."""
         motion = self.motion
-        if not motion.is_blind or motion.is_held or motion.sigma_m > MAX_BLIND_SIGMA_M:
+        state = motion.state
+        is_held = state is TrackingState.HELD
+        if not state.is_blind or is_held or sigma_m(motion.covariance) > MAX_BLIND_SIGMA_M:
             return False
         return self.local.is_new_view(motion.T_camera_world)
 
@@ -309,7 +302,7 @@ class FrontEnd:
         if track is not None and track.observed is not None:
             inside = is_inside(images.excluded, track.observed.features.uv_px)
             observed = track.observed.take(np.flatnonzero(~inside))
-            return self._no_surer(images, observed)
+            return _with_patch_noise(images, observed, track)
         features = self.extractor.extract(frame.left, images.excluded)
         if track is None:
             if not self._map.keyframes:
@@ -318,28 +311,15 @@ class FrontEnd:
             return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
         pose = self.motion.T_camera_world
         matched = self.tracker.track_at(
-            images,
-            features,
-            self._map,
-            self.local.point_ids,
-            pose,
-            self.offset_px,
-            track.estimate,
+            images, features, self.local.point_ids, pose, track.estimate
         )
         if matched is None:
             return None
         assert matched.observed is not None
-        self.motion.T_camera_world = self._weighed(matched, images).T_camera_world
-        self._map.note_tracking(matched.visible_ids, matched.point_ids)
-        return self._no_surer(images, matched.observed)
-
-    def _no_surer(self, images: Images, observed: ObservedFeatures) -> ObservedFeatures:
-        """Return the features of a frame; where wheels know some direction better than they do, no
-        surer than their patches.
-        """
-        if not self._tells_less:
-            return observed
-        return replace(observed, observations=no_surer(images.left, observed.observations))
+        weighed = self._weighed(replace(matched, prior=track.prior), images)
+        self.motion.T_camera_world = weighed.T_camera_world
+        self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
+        return _with_patch_noise(images, matched.observed, weighed)
 
     def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
         """Track on from the points of a keyframe, old and new."""
@@ -348,6 +328,15 @@ class FrontEnd:
         self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
         self.local.move_to(ids, keyframe.T_camera_world)
         self.frames_since_keyframe = 0
+
+
+def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) -> ObservedFeatures:
+    """Return the features of a frame; with the noise of their patches where wheels know some
+    direction of its pose better than they do.
+    """
+    if not track.is_prior_better:
+        return observed
+    return replace(observed, observations=with_patch_noise(images.left, observed.observations))
 
 
 def _recognised(track: Track, ratio: float) -> bool:

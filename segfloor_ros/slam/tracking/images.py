@@ -165,12 +165,12 @@ def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Ar
 
 
 class RepeatCheck:
-    """Tells an image that a camera delivers twice, as a Kinect does, from a camera that is frozen:
-    it delivers the same one again and again. A robot that stands still shows the same view, too,
-    but then no motion was to be expected.
+    """Distinguishes an image that a camera delivers twice, as a Kinect does, from a camera that is
+    frozen: it delivers the same one again and again. A robot that stands still shows the same view,
+    too, but then no motion was to be expected.
 
     is_repeated: whether the last image is the one before. is_carried: whether its view should have
-    moved since, so that it tells nothing of this moment.
+    moved since, so that it shows nothing of this moment.
     """
 
     def __init__(self) -> None:

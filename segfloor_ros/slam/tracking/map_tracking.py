@@ -27,7 +27,7 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.consensus import (
     MIN_AGREEMENT,
     Agreement,
@@ -68,6 +68,9 @@ NARROW_SEARCH = 0.4
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
 
+TRACKED_POINTS = 400
+"""Map points, spread over the image, that are measured in a frame between keyframes."""
+
 COVISIBLE_KEYFRAMES = 20
 PLACE_KEYFRAMES = 10
 """Keyframes of the local map that belong to it by where they are."""
@@ -76,9 +79,11 @@ PLACE_KEYFRAMES = 10
 class Tracker:
     """Finds the pose of frames against the local map."""
 
-    def __init__(self, camera: StereoCamera, consensus: Consensus) -> None:
-        self._camera = camera
-        self._consensus = consensus
+    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
+        self.consensus = Consensus(rig, sparse_map)
+        self._rig = rig
+        self._camera = rig.camera
+        self._map = sparse_map
 
     def pixel_observations(self, features: Features) -> Observations:
         """Return the observations of features (N) before any disparity is known."""
@@ -93,64 +98,55 @@ class Tracker:
         self,
         images: Images,
         features: Features,
-        sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         predictions: Sequence[Array],
-        offset_px: float = 0.0,
     ) -> Track | None:
-        """Find the pose of a frame near one of the predicted ones, tried in order.
-
-        offset_px: the known error of all disparities, measured minus true; the returned
-        observations still have it.
-        None when too few points are found again.
+        """Find the pose of a frame near one of the predicted ones, tried in order; its observations
+        have the disparity offset. None when too few points are found again.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
         tree = cKDTree(features.uv_px)
         observations = self.pixel_observations(features)
-        estimate = self._coarse_pose(
-            features, tree, observations, sparse_map, local_ids, predictions
-        )
+        estimate = self._coarse_pose(features, tree, observations, local_ids, predictions)
         if estimate is None:
             return None
         pose = estimate.T_camera_world
-        return self.track_at(images, features, sparse_map, local_ids, pose, offset_px)
+        return self.track_at(images, features, local_ids, pose)
 
     def track_at(
         self,
         images: Images,
         features: Features,
-        sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
-        offset_px: float = 0.0,
         known: PoseEstimate | None = None,
         is_given: bool = False,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
-        `track` for the rest. known: the pose as the same images told it before; or, with is_given,
+        `track` for the rest. known: the pose by the same images before; or, with is_given,
         where the camera is, and only its points are looked for.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        observations = self.pixel_observations(features)
-        seen = predict_points(self._camera, sparse_map, local_ids, T_camera_world, images.excluded)
+        observations, offset_px = self.pixel_observations(features), self._rig.offset.value_px
+        seen = predict_points(self._camera, self._map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
-        points, rows = self._search(features, tree, sparse_map, seen, NARROW_SEARCH)
+        points, rows = self._search(features, tree, seen, NARROW_SEARCH)
         if len(rows) < (MIN_TRACKED if known is None else 1):
             return None
         ids = seen.ids[points]
-        align_pixels(images.left, observations, rows, sparse_map, ids, T_camera_world)
+        align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
         guess_px = seen.uvd_px[points, 2] + offset_px
         measure_disparity(images, observations, rows, guess_px)
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:
-            found = self._consensus.refine(T_camera_world, sparse_map, ids, measured, known=known)
+            found = self.consensus.refine(T_camera_world, ids, measured, known=known)
         if found is None or not self._agree(found):
             if known is None:
                 return None
-            found = self._consensus.at(known, sparse_map, ids, measured)
+            found = self.consensus.at(known, ids, measured)
         estimate = found.estimate
         rows, ids = rows[estimate.inliers], ids[estimate.inliers]
         point_id = np.full(len(features), NO_POINT, np.int32)
@@ -170,45 +166,40 @@ class Tracker:
         features: Features,
         tree: cKDTree,
         observations: Observations,
-        sparse_map: SparseMap,
         local_ids: NDArray[np.int32],
         predictions: Sequence[Array],
     ) -> PoseEstimate | None:
         """Search around the predictions, then wider around the first, then without any."""
         attempts = [(T, 1.0) for T in predictions] + [(T, WIDE_SEARCH) for T in predictions[:1]]
         for T_predicted, factor in attempts:
-            seen = self._predict(sparse_map, local_ids, T_predicted)
-            points, rows = self._search(features, tree, sparse_map, seen, factor)
-            estimate = self._believable(
-                observations, sparse_map, seen.ids[points], rows, T_predicted
-            )
+            seen = predict_points(self._camera, self._map, local_ids, T_predicted)
+            points, rows = self._search(features, tree, seen, factor)
+            estimate = self._believable(observations, seen.ids[points], rows, T_predicted)
             if estimate is not None:
                 return estimate
-        return self.locate(features, tree, observations, sparse_map, local_ids)
+        return self.locate(features, tree, observations, local_ids)
 
     def locate(
         self,
         features: Features,
         tree: cKDTree,
         observations: Observations,
-        sparse_map: SparseMap,
         ids: NDArray[np.int32],
     ) -> PoseEstimate | None:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
-        points, rows = match_unguided(sparse_map.descriptor[ids], features.descriptor)
-        found = solve_pnp(self._camera, sparse_map.xyz_world[ids[points]], features.uv_px[rows])
+        points, rows = match_unguided(self._map.descriptor[ids], features.descriptor)
+        found = solve_pnp(self._camera, self._map.xyz_world[ids[points]], features.uv_px[rows])
         if found is None or found[1].sum() < MIN_PNP_INLIERS:
             return None
-        seen = self._predict(sparse_map, ids, found[0])
-        points, rows = self._search(features, tree, sparse_map, seen, 1.0)
-        return self._believable(observations, sparse_map, seen.ids[points], rows, found[0])
+        seen = predict_points(self._camera, self._map, ids, found[0])
+        points, rows = self._search(features, tree, seen, 1.0)
+        return self._believable(observations, seen.ids[points], rows, found[0])
 
     def _believable(
         self,
         observations: Observations,
-        sparse_map: SparseMap,
         ids: NDArray[np.int32],
         rows: NDArray[np.intp],
         T_start: Array,
@@ -216,24 +207,18 @@ class Tracker:
         """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
         if len(rows) < MIN_TRACKED:
             return None
-        found = self._consensus.refine(
-            T_start, sparse_map, ids, observations.take(rows), MAX_CORNER_NOISE_FACTOR
+        found = self.consensus.refine(
+            T_start, ids, observations.take(rows), MAX_CORNER_NOISE_FACTOR
         )
         return found.estimate if self._agree(found) else None
 
     def _agree(self, found: Agreement) -> bool:
         return found.agreeing >= MIN_TRACKED and found.share >= MIN_AGREEMENT
 
-    def _predict(
-        self, sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array
-    ) -> Prediction:
-        return predict_points(self._camera, sparse_map, ids, T_camera_world)
-
     def _search(
         self,
         features: Features,
         tree: cKDTree,
-        sparse_map: SparseMap,
         seen: Prediction,
         radius_factor: float,
     ) -> Matches:
@@ -243,7 +228,7 @@ class Tracker:
             tree,
             seen.uvd_px[:, :2],
             seen.octave,
-            sparse_map.descriptor[seen.ids],
+            self._map.descriptor[seen.ids],
             radius_factor * MATCH_RADIUS_PX * scale,
         )
 
@@ -298,14 +283,14 @@ def predict_points(
 
 
 class LocalMap:
-    """Chooses points around a view (Mur-Artal et al., ORB-SLAM, 2015, section V-D)."""
+    """Chooses points around a view (Mur-Artal et al., ORB-SLAM, 2015, section V-D). max_frames:
+    after which a keyframe is due.
+    """
 
-    def __init__(
-        self, camera: StereoCamera, settings: StereoSlamSettings, sparse_map: SparseMap
-    ) -> None:
+    def __init__(self, camera: StereoCamera, sparse_map: SparseMap, max_frames: int) -> None:
         self.point_ids: NDArray[np.int32] = np.zeros(0, np.int32)
         self._camera = camera
-        self._settings = settings
+        self._max_frames = max_frames
         self._map = sparse_map
         self._depth_m = MIN_DEPTH_M
 
@@ -336,18 +321,18 @@ class LocalMap:
         reliable = known[self._map.observer_count[known] >= SEEN_BY_SEVERAL]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         novelty = view_novelty(
-            self._camera, self._settings, self._map, track.point_ids, track.T_camera_world, depth_m
+            self._camera, self._map, track.point_ids, track.T_camera_world, depth_m
         )
-        num_reliable = min(len(reliable), self._settings.tracked_points)
+        num_reliable = min(len(reliable), TRACKED_POINTS)
         found = len(track.point_ids)
         share = found / max(1, len(track.visible_ids))
         view = View(frames_since, found, num_reliable, novelty, mapper_idle, share)
-        return is_keyframe(view, self._settings)
+        return is_keyframe(view, self._max_frames)
 
     def is_new_view(self, T_camera_world: Array) -> bool:
         """Whether a camera that sees no point has come to where the last keyframe was not."""
         T_last_now = self._map.keyframes[-1].T_camera_world @ invert(T_camera_world)
-        return novelty(T_last_now, self._depth_m, self._settings) > 1
+        return novelty(T_last_now, self._depth_m) > 1
 
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""

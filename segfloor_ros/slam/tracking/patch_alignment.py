@@ -1,7 +1,7 @@
 """Sub-pixel alignment of image patches.
 
 Corners and descriptors find *which* point a feature is; where it is to a tenth of a pixel or
-better, the grey levels around it tell. A patch on the floor does not only shift between two
+better, the grey levels around it determine. A patch on the floor does not only shift between two
 views, it is sheared and stretched too; so the fit has an affine part, and a gain and an offset
 for brightness (Lucas and Kanade 1981; Baker and Matthews, Lucas-Kanade 20 Years On, 2004, for
 the parametrised form).

@@ -89,7 +89,7 @@ def refine_pose(
     between rounds.
 
     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
-    and a poor calibration make errors larger than the single measurements tell; the median
+    and a poor calibration make errors larger than the sigmas of single measurements; the median
     residual shows by how much, and the bound on outliers follows it.
     """
     inliers = np.ones(len(points_world), bool)

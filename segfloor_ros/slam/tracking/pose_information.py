@@ -1,8 +1,8 @@
-"""How well the points of an image tell the pose of the camera.
+"""How well the points of an image determine the pose of the camera.
 
-A patch tells how far it shifted as well as its slopes allow against the noise of the camera (the
-Cramer-Rao bound; Foerstner and Guelch 1987): an edge only across itself, a plain face not at all.
-Patches that overlap hold the same pixels and err together: they count as one.
+A patch determines how far it shifted as well as its slopes allow against the noise of the camera
+(the Cramer-Rao bound; Foerstner and Guelch 1987): an edge only across itself, a plain face not at
+all. Patches that overlap hold the same pixels and err together: they count as one.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ LEAST_SHIFT = 1e-4
 """Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
 
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
-"""Of a pose before any point is seen, in metres and radians: a direction that no point tells."""
+"""Of a pose before any point is seen, in metres and radians: where no point determines it."""
 
 
 class PoseInformation:
-    """What points (N, 3) of the world, seen in a grey image (H, W), tell of its pose."""
+    """What points (N, 3) of the world, seen in a grey image (H, W), say of its pose."""
 
     def __init__(
         self,
@@ -70,14 +70,14 @@ class PoseInformation:
         information, _ = self._normal_equations(T_camera_world)
         return np.asarray(np.linalg.inv(information + np.diag(FIRST_INFORMATION)))
 
-    def tells_less(self, T_camera_world: Array, prior: PoseEstimate) -> bool:
+    def is_prior_better(self, T_camera_world: Array, prior: PoseEstimate) -> bool:
         """Whether a prior knows some direction of a pose (4, 4) better than the points do."""
         covariance, known = self.covariance(T_camera_world), np.linalg.inv(prior.covariance)
         return bool(np.linalg.eigvals(covariance @ known).real.max() > 1)
 
     def fused(self, seen: PoseEstimate, prior: PoseEstimate) -> PoseEstimate:
-        """Return the likeliest pose with a prior, near the one that the points alone tell: what
-        edges do not tell, the prior does.
+        """Return the likeliest pose with a prior, near the one of the points alone: the prior
+        adds what edges do not determine.
         """
         pose, known = seen.T_camera_world, np.linalg.inv(prior.covariance)
         for _ in range(STEPS):
@@ -104,9 +104,9 @@ class PoseInformation:
         )
 
 
-def no_surer(image: NDArray[Any], observations: Observations) -> Observations:
-    """Return observations (N) that take their pixels to be no surer than the patches of a grey
-    image (H, W) around them allow: on an edge along an axis, that across it.
+def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observations:
+    """Return observations (N) whose pixels have at least the noise that the patches of a grey image
+    (H, W) around them allow: on an edge, that along it.
     """
     shift = _shift_information(image, observations.uvd_px[:, :2])
     variance = np.linalg.inv(shift + LEAST_SHIFT * np.eye(2))
@@ -133,10 +133,10 @@ def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:
     energy, axes = np.linalg.eigh(slopes @ np.swapaxes(slopes, 1, 2))
     of_noise = NOISE_SLOPE * GREY_NOISE**2 * SIDE_PX**2
     apparent = 2 * of_noise + ALIASED * energy[:, 1:]
-    told = np.maximum(energy - apparent, 0.0) / GREY_NOISE**2
-    told /= 1 + MIN_SIGMA_PIXEL**2 * told
+    known = np.maximum(energy - apparent, 0.0) / GREY_NOISE**2
+    known /= 1 + MIN_SIGMA_PIXEL**2 * known
     if len(uv_px):
         tree = cKDTree(uv_px)
         crowd = tree.query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
-        told /= np.asarray(crowd)[:, None]
-    return np.asarray((axes * told[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)
+        known /= np.asarray(crowd)[:, None]
+    return np.asarray((axes * known[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)

@@ -11,7 +11,6 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     equal_exposure,
 )
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 
 def shifted_pair(shift_px: int, height: int = 80, width: int = 240):
@@ -70,8 +69,7 @@ def test_two_scales_find_what_one_finds():
     right = np.take_along_axis(wide, np.arange(400) + shifts, axis=1)
     near = wide[::-1][20:50, 400:500]
     left[20:50, 230:330], right[20:50, 150:250] = near, near  # 80 px within the far rows
-    settings = FloorSegmentationSettings(coarse_above_px=32.0)
-    matcher = TwoScaleMatcher(112, settings)
+    matcher = TwoScaleMatcher(112)
     assert matcher.num_disparities == 128
     disparity = matcher.compute(left, right, fine_rows=60)
     assert np.mean(np.abs(disparity[5:15, 30:-10] - 12) < 0.2) > 0.95
@@ -82,8 +80,7 @@ def test_two_scales_find_what_one_finds():
 @pytest.mark.parametrize('shift_px', [20, 40])
 def test_a_short_range_takes_one_scale(shift_px):
     left, right = shifted_pair(shift_px)
-    settings = FloorSegmentationSettings()
-    matcher = TwoScaleMatcher(48, settings)
+    matcher = TwoScaleMatcher(48)
     assert matcher.num_disparities == 48
     whole = DisparityMatcher(48).compute(left, right)
     assert np.median(whole[:, 60:]) == pytest.approx(shift_px, abs=0.1)

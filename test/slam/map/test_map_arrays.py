@@ -50,7 +50,7 @@ def test_a_loaded_map_is_the_one_that_was_saved(mapped):
     np.testing.assert_array_equal(slam.map.xyz_world, mapped.map.xyz_world[order])
     np.testing.assert_array_equal(slam.map.observer_count, mapped.map.observer_count[order])
     np.testing.assert_array_equal(slam.map.patch, mapped.map.patch[order])
-    assert slam.map.num_ever == mapped.map.num_ever
+    assert slam.map.points.num_ever == mapped.map.points.num_ever
     for a, b in zip(slam.map.keyframes, mapped.map.keyframes, strict=True):
         np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-12)
         assert a.links == b.links
@@ -90,7 +90,7 @@ def test_localizing_finds_the_camera_and_adds_nothing(mapped):
 def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
     saved = mapped.to_arrays()
     slam = loaded(mapped, localize=False)
-    before = slam.map.num_ever, len(slam.map.keyframes)
+    before = slam.map.points.num_ever, len(slam.map.keyframes)
     poses = there(25)[15:] + [planar_pose(1.0, 0.04 * k, 0.75 + 0.06 * k) for k in range(12)]
     results, errors = drive(slam, poses)
     assert all(r.tracked for r in results[3:])
@@ -146,7 +146,7 @@ def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkey
 
 
 def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
-    mapped._front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
+    mapped.front_end.motion.T_world_odom = planar_pose(0.1, 0.2, 0.3)
     slam = loaded(mapped, localize=False, last=mapped.last_pose)
     stamps = [k.stamp_ns for k in slam.map.keyframes]
     assert stamps == [k.stamp_ns for k in mapped.map.keyframes]
@@ -154,7 +154,9 @@ def test_a_drive_goes_on_where_it_ended_with_its_stamps_and_its_odom(mapped):
     assert result.tracked
     error = invert(there(25)[-1]) @ result.T_map_odom @ result.T_odom_base
     assert np.linalg.norm(error[:3, 3]) < 0.03
-    np.testing.assert_allclose(slam.T_world_odom, mapped.T_world_odom, atol=1e-9)
+    np.testing.assert_allclose(
+        slam.front_end.motion.T_world_odom, mapped.front_end.motion.T_world_odom, atol=1e-9
+    )
 
 
 def test_a_search_around_a_pose_finds_the_camera_there_alone(mapped):
@@ -188,7 +190,7 @@ def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mappe
     assert np.linalg.norm(error[:3, 3]) < 0.03
     # What was mapped apart has moved along, with its ids.
     own = before[-1].cloud.point_id
-    assert own.min() >= mapped.map.num_ever
+    assert own.min() >= mapped.map.points.num_ever
     assert np.isin(own, last.cloud.point_id).mean() > 0.5
     at = np.searchsorted(last.path.stamp_ns, before[0].stamp_ns)
     truth = start[[r.index for r in results].index(before[0].frame_index)]

@@ -82,7 +82,7 @@ def test_unlinking_the_last_observer_removes_the_point():
 def test_points_that_tracking_seldom_finds_are_poor():
     sparse_map, _, _ = two_keyframes()
     for _ in range(10):
-        sparse_map.note_tracking(np.array([0, 1, 2]), np.array([1, 2]))
+        sparse_map.points.note_tracking(np.array([0, 1, 2]), np.array([1, 2]))
     # Point 0 was found once (when it was made) in eleven chances.
     np.testing.assert_array_equal(sparse_map.poor_points(0, 0.25), [0])
     np.testing.assert_array_equal(sparse_map.poor_points(0, 0.05), [])

@@ -12,7 +12,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import make_transform, se3_exp, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import adjust
-from segfloor_ros.slam.mapping.disparity_offset import DisparityOffset, OffsetEstimate
+from segfloor_ros.slam.rig import EXPECTED_SIGMA_PX, DisparityOffset, OffsetEstimate
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -100,9 +100,11 @@ def frames(step_m, step_rad, offset_px, seed, contrast):
     return seen
 
 
-def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, seed=0, contrast=60.0, **settings):
+def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, seed=0, contrast=60.0, is_known=False):
     """Drive through the room, straight ahead if not told otherwise."""
-    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800, **settings), MOUNT)
+    slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    if is_known:
+        slam.rig.offset = DisparityOffset(0.0, 1.0)
     seen = frames(step_m, step_rad, offset_px, seed, contrast)
     results = [slam.process(frame)[0] for frame in seen]
     return slam, results
@@ -117,15 +119,15 @@ def length(results):
 def test_a_bent_rig_is_found_and_its_distances_put_right(seed, contrast, offset_px):
     room = {'seed': seed, 'contrast': contrast}
     slam, results = room_drive(offset_px, **room)
-    switched_off, believed = room_drive(offset_px, disparity_offset_sigma_px=0.0, **room)
-    assert slam.disparity_offset_px == pytest.approx(offset_px, abs=0.1)
-    assert switched_off.disparity_offset_px == 0.0
+    switched_off, believed = room_drive(offset_px, is_known=True, **room)
+    assert slam.rig.offset.value_px == pytest.approx(offset_px, abs=0.1)
+    assert switched_off.rig.offset.value_px == 0.0
     assert abs(length(results) - 1.95) < 0.5 * abs(length(believed) - 1.95)
 
 
 def test_an_exact_rig_stays_exact():
     slam, results = room_drive()
-    assert abs(slam.disparity_offset_px) < 0.03  # known to 0.036
+    assert abs(slam.rig.offset.value_px) < 0.03  # known to 0.036
     assert length(results) == pytest.approx(1.95, abs=0.01)
 
 
@@ -135,6 +137,6 @@ def test_a_turn_on_the_spot_tells_little_and_changes_little():
         slam, results = room_drive(step_m=0.0, step_rad=float(step))
         assert len(slam.map.keyframes) > 5
         assert all(result.tracked for result in results)
-        offsets.append(abs(slam.disparity_offset_px))
+        offsets.append(abs(slam.rig.offset.value_px))
     # One drive alone may err by as much as the noise of its matches.
-    assert np.median(offsets) < 0.5 * StereoSlamSettings().disparity_offset_sigma_px
+    assert np.median(offsets) < 0.5 * EXPECTED_SIGMA_PX

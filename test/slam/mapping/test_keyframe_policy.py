@@ -5,15 +5,8 @@ import pytest
 
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.slam.places.known_views import View, is_keyframe, novelty
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.images import RepeatCheck, image_fault
 
-SETTINGS = StereoSlamSettings(
-    keyframe_max_frames=30,
-    keyframe_min_frames=3,
-    keyframe_motion_ratio=0.05,
-    keyframe_turn_rad=0.1,
-)
 STILL = np.eye(4)
 MOVED = make_transform(np.eye(3), np.array([0.0, 0.0, 0.2]))
 TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
@@ -21,10 +14,10 @@ TURNED = se3_exp(np.array([0, 0, 0, 0, 0.15, 0]))
 
 @pytest.mark.parametrize(
     ('motion', 'depth_m', 'expected'),
-    [(STILL, 2.0, 0.0), (MOVED, 2.0, 2.0), (MOVED, 8.0, 0.5), (TURNED, 2.0, 1.5)],
+    [(STILL, 2.0, 0.0), (MOVED, 2.0, 2.5), (MOVED, 8.0, 0.625), (TURNED, 2.0, 2.5)],
 )
 def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
-    assert novelty(motion, depth_m, SETTINGS) == pytest.approx(expected)
+    assert novelty(motion, depth_m) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +40,7 @@ def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
     ],
 )
 def test_conditions(view, expected):
-    assert is_keyframe(view, SETTINGS) is expected
+    assert is_keyframe(view, max_frames=30) is expected
 
 
 def textured():

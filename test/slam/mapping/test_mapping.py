@@ -10,7 +10,7 @@ from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 
@@ -25,7 +25,7 @@ def mapped(points):
     sparse_map = SparseMap()
     rows = np.arange(len(points))
     add(sparse_map, seen(points, 0, [NO_POINT] * len(points)), rows, points)
-    return sparse_map, LocalMapper(CAMERA, StereoSlamSettings())
+    return sparse_map, LocalMapper(Rig(CAMERA), sparse_map)
 
 
 def patches(points):
@@ -37,7 +37,7 @@ def test_a_feature_whose_disparity_contradicts_its_point_gets_one_of_its_own(sce
     sparse_map, mapper = mapped(points)
     second = seen(points, 1, np.arange(len(points)), x=0.1)
     second.observations.uvd_px[[3, 5], 2] = contradicting_px, np.nan
-    mapper.insert(sparse_map, second, patches(points))
+    mapper.insert(second, patches(points))
     kept = np.arange(len(points)) != 3
     np.testing.assert_array_equal(second.point_id[kept], np.flatnonzero(kept))
     assert second.point_id[3] == len(points)
@@ -48,17 +48,17 @@ def test_an_adjustment_that_loses_what_the_newest_keyframe_saw_changes_nothing(s
     points, _ = scene
     sparse_map, mapper = mapped(points)
     second = seen(points, 1, np.arange(len(points)), x=0.1)
-    mapper.insert(sparse_map, second, patches(points))
+    mapper.insert(second, patches(points))
     before, mapped_before = second.T_camera_world.copy(), sparse_map.xyz_world.copy()
-    adjustment = mapper.plan_adjustment(sparse_map, second)
+    adjustment = mapper.plan_adjustment(second)
     result = mapper.solve(adjustment)
     turned = make_transform(np.eye(3), np.array([0.5, 0.0, 0.0])) @ result.T_camera_world
     newest = adjustment.edge_keyframe == 1
     astray = replace(result, T_camera_world=turned, inliers=~newest)
-    mapper.apply(sparse_map, adjustment, astray)
+    mapper.apply(adjustment, astray)
     np.testing.assert_array_equal(second.T_camera_world, before)
     np.testing.assert_array_equal(sparse_map.xyz_world, mapped_before)
-    mapper.apply(sparse_map, adjustment, replace(astray, inliers=np.ones_like(newest)))
+    mapper.apply(adjustment, replace(astray, inliers=np.ones_like(newest)))
     assert not np.array_equal(second.T_camera_world, before)
 
 
@@ -67,9 +67,9 @@ def test_an_adjustment_retires_views_of_what_others_have_seen_as_well(scene):
     sparse_map, mapper = mapped(points)
     for index in range(1, 9):
         view = seen(points, index, np.arange(len(points)), x=0.01 * index)
-        mapper.insert(sparse_map, view, patches(points))
-    adjustment = mapper.plan_adjustment(sparse_map, view)
-    mapper.apply(sparse_map, adjustment, mapper.solve(adjustment))
+        mapper.insert(view, patches(points))
+    adjustment = mapper.plan_adjustment(view)
+    mapper.apply(adjustment, mapper.solve(adjustment))
     retired = [k.index for k in sparse_map.keyframes if k.retired]
     # Neither the first nor the latest three; three others must go on seeing each point.
     assert retired == [1, 2, 3, 4, 5]

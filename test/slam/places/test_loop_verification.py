@@ -13,6 +13,7 @@ from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import Rig
 
 MOUNT = Mount(0.4, 0.15)
 POINTS, _ = SCENES['wall']
@@ -37,8 +38,8 @@ def objection(centre, drift, own=ROWS, apart=0.0):
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
     sparse_map.xyz_world[ROWS] *= 1.0 - apart
-    checks = LoopChecks(CAMERA, sparse_map)
-    return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match, MOUNT)
+    checks = LoopChecks(Rig(CAMERA, MOUNT), sparse_map)
+    return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match)
 
 
 def test_a_place_seen_again_after_a_drift_is_sound():

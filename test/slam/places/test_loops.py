@@ -9,6 +9,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.map.records import Match
+from segfloor_ros.slam.places.loop_checks import LoopChecks
 from segfloor_ros.slam.places.loop_closing import move_keyframes
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -33,7 +34,7 @@ def bend(slam, drift):
     share = np.clip((np.arange(len(keyframes)) - 10) / (len(keyframes) - 11), 0, 1)
     poses = np.stack([k.T_camera_world for k in keyframes])
     move_keyframes(slam.map, poses @ se3_exp(share[:, None] * drift))
-    slam._front_end.motion.move_map(before, keyframes[-1].T_camera_world)
+    slam.front_end.motion.move_map(before, keyframes[-1].T_camera_world)
 
 
 def drive(drift):
@@ -58,7 +59,7 @@ def closed():
 def test_a_drift_is_found_and_taken_away(closed):
     slam, errors = closed
     assert max(errors[BENT_AT : BENT_AT + 3]) > 0.1
-    assert slam.loop_count >= 1
+    assert slam.back_end.loop_count >= 1
     assert errors[-1] < 0.03
 
 
@@ -71,7 +72,7 @@ def test_both_ends_become_one_map(closed):
 
 def test_more_drift_than_a_path_can_have_is_no_loop():
     slam, _ = drive(np.array([0.8, 0.0, 0.6, 0.0, 0.0, 0.0]))
-    assert slam.loop_count == 0
+    assert slam.back_end.loop_count == 0
 
 
 @pytest.mark.parametrize(
@@ -89,4 +90,4 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     none = np.zeros(0, np.int32)
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
-    assert slam._back_end.loops._checks.is_level(match, MOUNT) is expected
+    assert LoopChecks(slam.rig, slam.map).is_level(match) is expected

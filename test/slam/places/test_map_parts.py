@@ -7,6 +7,7 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -50,7 +51,7 @@ def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(joi
     lost = [r.index for r in results if not r.tracked]
     assert lost == list(range(len(KNOWN), held))
     assert errors(batches[at] + batches[-1], poses).max() < 0.04
-    assert not slam.is_apart
+    assert slam.back_end.submap is Submap.KNOWN
 
 
 def test_keyframes_that_were_mapped_apart_are_told_in_the_map(joined):
@@ -85,7 +86,7 @@ def test_a_part_joins_only_where_the_robot_can_have_driven(waited_s, is_there):
     for k in range(15):
         drive(slam, way[-1:], len(way) + k, StereoRoom(seed=77 + k % 4))
     drive(slam, way[:40], len(way) + 15 + 10 * waited_s)
-    assert slam.is_apart is not is_there
+    assert (slam.back_end.submap is Submap.LOST) is not is_there
 
 
 def test_a_part_that_is_never_recognised_is_no_part_of_the_map():
@@ -93,7 +94,7 @@ def test_a_part_that_is_never_recognised_is_no_part_of_the_map():
     drive(slam, KNOWN)
     before = slam.to_arrays()
     batches = drive(slam, KNOWN, len(KNOWN), StereoRoom(seed=77))
-    assert slam.is_apart and batches[-1] == []
+    assert slam.back_end.submap is Submap.LOST and batches[-1] == []
     np.testing.assert_array_equal(
         slam.to_arrays()['keyframe_stamp_ns'], before['keyframe_stamp_ns']
     )
@@ -131,7 +132,7 @@ def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
     drive(slam, KNOWN, 20, StereoRoom(seed=77))
     batches = drive(slam, [KNOWN[10]] * 20, 40)
     results = [r for batch in batches for r in batch]
-    assert results[-1].tracked and not slam.is_apart
+    assert results[-1].tracked and slam.back_end.submap is Submap.KNOWN
     assert errors(results[-1:], [KNOWN[10]] * 60).max() < 0.02
     # It is not looked for in the part alone.
     found = next(r.index for r in results if r.tracked)

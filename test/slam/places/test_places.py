@@ -24,7 +24,6 @@ FLOOR = np.stack([RNG.uniform(-1, 1, 10), np.full(10, 0.5), RNG.uniform(4, 6, 10
 """Ten points of a floor, some 5 m away."""
 
 SCENES = [(2.0, WALL), (5.0, FLOOR)]
-SETTINGS = StereoSlamSettings(keyframe_motion_ratio=0.05)
 
 
 def turned(angle_rad):
@@ -57,24 +56,24 @@ def test_near_views_come_nearest_first_and_not_beyond_reach():
 def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
     ids = np.arange(10, dtype=np.int32)
     sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.01 * depth_m, xyz)
-    # 0.15 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
-    beside = camera_at(-0.075 * depth_m)
-    new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, beside, depth_m)
+    # 0.12 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
+    beside = camera_at(-0.06 * depth_m)
+    new = view_novelty(CAMERA, sparse_map, ids, beside, depth_m)
     assert new == pytest.approx(0.5)
     # Points that the earlier views did not see, or a view that looks past them, are new.
     unknown = sparse_map_without(sparse_map, range(5))
-    assert view_novelty(CAMERA, SETTINGS, unknown, ids, beside, depth_m) > 1.5
+    assert view_novelty(CAMERA, unknown, ids, beside, depth_m) > 1.5
     aside = turned(0.17) @ camera_at(-0.01 * depth_m)
-    assert view_novelty(CAMERA, SETTINGS, sparse_map, ids, aside, depth_m) > 1.5
+    assert view_novelty(CAMERA, sparse_map, ids, aside, depth_m) > 1.5
 
 
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
 def test_a_known_place_is_looked_at_again_now_and_then(depth_m, xyz):
     ids = np.arange(10, dtype=np.int32)
     sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.1 * depth_m, xyz)
-    # The nearest of the latest keyframes stands at half the depth, ten times what makes a view new.
-    new = view_novelty(CAMERA, SETTINGS, sparse_map, ids, camera_at(0.0), depth_m)
-    assert new == pytest.approx(10 / LOOK_AGAIN)
+    # The nearest of the latest keyframes stands at half the depth, 12.5 times as far as a new view.
+    new = view_novelty(CAMERA, sparse_map, ids, camera_at(0.0), depth_m)
+    assert new == pytest.approx(12.5 / LOOK_AGAIN)
 
 
 def sparse_map_without(sparse_map, views):

@@ -163,7 +163,7 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
     rows = rng.integers(20, CAMERA.height - 20, 150)
     on_edge = np.stack([edge_px[rows], rows], axis=1)
-    pose, sure = slam._front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
+    pose, sure = slam.front_end.motion.predict(round(FRAMES * 1e8)), 1e-6 * np.eye(6)
     estimate = PoseEstimate(pose, np.ones(150, bool), sure, 1.0)
     anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
     for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
@@ -174,7 +174,7 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
         images = Images.of(frame, CAMERA, 0)
-        assert slam._front_end.is_believable(track, images, frame.stamp_ns) == expected
+        assert slam.front_end.is_believable(track, images, frame.stamp_ns) == expected
 
 
 def test_a_turn_without_a_picture_is_as_the_gyroscope_tells_it(frames):

@@ -164,7 +164,7 @@ def test_stamps_of_wheels_that_are_late_are_found_out():
 def test_what_was_found_turns_what_wheels_tell_into_the_motion_of_the_base():
     found = WheelCalibration(1.05, 0.04, (0.15, -0.05), 0.96)
     (one,) = driven((1.05, 0.04, (0.15, -0.05), 0.96), [((0.2, 0.03), 0.3)])
-    told = base_pose(*one.told_m, one.told_rad)
+    told = base_pose(*one.measured_m, one.measured_rad)
     way_m, turn_rad = found.base_motion(told, None)
     assert turn_rad == pytest.approx(0.3)
     # The chord is that of the arc as told, turned by what the turn was wrong.

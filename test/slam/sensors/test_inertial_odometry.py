@@ -10,7 +10,12 @@ from test_gravity import BESIDE, RATE_HZ, felt, pose
 from segfloor_ros.geometry import invert, make_transform
 from segfloor_ros.measurements import ImuSample
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
-from segfloor_ros.slam.tracking.motion import MAX_BLIND_SIGMA_M, CameraMotion
+from segfloor_ros.slam.tracking.motion import (
+    MAX_BLIND_SIGMA_M,
+    CameraMotion,
+    TrackingState,
+    sigma_m,
+)
 
 SEEN_S = 8.0
 """So long the images tell the pose; then they fail."""
@@ -45,9 +50,9 @@ def blind_drive(until_s, feels, place_m=(0.0, 0.0, 0.0), told_m=None):
 def test_what_is_felt_carries_the_camera_through_seconds_without_images():
     # It drives to and fro by 0.6 m, speeds up by 0.7 m/s², and turns by 45 degrees to either side.
     motion, errors_m = blind_drive(SEEN_S + 3.0, feels=True)
-    assert len(errors_m) == 30 and motion.carried_by == 'IMU'
+    assert len(errors_m) == 30 and motion.state is TrackingState.ON_IMU
     assert errors_m.max() < 0.1
-    assert errors_m[-1] < 3 * motion.sigma_m < 3 * MAX_BLIND_SIGMA_M
+    assert errors_m[-1] < 3 * sigma_m(motion.covariance) < 3 * MAX_BLIND_SIGMA_M
 
 
 def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():
@@ -66,15 +71,17 @@ def test_without_an_accelerometer_the_speed_is_constant_for_a_second():
 
 def test_a_camera_that_was_lost_is_found_where_it_may_look_only():
     motion, _ = blind_drive(SEEN_S + 9.0, feels=False)
-    assert motion.is_lost
+    assert motion.state.is_lost
     until_ns = round((SEEN_S + 9.0) * 1e9)
     true = invert(pose(0, True)) @ pose(SEEN_S + 9.0, True)
     for degrees, expected in ((0, True), (10, True), (60, False), (180, False)):
         turn = make_transform(
             Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix(), np.array([4.0, 0, 1.0])
         )
-        assert motion.may_face(turn @ invert(true), until_ns) == expected
-    assert motion.may_face(make_transform(np.diag([-1.0, 1, -1]), np.zeros(3)), until_ns + 10**9)
+        assert motion.is_heading_possible(turn @ invert(true), until_ns) == expected
+    assert motion.is_heading_possible(
+        make_transform(np.diag([-1.0, 1, -1]), np.zeros(3)), until_ns + 10**9
+    )
 
 
 def test_a_prediction_for_a_camera_that_was_lost_has_turned_on():

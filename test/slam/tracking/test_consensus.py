@@ -8,6 +8,7 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.geometry import Array, invert, se3_exp, se3_log, transform_points
 from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.consensus import Consensus
 from segfloor_ros.slam.tracking.pose import refine_pose
 
@@ -42,7 +43,7 @@ def test_a_majority_that_moves_does_not_carry_the_pose_away():
     ids = np.arange(STILL + MOVING, dtype=np.int32)
     of_most = refine_pose(CAMERA, np.eye(4), sparse_map.xyz_world, seen)
     assert error_m(of_most.T_camera_world) > 0.1
-    found = Consensus(CAMERA).refine(np.eye(4), sparse_map, ids, seen)
+    found = Consensus(Rig(CAMERA), sparse_map).refine(np.eye(4), ids, seen)
     assert error_m(found.estimate.T_camera_world) < 0.01
     assert found.estimate.inliers[:STILL].mean() > 0.8
     assert not found.estimate.inliers[STILL:].any()
@@ -52,8 +53,9 @@ def test_a_majority_that_moves_does_not_carry_the_pose_away():
 def test_points_on_the_floor_need_no_record():
     sparse_map, seen = scene(observers_of_still=1)
     ids = np.arange(STILL + MOVING, dtype=np.int32)
-    consensus = Consensus(CAMERA)
-    assert error_m(consensus.refine(np.eye(4), sparse_map, ids, seen).estimate.T_camera_world) > 0.1
+    rig = Rig(CAMERA)
+    consensus = Consensus(rig, sparse_map)
+    assert error_m(consensus.refine(np.eye(4), ids, seen).estimate.T_camera_world) > 0.1
     up = MOUNT.up_in_camera
     lifted = MOUNT.heights_m(sparse_map.xyz_world[:STILL])[:, None] * up
     on_floor = sparse_map.xyz_world[:STILL] - lifted
@@ -61,10 +63,8 @@ def test_points_on_the_floor_need_no_record():
     sparse_map.xyz_world[:STILL] = np.where(ahead[:, None], on_floor, sparse_map.xyz_world[:STILL])
     uvr = CAMERA.project(transform_points(TRUTH, sparse_map.xyz_world[:STILL]))
     seen.uvd_px[:STILL] = np.column_stack([uvr[:, :2], uvr[:, 0] - uvr[:, 2]])
-    consensus.mount = MOUNT
-    assert (
-        error_m(consensus.refine(np.eye(4), sparse_map, ids, seen).estimate.T_camera_world) < 0.01
-    )
+    rig.mount = MOUNT
+    assert error_m(consensus.refine(np.eye(4), ids, seen).estimate.T_camera_world) < 0.01
 
 
 @pytest.mark.parametrize('observers', [1, 4])
@@ -72,7 +72,7 @@ def test_where_all_agree_the_pose_is_that_of_all(observers):
     sparse_map, seen = scene(observers_of_still=observers)
     ids = np.arange(STILL, dtype=np.int32)
     alone = seen.take(ids)
-    found = Consensus(CAMERA).refine(np.eye(4), sparse_map, ids, alone)
+    found = Consensus(Rig(CAMERA), sparse_map).refine(np.eye(4), ids, alone)
     of_all = refine_pose(CAMERA, np.eye(4), sparse_map.xyz_world[ids], alone)
     np.testing.assert_array_equal(found.estimate.T_camera_world, of_all.T_camera_world)
     assert found.counted.all()
@@ -82,10 +82,11 @@ def test_corners_of_what_moves_do_not_overrule_the_patches_of_the_same_image():
     sparse_map, seen = scene(observers_of_still=1)
     ids = np.arange(STILL + MOVING, dtype=np.int32)
     patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[:STILL], seen.take(ids[:STILL]))
-    consensus = Consensus(CAMERA)
-    alone = consensus.refine(np.eye(4), sparse_map, ids, seen)
+    rig = Rig(CAMERA)
+    consensus = Consensus(rig, sparse_map)
+    alone = consensus.refine(np.eye(4), ids, seen)
     assert error_m(alone.estimate.T_camera_world) > 0.1
-    found = consensus.refine(np.eye(4), sparse_map, ids, seen, known=patches)
+    found = consensus.refine(np.eye(4), ids, seen, known=patches)
     assert error_m(found.estimate.T_camera_world) < 0.01
     assert not found.estimate.inliers[STILL:].any()
 
@@ -95,7 +96,7 @@ def test_where_next_to_nothing_fits_the_patches_no_corner_agrees():
     ids = np.arange(STILL, STILL + MOVING, dtype=np.int32)
     still = np.arange(STILL)
     patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[still], seen.take(still))
-    found = Consensus(CAMERA).refine(np.eye(4), sparse_map, ids, seen.take(ids), known=patches)
+    found = Consensus(Rig(CAMERA), sparse_map).refine(np.eye(4), ids, seen.take(ids), known=patches)
     assert found.agreeing == 0
 
 
@@ -103,7 +104,7 @@ def test_a_known_pose_stands_however_few_corners_fit_it():
     sparse_map, seen = scene(observers_of_still=1)
     still, few = np.arange(STILL), np.arange(STILL - 10, STILL + 40, dtype=np.int32)
     patches = refine_pose(CAMERA, TRUTH, sparse_map.xyz_world[still], seen.take(still))
-    found = Consensus(CAMERA).at(patches, sparse_map, few, seen.take(few))
+    found = Consensus(Rig(CAMERA), sparse_map).at(patches, few, seen.take(few))
     np.testing.assert_array_equal(found.estimate.T_camera_world, patches.T_camera_world)
     assert 7 <= found.agreeing <= 10
     assert not found.estimate.inliers[10:].any()

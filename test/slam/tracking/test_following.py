@@ -10,6 +10,7 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import Images, follow_pixels, shrink
+from segfloor_ros.slam.tracking.map_tracking import TRACKED_POINTS
 
 SETTINGS = StereoSlamSettings(num_features=800)
 
@@ -44,15 +45,13 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
     truth = planar_pose(0.03, 0, 0.02) @ MOUNT.T_base_left
 
     def follow(frame):
-        ids = slam._front_end.local.point_ids
-        return slam._front_end.follower.follow(
-            Images.of(frame, CAMERA), slam.map, ids, np.eye(4), 0.0
-        )
+        ids = slam.front_end.local.point_ids
+        return slam.front_end.follower.follow(Images.of(frame, CAMERA), ids, np.eye(4))
 
     track = follow(frame)
     error = MOUNT.T_base_left @ invert(track.T_camera_world) @ invert(truth)
     assert np.linalg.norm(error[:3, 3]) < 0.003
-    assert len(track.point_ids) <= SETTINGS.tracked_points
+    assert len(track.point_ids) <= TRACKED_POINTS
     assert np.isin(track.point_ids, track.visible_ids).all()
     assert follow(other) is None
 
@@ -60,21 +59,21 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
 def test_points_that_are_gone_are_not_followed(room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))
-    follower, ids = slam._front_end.follower, slam._front_end.follower.seen_ids
+    follower, ids = slam.front_end.follower, slam.front_end.follower.seen_ids
     slam.map.remove_points(ids[::2])
-    follower.drop_dead(slam.map)
+    follower.drop_dead()
     np.testing.assert_array_equal(follower.seen_ids, ids[1::2])
     images = Images.of(room.frame(1, planar_pose(0.03, 0, 0.02)), CAMERA)
-    track = follower.follow(images, slam.map, ids[1::2], np.eye(4), 0.0)
+    track = follower.follow(images, ids[1::2], np.eye(4))
     assert not np.isin(track.point_ids, ids[::2]).any()
 
 
 def test_only_keyframes_need_features(monkeypatch, room):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    extract = slam._front_end.extractor.extract
+    extract = slam.front_end.extractor.extract
     calls = []
     monkeypatch.setattr(
-        slam._front_end.extractor, 'extract', lambda *given: calls.append(1) or extract(*given)
+        slam.front_end.extractor, 'extract', lambda *given: calls.append(1) or extract(*given)
     )
     for k in range(12):
         result = slam.process(room.frame(k, planar_pose(0.03 * k, 0, 0.01 * k)))[0]

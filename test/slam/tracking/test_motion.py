@@ -11,7 +11,7 @@ from segfloor_ros.slam.tracking.motion import CameraMotion, sigma_m
 def test_without_wheels_nothing_holds_the_pose_also_right_after_a_keyframe():
     motion = CameraMotion(2.0, BodyMotion())
     motion.take(np.eye(4), 1e-6 * np.eye(6), 0)
-    motion.start_keyframe()
+    motion.since_keyframe.start(motion.T_camera_world, motion.covariance)
     assert motion.prior(100_000_000) is None
 
 
@@ -23,7 +23,7 @@ def test_what_is_told_before_an_image_is_looked_at_counts_from_the_last_keyframe
         body.add(WheelPose(k * 20_000_000, planar_pose(0.01 * k, 0, 0)))
     sure = 1e-8 * np.eye(6)
     motion.take(np.eye(4), sure, 0)
-    motion.start_keyframe()
+    motion.since_keyframe.start(motion.T_camera_world, motion.covariance)
     for k in range(1, 4):
         motion.take(motion.predict(k * 100_000_000), sure, k * 100_000_000)
     prior = motion.prior(400_000_000)

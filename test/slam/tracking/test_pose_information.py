@@ -11,7 +11,7 @@ from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.pose import PoseEstimate
-from segfloor_ros.slam.tracking.pose_information import PoseInformation, no_surer
+from segfloor_ros.slam.tracking.pose_information import PoseInformation, with_patch_noise
 
 RNG = np.random.default_rng(3)
 START = RNG.bit_generator.state
@@ -107,9 +107,9 @@ def test_a_prior_is_outdone_where_points_tell_every_direction_better():
     none, wide = np.zeros(0, bool), np.diag([0.02] * 6) ** 2
     sure_of_turns = np.diag([0.02] * 3 + [1e-5] * 3) ** 2
     of_wheels, of_gyroscope = (PoseEstimate(np.eye(4), none, P, 1.0) for P in (wide, sure_of_turns))
-    assert edge.tells_less(np.eye(4), of_wheels)
-    assert not texture.tells_less(np.eye(4), of_wheels)
-    assert texture.tells_less(np.eye(4), of_gyroscope)
+    assert edge.is_prior_better(np.eye(4), of_wheels)
+    assert not texture.is_prior_better(np.eye(4), of_wheels)
+    assert texture.is_prior_better(np.eye(4), of_gyroscope)
 
 
 def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_tell_more():
@@ -134,7 +134,7 @@ def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_tell_more():
 def test_a_pixel_on_an_edge_is_sure_across_it_alone():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
     uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
-    sigma_px = no_surer(image, Observations(uvd_px, np.full((1, 3), 0.5))).sigma_px[0]
+    sigma_px = with_patch_noise(image, Observations(uvd_px, np.full((1, 3), 0.5))).sigma_px[0]
     assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
 
 

@@ -1,15 +1,25 @@
-"""The error that all disparities of a stereo rig share, estimated while it moves.
+"""The stereo rig: its camera, its mount, and the error that all its disparities share, estimated
+while it moves.
 
 Cheap stereo cameras bend and warm up: a tenth of a milliradian between the two eyes shifts every
-disparity by the same fraction of a pixel and stretches far distances. A moving rig can tell: the
+disparity by the same fraction of a pixel and stretches far distances. A moving rig shows it: the
 parallax between keyframes measures the same points without it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+
+EXPECTED_SIGMA_PX = 0.1
+"""A tenth of a milliradian at a focal length of a thousand pixels, px; 0: disparities are true."""
+
+LOCAL_KEYFRAMES = 10
+"""Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is
+solved well within the time between two keyframes."""
 
 WINDOW_SIGMA_PX = 0.03
 """Error of the estimate from one local adjustment that more points do not average out, px."""
@@ -34,7 +44,7 @@ NO_OFFSET = OffsetEstimate(0.0, 1e12)
 
 
 class DisparityOffset:
-    """Fuses what the local adjustments tell about the offset with the expectation that it is 0.
+    """Fuses what the local adjustments find of the offset with the expectation that it is 0.
 
     An information filter on one scalar (Barfoot, State Estimation for Robotics, 2017, section
     3.3). expected_sigma_px: of the offset before anything is seen, 0 when there is none. share: the
@@ -65,3 +75,14 @@ class DisparityOffset:
         information = known.information + weight
         value_px = (known.information * known.value_px + weight * seen_px) / information
         self.estimate = OffsetEstimate(value_px, min(information, MEMORY_SIGMA_PX**-2))
+
+
+@dataclass
+class Rig:
+    """What all of SLAM knows of the stereo rig. mount: None until it is measured or given."""
+
+    camera: StereoCamera
+    mount: Mount | None = None
+    offset: DisparityOffset = field(
+        default_factory=lambda: DisparityOffset(EXPECTED_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
+    )
