@@ -111,6 +111,7 @@ class MovingRegions:
         )  # fmt: skip
         self._pair: tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
+        self._found: NDArray[np.uint8] | None = None
 
     def search(
         self,
@@ -122,7 +123,8 @@ class MovingRegions:
         """Find what moves in a frame whose pose is known."""
         disparity = self.measure(frame.left, frame.right)
         view = FlowView(frame.stamp_ns, self._pair[0], disparity, T_odom_camera)
-        moving = self.find(disparity, T_camera_world, mount, self._flow.votes(view))
+        found = self.find(disparity, T_camera_world, mount, self._flow.votes(view))
+        moving, self._found = self._held(found, disparity), found
         self._flow.remember(replace(view, moving=moving))
         return Scene(self._pair[0], disparity, moving)
 
@@ -219,6 +221,26 @@ class MovingRegions:
         return np.asarray(
             cv2.copyMakeBorder(whole, 0, below, 0, right, cv2.BORDER_REPLICATE), np.uint8
         )
+
+    def _held(self, found: NDArray[np.uint8], disparity: Disparity) -> NDArray[np.uint8]:
+        """Return what is found to move (h, w) and was already found in the last search, no farther
+        off than a limb reaches: blur, a lag between the eyes or a wrong match last for one image.
+        """
+        held = np.zeros_like(found)
+        if self._found is None:
+            return held
+        count, labels = cv2.connectedComponents(found)
+        for label in range(1, count):
+            own = labels == label
+            known = disparity[own & (disparity > 0)]
+            if len(known) == 0:
+                continue
+            depth_m = self._small.disparity_m / float(np.median(known))
+            reach = max(1, round(self._small.focal[0] * REACH_M / depth_m))
+            around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+            if self._found[cv2.dilate(own.astype(np.uint8), around) > 0].any():
+                held[own] = 255
+        return held
 
     def _compare(
         self, points: NDArray[np.float32], disparity: Disparity, T_camera_world: Array
