@@ -28,6 +28,7 @@ from segfloor_ros.slam.moving.scene_flow import (
     FlowVotes,
     SceneFlow,
     SmallCamera,
+    static_scale,
 )
 from segfloor_ros.slam.tracking.images import Region
 
@@ -263,6 +264,8 @@ class MovingRegions:
             inside &= view.disparity.ravel()[at] > 0
             expected = self._small.disparity_m / depth
             tolerance = TOLERANCE_PX * np.sqrt(1 + (expected / disparity) ** 4)
+            differs = np.abs(view.disparity.ravel()[at] - expected) / tolerance
+            tolerance *= static_scale(differs[inside])
             nearest = view.nearest.ravel()[at]
             behind = nearest < expected - tolerance
             before = view.farthest.ravel()[at] > expected + tolerance

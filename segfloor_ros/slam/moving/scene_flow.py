@@ -44,6 +44,10 @@ MAX_ZOOM, MAX_SHIFT_PX = 1.3, 20.0
 """What stands still and changes its size by more, or its place in the image, is not compared."""
 
 FLOW_TOLERANCE_PX = 1.0
+STATIC_SIGMAS, QUARTER_SIGMAS = 3.0, 0.319
+"""What moves differs by more than so many sigmas, of which a quarter of normal errors is below the
+second."""
+
 NEIGHBOUR_PX = 15.0
 MIN_MOVING = 3
 """Fewest corners of a thing that moves."""
@@ -99,14 +103,16 @@ class SceneFlow:
         """Return what moved in an image."""
         earlier = self._earlier(view.stamp_ns)
         uv, sure = self._corners(view)
-        moved, still, moved_before = (np.zeros(len(uv), bool) for _ in range(3))
+        moved, still, moved_before, odd = (np.zeros(len(uv), bool) for _ in range(4))
         for then in earlier if len(uv) else []:
-            found, differs, moved_then = self._compare(view, then, uv)
+            found, ratio, moved_then = self._compare(view, then, uv)
+            differs = ratio > static_scale(ratio[found])
             moved |= found & differs & sure
             still |= found & ~differs
+            odd |= found & (ratio > 1) & sure
             moved_before = moved_then
         still &= ~moved
-        if moved.sum() > MAX_MOVING_SHARE * (moved | still).sum():
+        if odd.sum() > MAX_MOVING_SHARE * (moved | still).sum():
             moved, still = moved_before, still & ~moved_before
         disparity = self._camera.at(view.disparity, uv)
         moved = _outvoting(uv, disparity, moved, still)
@@ -145,9 +151,9 @@ class SceneFlow:
 
     def _compare(
         self, now: FlowView, then: FlowView, uv: Array
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which corners (N, 2) are found in an earlier image, which of them are not where
-        they would be if they stood still, and which moved already in that image.
+    ) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
+        """Return which corners (N, 2) are found in an earlier image, how far off they are, in
+        tolerances, from where they would be if they stood still, and which moved in that image.
         """
         disparity = self._camera.at(now.disparity, uv)
         T_then_now = invert(then.T_odom_camera) @ now.T_odom_camera
@@ -165,10 +171,20 @@ class SceneFlow:
         found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(MAX_ZOOM)
         found &= np.hypot(*(nominal[:, :2] - uv).T) < MAX_SHIFT_PX
         there = self._camera.at(then.disparity, back)
-        differs = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) > FLOW_TOLERANCE_PX
         tolerance = TOLERANCE_PX * (1 + (nominal[:, 2] / np.maximum(disparity, 0.1)) ** 2)
-        differs |= (there > 0) & (np.abs(there - nominal[:, 2]) > tolerance)
-        return found, differs, moved_then
+        ratio = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) / FLOW_TOLERANCE_PX
+        off = np.where(there > 0, np.abs(there - nominal[:, 2]) / tolerance, 0.0)
+        return found, np.maximum(ratio, off), moved_then
+
+
+def static_scale(ratios: Array) -> float:
+    """Return by how much tolerances must grow, at least 1, by what the whole scene differs (N,), in
+    tolerances: blur, a rolling shutter, a lag between the eyes and errors of the
+    rectification move what stands still, too. At least a quarter of all stands still.
+    """
+    if len(ratios) == 0:
+        return 1.0
+    return max(1.0, STATIC_SIGMAS / QUARTER_SIGMAS * float(np.quantile(ratios, 0.25)))
 
 
 def _follow(
