@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA
 
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.slam.moving.moving_regions import MovingRegions
 from segfloor_ros.slam.moving.scene_flow import FlowVotes
 
@@ -108,3 +109,27 @@ def test_the_feet_below_shins_that_move_are_left_out_too(regions):
     assert below.min() == 40
     assert 0.75 * foot_px < below.max() - 59 <= foot_px
     assert not found[45, :69].any()
+
+
+def with_thing(columns):
+    """A frame of the wall with a thing before it."""
+    left, right = pair(noise(600), WALL_PX)
+    shift = round(FACTOR * (NEARER_PX - WALL_PX))
+    thing = np.flip(left[40:200, columns], axis=0)
+    left, right = left.copy(), right.copy()
+    left[40:200, columns] = thing
+    start = columns.start - shift - round(FACTOR * WALL_PX)
+    right[40:200, start : start + thing.shape[1]] = thing
+    return StereoFrame(0, 0, left, right)
+
+
+def test_what_is_found_once_does_not_move_yet(regions):
+    empty = StereoFrame(0, 0, *pair(noise(600), WALL_PX))
+    at_first, then, alone = slice(120, 200), slice(130, 210), slice(230, 310)
+    shares = []
+    for frame in (empty, with_thing(at_first), with_thing(then), empty, with_thing(alone)):
+        moving = regions.search(frame, np.eye(4), np.eye(4), None).moving
+        shares.append((moving[30:90, 68:100] > 0).mean())
+        assert not moving[:, 125:].any()
+    assert shares[0] == shares[1] == shares[3] == 0
+    assert shares[2] > 0.9

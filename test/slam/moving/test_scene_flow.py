@@ -4,10 +4,17 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 from stereo_room import CAMERA
 
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.slam.moving.scene_flow import FlowView, FlowVotes, SceneFlow, SmallCamera
+from segfloor_ros.slam.moving.scene_flow import (
+    FlowView,
+    FlowVotes,
+    SceneFlow,
+    SmallCamera,
+    static_scale,
+)
 
 SMALL = SmallCamera(CAMERA)
 WALL_PX, NEARER_PX = 4.0, 12.0
@@ -92,3 +99,13 @@ def test_where_the_pose_is_in_doubt_what_moved_still_does():
     found = votes(replace(first, moving=moving), lifted)
     assert share(found.moving, slice(65, 95)) > 0.1
     assert not found.moving[:, 100:].any()
+
+
+def test_tolerances_grow_with_what_the_static_scene_differs_by():
+    rng = np.random.default_rng(4)
+    ratios = np.abs(rng.normal(0, 0.2, 2000))
+    assert static_scale(ratios) == static_scale(np.zeros(0)) == 1.0
+    # Blur five times as bad; a third moves.
+    moving = np.where(np.arange(2000) % 3 == 0, 40.0, 5 * ratios)
+    assert 3.0 < static_scale(moving) < 5.0
+    assert static_scale(5 * ratios) == pytest.approx(3.0, abs=0.3)
