@@ -23,6 +23,9 @@ UNKNOWN_COVARIANCE = 1e6
 NO_POINT = -1
 """Id of a feature that has no map point."""
 
+MIN_SHARED = 15
+"""Fewest points that two keyframes must share, or agree on; fewer may be chance."""
+
 MIN_TRACKED = 20
 """Fewest points that must agree for a pose to be believed; chance gives five or six."""
 

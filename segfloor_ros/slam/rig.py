@@ -21,6 +21,9 @@ LOCAL_KEYFRAMES = 10
 """Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is
 solved well within the time between two keyframes."""
 
+NEIGHBOURS = 2 * LOCAL_KEYFRAMES
+"""Keyframes around a view: those that move in a local adjustment, and those that hold them."""
+
 WINDOW_SIGMA_PX = 0.03
 """Error of the estimate from one local adjustment that more points do not average out, px."""
 

@@ -31,6 +31,7 @@ from segfloor_ros.slam.map.residuals import (
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.normal_equations import Linearisation, Step, System, normal_equations
 from segfloor_ros.slam.places.loop_closing import move_keyframes
+from segfloor_ros.slam.results import MIN_SHARED
 from segfloor_ros.slam.rig import NO_OFFSET, OffsetEstimate
 from segfloor_ros.slam.sensors.motion_links import Factor, cost, factors_of, with_factors
 
@@ -40,12 +41,7 @@ CONVERGED = 2e-3
 POINTS_PER_KEYFRAME = 300
 """Points of a keyframe that most others see: they hold the map together, the rest moves along."""
 
-MIN_POINTS = 15
-"""A keyframe that shares fewer moves along with the one before it."""
-
 STEPS = 6
-KNOWN_OFFSET = 1e12
-"""Information of a disparity offset that stays as it is."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +254,7 @@ def solve_global(
     a map of one view.
     """
     keyframe, point, row = _known_best(copied)
-    enough = np.bincount(keyframe, minlength=len(copied.records)) >= MIN_POINTS
+    enough = np.bincount(keyframe, minlength=len(copied.records)) >= MIN_SHARED
     enough[0] = True
     kept = enough[keyframe]
     kept &= np.bincount(point[kept], minlength=len(copied.stable_ids))[point] > 1
@@ -277,7 +273,7 @@ def solve_global(
         slot[keyframe],
         np.searchsorted(ids, point),
         _gather(copied, keyframe, row),
-        OffsetEstimate(copied.offset.value_px, KNOWN_OFFSET),
+        OffsetEstimate(copied.offset.value_px, NO_OFFSET.information),
         factors_of(copied.records, slot, copied.up_world),
     )
     adjusted = adjust(camera, problem, STEPS, is_wanted)

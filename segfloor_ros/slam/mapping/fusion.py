@@ -18,10 +18,10 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import NEIGHBOURS
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.map_tracking import predict_points
 
-NEIGHBOUR_KEYFRAMES = 20
 MAX_APART_PX = 2.0
 """Distance of two projections, in u, v and disparity, of what may be one point."""
 
@@ -60,7 +60,7 @@ def find_duplicates(
     """
     own = np.unique(keyframe.point_id[keyframe.point_id != NO_POINT])
     order, _ = sparse_map.covisible(own)
-    around = sparse_map.points_of(order[:NEIGHBOUR_KEYFRAMES])
+    around = sparse_map.points_of(order[:NEIGHBOURS])
     others = around[~np.isin(around, own)]
     pose = keyframe.T_camera_world
     here = predict_points(camera, sparse_map, own, pose)

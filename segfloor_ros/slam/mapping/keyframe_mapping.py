@@ -20,8 +20,8 @@ from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates, retire_redundant
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
+from segfloor_ros.slam.results import MIN_SHARED, NO_POINT
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, Rig
 from segfloor_ros.slam.sensors.motion_links import factors_of
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.point_measurement import measure_disparity
@@ -33,7 +33,6 @@ CONTRADICTED_SHARE = 0.1
 with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
 """
 
-MIN_SHARED_POINTS = 15
 MIN_LINK_SHARE = 0.1
 """Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
 
@@ -41,9 +40,6 @@ SETTLING_KEYFRAMES = 2
 MIN_FOUND_RATIO = 0.25
 MIN_KEPT_RATIO = 0.5
 """Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
-
-FIXED_KEYFRAMES = LOCAL_KEYFRAMES
-"""Keyframes that hold those which move in a local adjustment."""
 
 BUNDLE_STEPS = 5
 """Steps of a local adjustment; it mostly converges in three."""
@@ -124,7 +120,7 @@ class LocalMapper:
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)
-        enough = max(MIN_SHARED_POINTS, MIN_LINK_SHARE * len(own))
+        enough = max(MIN_SHARED, MIN_LINK_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
         before = [keyframe.index - 1] if keyframe.index > 0 else []
         return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
@@ -214,7 +210,7 @@ class LocalMapper:
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)
-        near = order[(shared >= MIN_SHARED_POINTS) & (order != keyframe.index)]
+        near = order[(shared >= MIN_SHARED) & (order != keyframe.index)]
         near = np.concatenate([near, np.setdiff1d(_linked(self._map, keyframe), near)[::-1]])
         free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
         free = free[free != 0]
@@ -222,7 +218,7 @@ class LocalMapper:
         if keyframe.motion is not None:
             # What wheels tie to the oldest that moves holds it.
             around = np.append(around, max(int(free.min()) - 1, 0))
-        fixed = around[~np.isin(around, free)][:FIXED_KEYFRAMES]
+        fixed = around[~np.isin(around, free)][: NEIGHBOURS - LOCAL_KEYFRAMES]
         if len(fixed) == 0:
             fixed, free = free[-1:], free[:-1]
         return free, fixed

@@ -12,7 +12,7 @@ from segfloor_ros.geometry import Array, invert, rotation_angle, transform_point
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.results import MIN_SHARED, NO_POINT
 from segfloor_ros.slam.rig import Rig
 
 MAX_DRIFT = 0.04
@@ -39,7 +39,6 @@ MAX_TILT_RAD = 0.2
 """Where a robot stands on the same floor again, its camera is about as high and as level as before:
 floors slope, and carts shake."""
 
-MIN_BACK = 15
 MIN_BACK_SHARE = 0.6
 MAX_BACK_PX = 4.0
 """The points of the keyframe must be where the place's own view shows what they are."""
@@ -52,7 +51,6 @@ IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by so much, and by this
 share."""
 
-MIN_COMPARED = 15
 MAX_SEEN_THROUGH = 0.2
 """Share of points that the other side may see through: edges hide what is behind by a few pixels.
 """
@@ -140,7 +138,7 @@ class LoopChecks:
         slot = np.argsort(match.ids)[slot]
         measured = own[slot] != NO_POINT
         slot, row = slot[measured], row[of_place][measured]
-        if len(slot) < MIN_BACK:
+        if len(slot) < MIN_SHARED:
             return False
         place = self._known.keyframes[match.place]
         T_place_world = place.T_camera_world @ invert(match.T_camera_world)
@@ -178,7 +176,7 @@ class LoopChecks:
             return 0.0
         gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=BESIDE_PX)
         beside = np.isfinite(gap)
-        if beside.sum() < MIN_COMPARED:
+        if beside.sum() < MIN_SHARED:
             return 0.0
         behind = disparity_seen[visible][np.asarray(near)[beside]]
         margin = np.maximum(IN_FRONT_PX, IN_FRONT_SHARE * behind)

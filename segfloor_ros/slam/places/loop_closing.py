@@ -24,15 +24,15 @@ from segfloor_ros.slam.map.residuals import CHI2_95
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.fusion import fuse_duplicates
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 
-FUSED_KEYFRAMES = 10
-LINK_SIGMA_M = 0.01
-LINK_SIGMA_RAD = 0.002
-"""Error of the motion between two keyframes that share points; only the ratio to that of a loop
-matters, and how far apart they stand does not."""
+LINK_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
+"""Error, m and rad, of the motion between two keyframes that share points; only the ratio to that of
+a loop matters, and how far from each other they stand does not."""
 
-LOOP_SIGMA_M = 0.02
-LOOP_SIGMA_RAD = 0.004
+LOOP_FACTOR = 2.0
+"""Error of a loop in that of the motion between two keyframes."""
+
 MIN_LOOP_WEIGHT = 0.25
 """A loop that switches an earlier one off contradicts it, and is not closed."""
 
@@ -61,8 +61,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     T_loops = np.stack([loop.T_i_j for loop in loops])
     sigma = np.concatenate(
         [
-            np.tile([LINK_SIGMA_M] * 3 + [LINK_SIGMA_RAD] * 3, (len(i), 1)),
-            np.tile([LOOP_SIGMA_M] * 3 + [LOOP_SIGMA_RAD] * 3, (len(loops), 1)),
+            np.tile(LINK_SIGMA, (len(i), 1)),
+            np.tile(LOOP_FACTOR * LINK_SIGMA, (len(loops), 1)),
         ]
     )
     fixed = np.zeros(len(keyframes), bool)
@@ -112,7 +112,7 @@ def apply_closing(
 
 def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> None:
     """Merge what the keyframes up to the latest know twice, now that both ends are one map."""
-    for keyframe in sparse_map.keyframes[max(0, latest - FUSED_KEYFRAMES) : latest + 1]:
+    for keyframe in sparse_map.keyframes[max(0, latest - LOCAL_KEYFRAMES) : latest + 1]:
         if keyframe.retired is None:
             fuse_duplicates(camera, sparse_map, keyframe)
 

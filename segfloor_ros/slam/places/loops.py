@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.known_views import views_near
+from segfloor_ros.slam.places.known_views import RECENT, views_near
 from segfloor_ros.slam.places.loop_checks import (
     FREE_DRIFT_M,
     MAX_DRIFT,
@@ -28,14 +28,10 @@ from segfloor_ros.slam.places.loop_checks import (
     median_depth_m,
 )
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
-from segfloor_ros.slam.results import NO_POINT, Track
+from segfloor_ros.slam.results import MIN_SHARED, NO_POINT, Track
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.tracking.images import Images
 
-RECENT = 20
-"""The latest keyframes, which a path leaves behind it, are no place that is seen again."""
-
-MIN_SHARED = 15
 MIN_SHARED_SHARE = 0.25
 """Keyframes that share so many points are linked already; fewer are shared by chance."""
 

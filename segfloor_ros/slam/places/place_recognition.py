@@ -28,15 +28,11 @@ from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
 from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker
 
-BEST_KEYFRAMES = 10
-"""Keyframes that look most like a view, around which groups are made."""
-
-GROUP_KEYFRAMES = 10
 MIN_FOUND = 25
 MIN_FOUND_SHARE = 0.10
 """Share of the points expected in view that must be found: far points alone fit many places."""
@@ -102,7 +98,7 @@ class PlaceRecognition:
         """Return up to `count` groups of covisible keyframes, by index, that look most like a view
         as scored (K,); each keyframe is in one of them only.
         """
-        best = np.argsort(-score, kind='stable')[:BEST_KEYFRAMES]
+        best = np.argsort(-score, kind='stable')[:LOCAL_KEYFRAMES]
         links = self._map.links()
         groups = [self._around(int(k), score, links) for k in best if score[k] > 0]
         groups.sort(key=lambda group: -float(score[group].sum()))
@@ -119,7 +115,7 @@ class PlaceRecognition:
         i, j = links
         others = np.union1d(j[i == index], i[j == index])
         others = others[np.argsort(-score[others], kind='stable')]
-        others = others[score[others] > 0][: GROUP_KEYFRAMES - 1]
+        others = others[score[others] > 0][: LOCAL_KEYFRAMES - 1]
         return np.append(index, others).astype(np.intp)
 
     def locate(self, images: Images, features: Features, ids: NDArray[np.int32]) -> Track | None:

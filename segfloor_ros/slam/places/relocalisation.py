@@ -29,9 +29,10 @@ from segfloor_ros.slam.places.loop_checks import (
     median_depth_m,
 )
 from segfloor_ros.slam.places.loop_closing import fuse_latest, merge_pairs
-from segfloor_ros.slam.places.place_recognition import BEST_KEYFRAMES, PlaceRecognition
+from segfloor_ros.slam.places.loops import MAX_MISSES
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import NO_POINT, Track
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, Rig
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
 
@@ -43,7 +44,7 @@ SAME_RAD = 0.3
 """Two finds further apart than this are two places that look alike."""
 
 FRAMES_IN_A_ROW = 2
-STEP_RAD = 0.6
+STEP_RAD = 2 * SAME_RAD
 MIN_AGREEMENT = 0.7
 """Away from where it was lost, so many frames must find the camera, each as far from where the one
 before did as it can have moved since, and show what is expected in so many parts of the image: a
@@ -57,8 +58,6 @@ VIEW_REACH_M = 2.0
 
 MAX_VIEW_TURN_RAD = 1.0
 
-NEIGHBOURS = 20
-MAX_MISSES = 1
 TIMES_A_LOOP = 2
 """No drift limits where the known map can be: so many times the sightings of a loop are asked for.
 With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
@@ -128,7 +127,7 @@ class Relocaliser:
         alike. is_possible: whether the camera can be at a pose T_camera_world (4, 4).
         """
         score = self._places.score(features) * self._allowed()
-        groups = self._places.groups(score, BEST_KEYFRAMES)
+        groups = self._places.groups(score, LOCAL_KEYFRAMES)
         chosen, others = groups[:BEST_GROUPS], groups[BEST_GROUPS:]
         if others:
             chosen.append(others[self._turn % len(others)])

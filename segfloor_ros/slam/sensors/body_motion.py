@@ -16,18 +16,14 @@ from segfloor_ros.measurements import Measurement, WheelPose, is_sound
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
+    SIGMA_ROOT_M,
+    SIGMA_ROOT_RAD,
     Stretch,
     WheelCalibrator,
     WheelOdometry,
     Window,
     yaw_of,
 )
-
-SIGMA_ROOT_M = 0.01
-"""Error of a way measured by wheels, per root metre, in any direction of the floor."""
-
-SIGMA_ROOT_UP_M, SIGMA_ROOT_TILT_RAD = 0.01, 0.02
-"""How far a floor that wheels take for a plane goes up and tilts, per root metre."""
 
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""
@@ -169,8 +165,8 @@ class BodyMotion:
         calibration = self._calibrator.current
         length_m = float(np.linalg.norm(measured.T_before_now[:3, 3]))
         on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
-        up = SIGMA_ROOT_UP_M**2 * length_m
-        tilt = SIGMA_ROOT_TILT_RAD**2 * length_m
+        up = SIGMA_ROOT_M**2 * length_m
+        tilt = SIGMA_ROOT_RAD**2 * length_m
         yaw = SIGMA_ROOT_TURN_RAD**2 * length_m
         yaw += (SIGMA_TURN_SHARE * yaw_of(measured.T_before_now)) ** 2
         yaw += (calibration.lag_sigma_s * measured.turning_up_rad_s) ** 2

@@ -19,7 +19,7 @@ MAX_GAP_NS = 500_000_000
 MAX_AHEAD_NS = 100_000_000
 """Messages may be so late; until then the base is taken to go on as it did."""
 
-SPEED_NS = 100_000_000
+SPEED_NS = MAX_AHEAD_NS
 """Time over which the speed is taken."""
 
 
@@ -179,6 +179,9 @@ SIGMA_REST_M, SIGMA_ROOT_M = 0.003, 0.01
 """Error of the way of a stretch: at rest, and per root metre."""
 
 SIGMA_REST_RAD, SIGMA_ROOT_RAD = 0.003, 0.02
+"""Error of the turn: at rest, and per root metre or radian; a floor tilts by as much, and goes up as
+a way errs."""
+
 OUTLIER_CHI2 = 9.0
 ROUNDS = 4
 

@@ -42,9 +42,6 @@ USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
 LEAST_VARIANCE = 1e-12
 """Of a pose, m² and rad²: a direction that is not observed must not look exact."""
 
-CONTRADICTED_SHARE = 0.5
-"""The majority's motion is contradicted where it fits less than this share of what has a record."""
-
 KNOWN_NOISE = 2.0
 """Corners of an image are worse by no more than this factor than patches of the same image."""
 
@@ -146,7 +143,7 @@ class _Problem:
         after = self.fitting(T_other, noise_factor)
         enough = max(MIN_PROVEN, MIN_AGREEMENT * witnesses.sum())
         support = (after & witnesses).sum()
-        if support < enough or (before & witnesses).sum() > CONTRADICTED_SHARE * support:
+        if support < enough or (before & witnesses).sum() > MIN_AGREEMENT * support:
             return None
         found = self.near(T_other, noise_factor)
         return replace(found, counted=found.counted | witnesses)

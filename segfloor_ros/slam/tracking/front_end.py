@@ -22,7 +22,7 @@ from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.consensus import differ
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.firm_points import count_firm
-from segfloor_ros.slam.tracking.following import Follower
+from segfloor_ros.slam.tracking.following import MIN_FOUND, Follower
 from segfloor_ros.slam.tracking.images import (
     ImageRotation,
     Images,
@@ -42,7 +42,7 @@ from segfloor_ros.slam.tracking.motion import (
 )
 from segfloor_ros.slam.tracking.pose_information import PoseInformation, with_patch_noise
 
-RECOVERY_RATIO = 0.15
+RECOVERY_RATIO = MIN_FOUND
 """Share of the points expected in view that a camera which was lost must find: far points alone
 fit many places."""
 

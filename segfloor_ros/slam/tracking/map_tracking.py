@@ -27,8 +27,9 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, Rig
 from segfloor_ros.slam.tracking.consensus import (
+    KNOWN_NOISE,
     MIN_AGREEMENT,
     Agreement,
     Consensus,
@@ -50,16 +51,13 @@ SIGMA_PIXEL = 0.6
 level.
 """
 
-MAX_CORNER_NOISE_FACTOR = 2.0
-"""Corners are not worse than this times `SIGMA_PIXEL`; beyond it the matches are wrong."""
-
 MATCH_RADIUS_PX = 15.0
 """Search radius around a predicted pixel, at the finest pyramid level."""
 
 WIDE_SEARCH = 3.0
 """Factor on the search radius when the first search finds too little."""
 
-MIN_PNP_INLIERS = 10
+MIN_PNP_INLIERS = MIN_TRACKED // 2
 """Fewest matches behind a first guess of the pose; chance gives five or six."""
 
 NARROW_SEARCH = 0.4
@@ -70,10 +68,6 @@ MIN_VIEW_COSINE = 0.5
 
 TRACKED_POINTS = 400
 """Map points, spread over the image, that are measured in a frame between keyframes."""
-
-COVISIBLE_KEYFRAMES = 20
-PLACE_KEYFRAMES = 10
-"""Keyframes of the local map that belong to it by where they are."""
 
 
 class Tracker:
@@ -207,9 +201,7 @@ class Tracker:
         """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
         if len(rows) < MIN_TRACKED:
             return None
-        found = self.consensus.refine(
-            T_start, ids, observations.take(rows), MAX_CORNER_NOISE_FACTOR
-        )
+        found = self.consensus.refine(T_start, ids, observations.take(rows), KNOWN_NOISE)
         return found.estimate if self._agree(found) else None
 
     def _agree(self, found: Agreement) -> bool:
@@ -304,8 +296,8 @@ class LocalMap:
         """
         order, _ = self._map.covisible(ids)
         depth_m = self._median_depth(ids, T_camera_world)
-        here = views_near(self._map, T_camera_world, depth_m, PLACE_KEYFRAMES)
-        local = self._map.points_of(np.append(order[:COVISIBLE_KEYFRAMES], here))
+        here = views_near(self._map, T_camera_world, depth_m, LOCAL_KEYFRAMES)
+        local = self._map.points_of(np.append(order[:NEIGHBOURS], here))
         # The oldest first: of two points that fit a feature equally well it is the one to keep.
         return local[np.argsort(self._map.stable_id[local])]
 
