@@ -17,10 +17,17 @@ from segfloor_ros.pipeline import Pipeline
 RATE_HZ = 10.0
 
 
-def room_drive(frames: int, step_m: float = 0.06) -> tuple[list[StereoFrame], list[np.ndarray]]:
-    """Return stereo frames of a straight drive with a slight turn, and T_world_base of each."""
+def room_drive(
+    frames: int, step_m: float = 0.06, arc_rad: float = 0.0
+) -> tuple[list[StereoFrame], list[np.ndarray]]:
+    """Return stereo frames of a straight drive with a slight turn, and T_world_base of each; or
+    along a circle, by arc_rad per frame.
+    """
     room = StereoRoom(seed=3)
     poses = [planar_pose(step_m * i, 0.0, 0.01 * i) for i in range(frames)]
+    if arc_rad:
+        turns, radius_m = arc_rad * np.arange(frames), step_m / arc_rad
+        poses = [planar_pose(radius_m * np.sin(a), radius_m * (1 - np.cos(a)), a) for a in turns]
     return [room.frame(i, pose, RATE_HZ) for i, pose in enumerate(poses)], poses
 
 

@@ -20,6 +20,10 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import camera_info_message, image_message
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import FLOOR, SLAM, TOPICS
+from segfloor_ros.slam.places.known_views import NEW_TURN_RAD
+
+NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
+"""Turn per frame: every one is a new view, which becomes a keyframe."""
 
 PLACES = 24
 FRAME_NS = 100_000_000
@@ -32,7 +36,7 @@ class Drive:
 
     def __init__(self, chain: NodeChain) -> None:
         self.chain = chain
-        self._views, self._poses = room_drive(PLACES, step_m=0.05)
+        self._views, self._poses = room_drive(PLACES, step_m=0.05, arc_rad=NEW_VIEW_RAD)
         self._count = 0
         self.stamp_ns = 0
         self._truth: dict[int, np.ndarray] = {}

@@ -25,6 +25,10 @@ from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM
 from segfloor_ros.nodes.shared.kept_state import KeptState
+from segfloor_ros.slam.places.known_views import NEW_TURN_RAD
+
+NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
+"""Turn per frame: every one is a new view, which becomes a keyframe."""
 
 PLACES = 80
 """More than are driven past: a place that is seen again makes no keyframe."""
@@ -35,7 +39,7 @@ REJOIN_S = 60.0
 
 @pytest.fixture(scope='module')
 def drive():
-    return room_drive(PLACES, step_m=0.05)
+    return room_drive(PLACES, step_m=0.05, arc_rad=NEW_VIEW_RAD)
 
 
 class Journey:

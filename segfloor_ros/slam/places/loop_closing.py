@@ -27,8 +27,8 @@ from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 
 LINK_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
-"""Error, m and rad, of the motion between two keyframes that share points; only the ratio to that of
-a loop matters, and how far from each other they stand does not."""
+"""Error, m and rad, of the motion between two keyframes that share points; only the ratio to that
+of a loop matters, and how far from each other they stand does not."""
 
 LOOP_FACTOR = 2.0
 """Error of a loop in that of the motion between two keyframes."""

@@ -179,8 +179,8 @@ SIGMA_REST_M, SIGMA_ROOT_M = 0.003, 0.01
 """Error of the way of a stretch: at rest, and per root metre."""
 
 SIGMA_REST_RAD, SIGMA_ROOT_RAD = 0.003, 0.02
-"""Error of the turn: at rest, and per root metre or radian; a floor tilts by as much, and goes up as
-a way errs."""
+"""Error of the turn: at rest, and per root metre or radian; a floor tilts by as much, and goes up
+as a way errs."""
 
 OUTLIER_CHI2 = 9.0
 ROUNDS = 4
