@@ -87,7 +87,7 @@ SLAM: dict[str, Mechanism] = {
         }
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
-    'two motions told apart': Mechanism(
+    'two motions distinguished': Mechanism(
         {
             'slam.tracking.consensus.differ': lambda a, b: False,
             'slam.tracking.consensus.KNOWN_NOISE': 1e9,
