@@ -109,3 +109,12 @@ def test_the_rules_catch_what_they_are_for(tmp_path) -> None:
         'rclpy.node',
         'rclpy.node.Node',
     }
+
+
+def test_what_a_program_runs_comes_after_all_that_it_defines():
+    for path in MODULES:
+        mains = [
+            isinstance(part, ast.If) and '__name__' in ast.dump(part.test)
+            for part in ast.parse(path.read_text()).body
+        ]
+        assert not any(mains[:-1]), path

@@ -272,10 +272,6 @@ def main() -> None:
     run_node(StereoCameraNode)
 
 
-if __name__ == '__main__':
-    main()
-
-
 class ClockPace:
     """Sends frames at the recording's own pace times a rate; the first one starts the clock."""
 
@@ -379,3 +375,7 @@ class ChainPace:
         if self._frames:
             return f'stereo_slam to answer the frame with stamp {min(self._frames)}'
         return f'the keyframe with stamp {min(self._keyframes, default=0)} to reach the map'
+
+
+if __name__ == '__main__':
+    main()
