@@ -18,6 +18,7 @@ import numpy as np
 
 from segfloor_ros import results_folder
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.rig_check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
@@ -156,6 +157,7 @@ class LockstepRun:
         self._unmasked: dict[int, StereoFrame] = {}
         self._results: list[FrameResult] = []
         self._failed_frames = 0
+        self._faults_said: set[str] = set()
         self._frames = 0
         self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
@@ -168,6 +170,7 @@ class LockstepRun:
         start = time.perf_counter()
         try:
             self._process_frames(on_progress)
+            self._say_faults()
             for result in self._attempt(self._frames, self._pipeline.finish_tracking) or []:
                 self._note(result)
             grid = self._pipeline.finish()
@@ -247,6 +250,8 @@ class LockstepRun:
                 results = self._attempt(frame.index, partial(self._pipeline.process, frame))
                 for result in [lost_frame(frame)] if results is None else results:
                     self._note(result)
+                if self._frames >= SETTLED_FRAMES:
+                    self._say_faults()
                 if on_progress is not None:
                     state = self._results[-1].state if self._results else 'looking for the floor'
                     on_progress(self._frames, state)
@@ -256,6 +261,12 @@ class LockstepRun:
             if not self._frames:
                 raise
             self.broken_off = error
+
+    def _say_faults(self) -> None:
+        for fault in self._pipeline.slam.rig_check.faults.values():
+            if fault.fault not in self._faults_said:
+                self._faults_said.add(fault.fault)
+                logger.warning('%s: %s', self._configuration.stereo_camera.input, fault.line())
 
     def _attempt(self, index: int, step: Callable[[], T]) -> T | None:
         """Return what a step returns, None where it fails at what a frame shows: that one is lost,
@@ -347,6 +358,7 @@ class LockstepRun:
             blind_frames=sum(result.blind for result in self._results),
             moving_frames=sum(_shows_motion(result) for result in self._results),
             sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],
+            input_faults=self._pipeline.slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=self._pipeline.failed_keyframes,
             interrupted=self._is_cut_short,

@@ -62,10 +62,11 @@ class RunSummary:
     later; what was not is in no map and no trajectory. sensors: messages used, by name.
     repeated_frames: tracked although the camera delivered the image before again, bit for bit.
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
-    found that moves. sensor_remarks: what seems wrong with sensors, in words. failed_frames,
-    failed_keyframes: at which a stage failed; they are lost or not in the map. interrupted: whether
-    the drive was cut short. stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start,
-    peak and slope_per_update in MB, and samples over the updates.
+    found that moves. sensor_remarks: what seems wrong with sensors, in words. input_faults: what is
+    wrong with the images: fault, value, unit and remedy. failed_frames, failed_keyframes: at which
+    a stage failed; they are lost or not in the map. interrupted: whether the drive was cut short.
+    stages: by name count, mean_ms, p50_ms, p95_ms, max_ms. rss_mb: start, peak and slope_per_update
+    in MB, and samples over the updates.
     """
 
     map: str | None
@@ -88,6 +89,7 @@ class RunSummary:
     blind_frames: int
     moving_frames: int
     sensor_remarks: list[str]
+    input_faults: list[dict[str, Any]]
     failed_frames: int
     failed_keyframes: int
     interrupted: bool
@@ -296,6 +298,10 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('frames lost', lost),
         *(('frames in a submap', _submap_words(submap)) for submap in summary.submaps),
         *(('remark', remark) for remark in summary.sensor_remarks),
+        *(
+            ('fault of the images', f'{fault["fault"]}, {fault["value"]} {fault["unit"]}')
+            for fault in summary.input_faults
+        ),
         ('frames skipped (unreadable)', summary.skipped_frames),
         *([('frames that failed', summary.failed_frames)] if summary.failed_frames else []),
         *(

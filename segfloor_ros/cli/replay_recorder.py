@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from typing import Any
@@ -92,6 +93,11 @@ class ReplayRecorder(Node):
         """What seems wrong with sensors, in words."""
         text = self._last_value('remarks')
         return text.split(diagnostics.REMARKS_APART) if text else []
+
+    @property
+    def input_faults(self) -> list[dict[str, Any]]:
+        """What is wrong with the images, as in summary.json."""
+        return list(json.loads(self._last_value('input_faults') or '[]'))
 
     def _last_value(self, name: str) -> str:
         """Return what SLAM's latest answer says, '' before the first one."""

@@ -262,6 +262,7 @@ class ReplaySession:
             blind_frames=sum(bool(s and s.values.get('blind') == '1') for s in answers),
             moving_frames=sum(bool(s and int(s.values.get('moving', 0))) for s in answers),
             sensor_remarks=recorder.remarks,
+            input_faults=recorder.input_faults,
             failed_frames=sum(_failed(status) for status in answers),
             failed_keyframes=len(recorder.failed),
             interrupted=not is_whole,

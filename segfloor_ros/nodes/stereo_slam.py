@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections import deque
@@ -214,6 +215,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._send_next()
         for about, remark in slam.sensors.remarks.items():
             self.reporter.diagnose(about, remark, repeat_s=REMARK_AGAIN_S)
+        self._camera.watch.report_faults(slam.rig_check.faults.values())
         if self._mount is not None and slam.back_end.idle:
             self._maps.keep(slam)
         if slam.last_pose is not None:
@@ -284,6 +286,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             blind=int(result.blind),
             submap=int(result.in_submap),
             repeated=int(result.repeated and result.tracked),
+            input_faults=json.dumps(slam.rig_check.as_dicts()),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.rig_check import RigCheck
 from segfloor_ros.geometry import Array, adjoint, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement, Up
@@ -58,7 +59,8 @@ class StereoSlam:
     known, since frame `map` lies on the floor; then all of them come at once, none is lost. Until
     then `provisional` is the newest pose.
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
-    adjustment, and results depend on timing. rig, map, sensors: what is known of each. front_end,
+    adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check: what
+    is wrong with the images. front_end,
     back_end: tracking and mapping.
     """
 
@@ -78,6 +80,7 @@ class StereoSlam:
         self._settings = settings
         self._times = times or StageTimes()
         self.sensors = BodyMotion()
+        self.rig_check = RigCheck()
         self.front_end = FrontEnd(self.rig, settings, self.map, self.sensors)
         self.back_end = BackEnd(self.rig, settings, self.map, self.front_end, background)
         self._held = HeldResults()
@@ -128,6 +131,8 @@ class StereoSlam:
             if self.front_end.repeats.is_carried and not fault:
                 result = self._result(frame, None, '', None)
                 return self._hold(_carried(result, self.front_end.motion, self._covariance()))
+            if not fault:
+                self.rig_check.see(frame)
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = (
                 self.front_end.track(frame, images) if self.map.keyframes and not fault else None

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -75,6 +76,24 @@ def test_summary_has_the_promised_figures(result):
         stage = summary['stages'][name]
         assert set(stage) == {'count', 'mean_ms', 'p50_ms', 'p95_ms', 'max_ms'}
         assert 0 < stage['p50_ms'] <= stage['p95_ms'] <= stage['max_ms']
+
+
+def test_images_whose_rows_are_off_are_said_with_figure_and_remedy(tmp_path, result):
+    good = json.loads((result[0] / 'summary.json').read_text())
+    assert good['input_faults'] == []
+    assert good['repeated_frames'] == 0
+    frames, _ = room_drive(FRAMES)
+    frames = [replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames]
+    off = write_kitti(tmp_path / 'off', frames)
+    done = segfloor_process('run', off, '--out', tmp_path / 'out', *with_mount())
+    (line,) = [line for line in done.stderr.splitlines() if 'rows apart' in line]
+    assert f'{off}: left and right images are not rectified' in line
+    assert '3.0 rows apart' in line
+    assert 'calibrate' in line
+    (fault,) = json.loads((tmp_path / 'out' / 'summary.json').read_text())['input_faults']
+    assert set(fault) == {'fault', 'value', 'unit', 'remedy'}
+    assert (fault['fault'], fault['unit']) == ('rows_apart', 'px')
+    assert fault['value'] == pytest.approx(3.0, abs=0.1)
 
 
 def test_trajectory_follows_the_drive(result):

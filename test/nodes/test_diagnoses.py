@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,6 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.calibration.rectification import rows_apart_px
 from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
@@ -175,6 +175,10 @@ def test_images_taken_for_rectified_are_named(make_graph, frames) -> None:
     driver.send('right', 0, np.roll(frames[0].right, 4, axis=0))
     words = ('left/image_rect and right/image_rect are not rectified', '4.0 rows', 'image_raw')
     assert says(graph, 'stereo_slam', *words).level is Level.ERROR
+    answers = [s for s in graph.statuses if s.node == 'stereo_slam' and not s.kind]
+    (fault,) = json.loads(answers[-1].values['input_faults'])
+    assert (fault['fault'], fault['unit']) == ('rows_apart', 'px')
+    assert fault['value'] == pytest.approx(4.0, abs=0.1)
 
 
 def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
@@ -270,16 +274,6 @@ def test_rate_delay_and_problems_are_those_of_the_time() -> None:
     assert found.longest_wait() == ('image', 2.5)
     assert found.summary('active')[2]['queue_s image'] == '2.500'
     assert found.longest_wait()[1] == 0.0
-
-
-def test_rows_of_a_pair(frames) -> None:
-    left, right = frames[0].left, frames[0].right
-    apart, count = rows_apart_px(left, right) or (np.nan, 0)
-    assert apart < 1.0
-    assert count > 40
-    shifted, _ = rows_apart_px(left, np.roll(right, -5, axis=0)) or (np.nan, 0)
-    assert shifted == pytest.approx(5.0, abs=0.5)
-    assert rows_apart_px(left, np.zeros_like(left)) is None
 
 
 def test_a_mount_that_the_floor_confirms_is_not_mentioned(frames) -> None:

@@ -1,4 +1,4 @@
-"""Rectification of stereo pairs: epipolar lines become rows; and whether a pair is rectified.
+"""Rectification of stereo pairs: epipolar lines become rows.
 
 The block grid of JPEG images, found and smoothed.
 
@@ -20,18 +20,6 @@ from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCal
 from segfloor_ros.camera.depth import is_disparity
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
-
-FEATURES = 800
-
-LEVELS = 2
-
-MIN_MATCHES = 40
-
-BEST_SHARE = 0.5
-
-MAX_DISPARITY_SHARE = 0.4
-
-MAX_ROWS_APART_SHARE = 0.15
 
 _BLOCK_PX = 8
 _REACH_PX = 4
@@ -99,29 +87,6 @@ def rectification_maps(eye: EyeCalibration) -> Maps:
     else:
         maps = cv2.initUndistortRectifyMap(*arguments)
     return maps[0], maps[1]
-
-
-def rows_apart_px(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> tuple[float, int] | None:
-    """Return by how many rows matching corners of two grey images (H, W) differ, in the median, and
-    how many they are; None where too few match to tell.
-    """
-    orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
-    (left_points, left_words), (right_points, right_words) = (
-        orb.detectAndCompute(image, None) for image in (left, right)
-    )
-    if left_words is None or right_words is None:
-        return None
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
-    matches = sorted(matches, key=lambda m: m.distance)[: round(BEST_SHARE * len(matches))]
-    apart = np.array(
-        [np.subtract(left_points[m.queryIdx].pt, right_points[m.trainIdx].pt) for m in matches]
-    ).reshape(-1, 2)
-    height, width = left.shape
-    possible = (apart[:, 0] > -2) & (apart[:, 0] < MAX_DISPARITY_SHARE * width)
-    possible &= np.abs(apart[:, 1]) < MAX_ROWS_APART_SHARE * height
-    if possible.sum() < MIN_MATCHES:
-        return None
-    return float(np.median(np.abs(apart[possible, 1]))), int(possible.sum())
 
 
 def deblocked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from statistics import median
 
-import numpy as np
-from numpy.typing import NDArray
-
-from segfloor_ros.camera.calibration.rectification import rows_apart_px
 from segfloor_ros.camera.model import Mount
+from segfloor_ros.camera.rig_check import InputFault
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.headers import NS_PER_S
 from segfloor_ros.node_settings import StereoSlamNodeSettings
@@ -19,28 +17,25 @@ from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 RECENT = 10
 SILENT_S = 3.0
 LIVE_NS = 60 * NS_PER_S
-ROWS_APART_PX = 1.5
-CHECK_ROWS_EVERY = 100
+FAULT_LASTS_S = 30.0
 PLAUSIBLE_ROLL_DEG = 20.0
 PLAUSIBLE_PITCH_DEG = 60.0
 
 
 class CameraWatch:
-    """Notices unsynchronised and missing images, missing calibrations, images that are not
-    rectified, and an implausible floor.
+    """Notices unsynchronised and missing images, missing calibrations, and an implausible
+    floor, and says what is wrong in the images.
     """
 
     def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
         self._node = node
         self._own = own
 
-    def expect(self, left: str, right: str, is_rectified: bool) -> None:
+    def expect(self, left: str, right: str) -> None:
         """Watch these two topics from now on."""
         self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
-        self._is_rectified = is_rectified
         self._last_image_s: dict[str, float] = {}
         self._is_live = False
-        self._pairs_until_check = 0
 
     def saw_image(self, topic: str, stamp_ns: int) -> None:
         """Note an image."""
@@ -80,29 +75,11 @@ class CameraWatch:
         self._find_mono()
         self._find_different_stamps()
 
-    def check_rows(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> None:
-        """Compare the rows of a pair (H, W) that should be rectified, now and then."""
-        if self._pairs_until_check > 0:
-            self._pairs_until_check -= 1
-            return
-        found = rows_apart_px(left, right)
-        if found is None:
-            return
-        self._pairs_until_check = CHECK_ROWS_EVERY
-        if found[0] <= ROWS_APART_PX:
-            return
-        topics = ' and '.join(self._stamps)
-        what = (
-            f'{topics} are not rectified; take image_raw (image_kind: raw) or rectify them'
-            if self._is_rectified
-            else f'the calibration on camera_info is not that of {topics}; calibrate again'
-        )
-        self._node.reporter.diagnose(
-            'rows',
-            f'{what}: the same points stand {found[0]:.1f} rows apart (median of {found[1]})',
-            Level.ERROR,
-            lasts_s=30.0,
-        )
+    def report_faults(self, faults: Iterable[InputFault]) -> None:
+        """Diagnose what was found in the images."""
+        for fault in faults:
+            text = fault.line(' and '.join(self._stamps))
+            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, FAULT_LASTS_S)
 
     def judge_measured(self, mount: Mount) -> None:
         """Say so where the mount that was measured from the floor is hard to believe."""

@@ -1,0 +1,217 @@
+"""What is wrong with a stereo rig, told from its images alone.
+
+Points of the left image are found in the right one and in the left one before. In images that are
+rectified and taken together, both eyes have a point in one row. Row differences that depend on the
+place in the image are those of a wrong rectification: offset, roll, focal length. Those that grow
+with the motion of the points along the columns are those of a lag between the eyes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.depth import is_disparity
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.geometry import Array
+
+EVERY = 10
+RECENT = 5
+"""Every tenth frame is looked at, and five looks are judged together: what is seen in 50 frames."""
+
+SETTLED_FRAMES = EVERY * RECENT
+
+FEATURES, LEVELS = 500, 2
+MAX_HAMMING = 64
+WINDOW_PX = 15
+MAX_DISPARITY_SHARE = 0.4
+MAX_ROWS_SHARE = 0.15
+MIN_MATCHES = 40
+
+RETURN_PX = 0.5
+"""A point that is followed to another image and back comes back as near as this."""
+
+ROWS_PX = 1.5
+"""Matching along rows bears no more; nor are disparities wrong by more because they are noisy."""
+
+LAG_FRAMES, SURE = 0.15, 4.0
+"""A lag counts where it is more than this share of a frame, by so many standard deviations: what
+rectification leaves of two real cameras, which were triggered together, looked like half of it."""
+
+LEAST_NOISE_PX = 0.1
+"""Positions of points are not known better."""
+
+
+@dataclass(frozen=True)
+class InputFault:
+    """What is wrong with the images: `fault` in a word, a figure with its unit, what was found in
+    words that go on after the name of the images, and what to do.
+    """
+
+    fault: str
+    value: float
+    unit: str
+    finding: str
+    remedy: str
+
+    def line(self, images: str = 'left and right images') -> str:
+        """Return the fault in one line. images: their name."""
+        return f'{images} {self.finding}; {self.remedy}'
+
+
+def _rows_apart(rows_px: float) -> InputFault:
+    return InputFault(
+        'rows_apart',
+        round(rows_px, 2),
+        'px',
+        f'are not rectified: the same points stand {rows_px:.1f} rows apart (median)',
+        'give the raw images (image_raw) with the calibration of this camera, or calibrate again '
+        '(segfloor calibrate)',
+    )
+
+
+def _eyes_swapped(share: float) -> InputFault:
+    return InputFault(
+        'eyes_swapped',
+        round(100 * share, 1),
+        '%',
+        f'are exchanged: {share:.0%} of the disparities are negative',
+        'exchange the two, and their calibrations if these are exchanged, too',
+    )
+
+
+def _not_simultaneous(lag_s: float, frame_s: float) -> InputFault:
+    late, early = ('right', 'left') if lag_s > 0 else ('left', 'right')
+    return InputFault(
+        'not_simultaneous',
+        round(1e3 * lag_s, 1),
+        'ms',
+        f'are not taken at the same time: the {late} one lags {1e3 * abs(lag_s):.0f} ms '
+        f'({abs(lag_s) / frame_s:.1f} frames) behind the {early} one',
+        'trigger both cameras together, and pair the images by the time of exposure',
+    )
+
+
+class RigCheck:
+    """Looks at some frames of a stereo camera; `faults` is what was found so far, by name. Within
+    `SETTLED_FRAMES` a moving camera has told one fault from another.
+    """
+
+    def __init__(self) -> None:
+        self.faults: dict[str, InputFault] = {}
+        self.frames = 0
+        self._looks: deque[Array] = deque(maxlen=RECENT)
+        self._before: tuple[NDArray[np.uint8], int] | None = None
+        self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
+        self._frame_s = 0.0
+
+    def see(self, frame: StereoFrame) -> None:
+        """Take in a frame that shows something; of a depth camera nothing is found."""
+        if is_disparity(frame.right):
+            return
+        if self.frames % EVERY == 0:
+            self._looks.append(self._look(frame))
+            self._judge()
+        self.frames += 1
+        self._before = (frame.left, frame.stamp_ns) if self.frames % EVERY == 0 else None
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Return fault, value, unit and remedy of all that was found, for summary.json."""
+        names = 'fault', 'value', 'unit', 'remedy'
+        return [{name: getattr(fault, name) for name in names} for fault in self.faults.values()]
+
+    def _look(self, frame: StereoFrame) -> Array:
+        """Return (N, 6): where points are in the left image, by how much in the right one (column,
+        row), px, and how they move in the left one, px/s, NaN where that is not known.
+        """
+        left_px, right_px = self._match(frame.left, frame.right)
+        seen = np.full((len(left_px), 6), np.nan)
+        seen[:, :2], seen[:, 2:4] = left_px, left_px - right_px
+        if self._before is not None and len(left_px):
+            before, stamp_ns = self._before
+            self._frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
+            before_px, found = _follow(frame.left, before, left_px, left_px, levels=3)
+            seen[found, 4:] = (left_px - before_px)[found] / self._frame_s
+        return seen
+
+    def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Return pixels (N, 2) of a grey image (H, W) and where they are in the other one."""
+        nothing = np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+        (left_points, left_words), (right_points, right_words) = (
+            self._orb.detectAndCompute(image, None) for image in (left, right)
+        )
+        if left_words is None or right_words is None:
+            return nothing
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
+        matches = [match for match in matches if match.distance <= MAX_HAMMING]
+        if not matches:
+            return nothing
+        left_px = np.array([left_points[m.queryIdx].pt for m in matches], np.float32)
+        guess_px = np.array([right_points[m.trainIdx].pt for m in matches], np.float32)
+        most = np.array([MAX_DISPARITY_SHARE, MAX_ROWS_SHARE]) * left.shape[::-1]
+        possible = (np.abs(left_px - guess_px) < most).all(axis=1)
+        left_px, guess_px = left_px[possible], guess_px[possible]
+        if not possible.any():
+            return nothing
+        right_px, found = _follow(left, right, left_px, guess_px, levels=0)
+        return left_px[found], right_px[found]
+
+    def _judge(self) -> None:
+        seen = np.concatenate(self._looks)
+        if len(seen) < MIN_MATCHES:
+            return
+        lag_s = self._lag_s(seen[np.isfinite(seen).all(axis=1)])
+        apart = seen[:, 2:4] - lag_s * np.nan_to_num(seen[:, 4:])
+        negative = float(np.mean(apart[:, 0] < -ROWS_PX))
+        rows_px = float(np.median(np.abs(apart[:, 1])))
+        found = []
+        if lag_s:
+            self.faults.pop('rows_apart', None)  # it may have been the lag
+            found.append(_not_simultaneous(lag_s, self._frame_s))
+        if negative > 0.5:
+            found.append(_eyes_swapped(negative))
+        if rows_px > ROWS_PX:
+            found.append(_rows_apart(rows_px))
+        self.faults.update({fault.fault: fault for fault in found})
+
+    def _lag_s(self, seen: Array) -> float:
+        """Return by how much the right images are late, in seconds, by points (N, 6); 0 where that
+        is not sure, or no more than what rectification leaves.
+        """
+        if len(seen) < MIN_MATCHES:
+            return 0.0
+        rows_px, moved_px = seen[:, 3], seen[:, 5] * self._frame_s
+        A = np.column_stack([np.ones(len(seen)), 1e-3 * seen[:, :2], moved_px])
+        weight = np.ones(len(seen))
+        for _ in range(10):
+            W = A * weight[:, None]
+            covariance = np.linalg.pinv(W.T @ A)
+            x = covariance @ W.T @ rows_px
+            error = rows_px - A @ x
+            noise_px = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
+            weight = 1.0 / (1.0 + (error / (2 * noise_px)) ** 2)
+        lag, sigma = float(x[3]), noise_px * float(np.sqrt(covariance[3, 3]))
+        is_sure = sigma > 0 and abs(lag) - SURE * sigma > LAG_FRAMES
+        return lag * self._frame_s if is_sure else 0.0
+
+
+def _follow(
+    image: NDArray[np.uint8], other: NDArray[np.uint8], uv_px: Array, guess_px: Array, levels: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return where pixels (N, 2) of an image (H, W) are in another one, near a guess (N, 2), and
+    which of them were found, there and back.
+    """
+    how: dict[str, Any] = {
+        'winSize': (WINDOW_PX, WINDOW_PX),
+        'maxLevel': levels,
+        'flags': cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
+    there, found = cv2.calcOpticalFlowPyrLK(image, other, uv_px, guess_px.copy(), **how)[:2]
+    back, returned = cv2.calcOpticalFlowPyrLK(other, image, there, uv_px.copy(), **how)[:2]
+    is_same = np.linalg.norm(back - uv_px, axis=1) < RETURN_PX
+    return there, (np.asarray(found).ravel() > 0) & (np.asarray(returned).ravel() > 0) & is_same
