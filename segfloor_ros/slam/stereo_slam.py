@@ -59,9 +59,8 @@ class StereoSlam:
     known, since frame `map` lies on the floor; then all of them come at once, none is lost. Until
     then `provisional` is the newest pose.
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
-    adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check: what
-    is wrong with the images. front_end,
-    back_end: tracking and mapping.
+    adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
+    what is wrong with the images. front_end, back_end: tracking and mapping.
     """
 
     def __init__(
