@@ -10,6 +10,8 @@ from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
 from segfloor_ros.camera.calibration.rectification import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.observation import FLOOR
@@ -18,6 +20,7 @@ from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 OUTLINES = Path(__file__).with_name('library_floor_outlines.yaml')
 LIBRARY_MOUNT = Mount(1.27, np.radians(5.9), np.radians(0.4))
+ROVER_MOUNT = Mount(0.255, np.radians(26.3), np.radians(2.2))
 
 
 def test_corridor(shared_data):
@@ -110,3 +113,21 @@ def test_weak_texture_survives_compression(floor_kind):
         near = floor & (depth > 0.5)
         recall[name] = (called & near).sum() / near.sum()
     assert recall['deblocked'] > max(0.92, recall['as it is'] + 0.04)
+
+
+def test_what_lies_right_before_a_rover_is_not_floor(shared_data):
+    """A coil of rope, tyres and a stone: black, plain, or nearer than most of the floor."""
+    settings = resolve(None, (), stereo_camera={'input': str(shared_data / 'rover')})
+    source = open_source(settings.stereo_camera)
+    stage = FloorSegmentation(source.camera, FloorSegmentationSettings())
+    outlines = read_outlines(Path(__file__).with_name('rover_floor_outlines.yaml'))
+    counts = np.zeros(5, np.int64)
+    for frame in source.frames():
+        if frame.index in (37, 39, 60, 341, 364):
+            mask = stage.process(frame.left, frame.right, ROVER_MOUNT).mask
+            counts += count_pixels(mask, draw_outline(outlines[frame.index], mask.shape))
+        elif frame.index > 364:
+            break
+    hit, false, missed, _, pixels = counts
+    assert false / (pixels - hit - missed) < 0.06
+    assert hit / (hit + missed) > 0.7
