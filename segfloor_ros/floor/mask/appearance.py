@@ -18,6 +18,7 @@ _FEW = 0.1
 _SIGMAS = 2.0
 """One in twenty of the floor's own pixels differs by more."""
 _SMOOTH_PX = 5
+_SHRINK = 4
 _STEP_GREY = 1.0
 """Grey levels are whole: no surface is known better."""
 
@@ -43,11 +44,20 @@ def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[
 def _around(
     grey: NDArray[np.float32], counted: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean and variance (R, W) of what counts around each pixel."""
-    side = int(_WINDOW_SHARE * grey.shape[1]) | 1
+    """Return mean and variance (R, W) of what counts around each pixel. Both change slowly: they
+    are computed at a quarter of the resolution.
+    """
+    width, height = grey.shape[1], grey.shape[0]
+    small = (max(1, width // _SHRINK), max(1, height // _SHRINK))
+    side = int(_WINDOW_SHARE * small[0]) | 1
     sums = []
     for value in (counted, counted * grey, counted * grey**2):
-        share = cv2.blur(value, (side, side), borderType=cv2.BORDER_CONSTANT)
+        shrunk = cv2.resize(value, small, interpolation=cv2.INTER_AREA)
+        share = cv2.blur(shrunk, (side, side), borderType=cv2.BORDER_CONSTANT)
         sums.append(share + np.float32(_FEW / counted.mean() * value.mean()))
     mean = sums[1] / sums[0]
-    return mean, np.maximum(sums[2] / sums[0] - mean**2, 0)
+    variance = np.maximum(sums[2] / sums[0] - mean**2, 0)
+    return (
+        cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR),
+        cv2.resize(variance, (width, height), interpolation=cv2.INTER_LINEAR),
+    )
