@@ -284,7 +284,7 @@ class LockstepRun:
 
     def _note(self, result: FrameResult) -> None:
         if self._save_masks is SaveMasks.all:
-            frame = self._unmasked.pop(result.index)
+            frame = self._pipeline.slam.rig_check.corrected(self._unmasked.pop(result.index))
             self._attempt(frame.index, partial(self._mask_frame, frame, result))
         if result.keyframe is not None:
             self._path = new_keyframes(result.keyframe.path)

@@ -9,7 +9,7 @@ with the motion of the points along the columns are those of a lag between the e
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -69,7 +69,8 @@ def _rows_apart(rows_px: float) -> InputFault:
         'rows_apart',
         round(rows_px, 2),
         'px',
-        f'are not rectified: the same points stand {rows_px:.1f} rows apart (median)',
+        f'are not rectified: the same points stand {rows_px:.1f} rows apart (median), which is '
+        'taken off the right image as far as it is the same everywhere',
         'give the raw images (image_raw) with the calibration of this camera, or calibrate again '
         '(segfloor calibrate)',
     )
@@ -105,6 +106,7 @@ class RigCheck:
     def __init__(self) -> None:
         self.faults: dict[str, InputFault] = {}
         self.frames = 0
+        self._rows_px = 0.0
         self._looks: deque[Array] = deque(maxlen=RECENT)
         self._before: tuple[NDArray[np.uint8], int] | None = None
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
@@ -119,6 +121,14 @@ class RigCheck:
             self._judge()
         self.frames += 1
         self._before = (frame.left, frame.stamp_ns) if self.frames % EVERY == 0 else None
+
+    def corrected(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame with its right image moved by the rows that it was found to be off."""
+        if not self._rows_px:
+            return frame
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, self._rows_px]])
+        right = cv2.warpAffine(frame.right, shift, frame.right.shape[::-1])
+        return replace(frame, right=right)
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """Return fault, value, unit and remedy of all that was found, for summary.json."""
@@ -172,11 +182,13 @@ class RigCheck:
         found = []
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag
+            self._rows_px = 0.0
             found.append(_not_simultaneous(lag_s, self._frame_s))
         if negative > 0.5:
             found.append(_eyes_swapped(negative))
         if rows_px > ROWS_PX:
             found.append(_rows_apart(rows_px))
+            self._rows_px = float(np.median(apart[:, 1]))
         self.faults.update({fault.fault: fault for fault in found})
 
     def _lag_s(self, seen: Array) -> float:

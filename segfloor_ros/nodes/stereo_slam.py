@@ -210,6 +210,8 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         milliseconds = 1e3 * (time.perf_counter() - start)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
         if results and results[-1].stamp_ns == stamp_ns and results[-1].tracked:
+            frame = slam.rig_check.corrected(frame)
+            images = frame.left, frame.right
             self._outputs.publish_frame(stamp_ns, images, self._calibration, self._frames)
         if len(self._unsent) == 1:
             self._send_next()

@@ -132,6 +132,7 @@ class StereoSlam:
                 return self._hold(_carried(result, self.front_end.motion, self._covariance()))
             if not fault:
                 self.rig_check.see(frame)
+                frame = self.rig_check.corrected(frame)
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = (
                 self.front_end.track(frame, images) if self.map.keyframes and not fault else None

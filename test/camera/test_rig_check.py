@@ -58,6 +58,20 @@ def test_rows_that_are_off_are_counted(frames, rows) -> None:
     assert 'calibrate' in fault.remedy
 
 
+def test_rows_that_are_off_are_taken_off_the_right_image(frames) -> None:
+    check = RigCheck()
+    for frame in frames[:11]:
+        check.see(frame)
+    assert check.corrected(frames[0]) is frames[0]
+    check = RigCheck()
+    off = [replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames[:11]]
+    for frame in off:
+        check.see(frame)
+    right = check.corrected(off[10]).right
+    error = np.abs(right[8:-8].astype(float) - frames[10].right[8:-8])
+    assert np.median(error) <= 1  # interpolated between rows where it is not exactly 3
+
+
 def test_eyes_that_are_exchanged_are_named(frames) -> None:
     found = faults([replace(f, left=f.right, right=f.left) for f in frames])
     assert set(found) == {'eyes_swapped'}

@@ -90,7 +90,11 @@ def test_images_whose_rows_are_off_are_said_with_figure_and_remedy(tmp_path, res
     assert f'{off}: left and right images are not rectified' in line
     assert '3.0 rows apart' in line
     assert 'calibrate' in line
-    (fault,) = json.loads((tmp_path / 'out' / 'summary.json').read_text())['input_faults']
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert summary['tracked_frames'] == FRAMES
+    estimate = np.loadtxt(tmp_path / 'out' / 'trajectory.txt')
+    np.testing.assert_allclose(estimate[:, 1], 0.06 * np.arange(FRAMES), atol=0.01)
+    (fault,) = summary['input_faults']
     assert set(fault) == {'fault', 'value', 'unit', 'remedy'}
     assert (fault['fault'], fault['unit']) == ('rows_apart', 'px')
     assert fault['value'] == pytest.approx(3.0, abs=0.1)
