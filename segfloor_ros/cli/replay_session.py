@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,8 @@ from segfloor_ros.results_folder import (
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.slam.saved_slam import loaded_map, new_keyframes
 from segfloor_ros.trajectory import Trajectory, corrected_trajectory
+
+logger = logging.getLogger(__name__)
 
 SAVE_S = 120.0
 MAP_FILE = 'map.yaml'
@@ -123,7 +126,13 @@ class ReplaySession:
         start_s, recorder = time.perf_counter(), graph.recorder
         broken, is_whole = self._play(graph)
         wall_s = time.perf_counter() - start_s
-        self._check_result(recorder, broken)
+        try:
+            self._check_result(recorder, broken)
+        except SegfloorError:
+            for fault in recorder.input_faults:  # they may be why
+                what = '{fault}, {value} {unit}; {remedy}'.format(**fault)
+                logger.warning('%s: %s', self.configuration.stereo_camera.input, what)
+            raise
         try:
             graph.wait_for_map()
             graph.call(Trigger, 'save_map', Trigger.Request())

@@ -288,7 +288,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             blind=int(result.blind),
             submap=int(result.in_submap),
             repeated=int(result.repeated and result.tracked),
-            input_faults=json.dumps(slam.rig_check.as_dicts()),
+            input_faults=_faults_json(slam),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
 
@@ -306,7 +306,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self.reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
             return
         words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
-        self.reporter.report_waiting(stamp_ns, words)
+        self.reporter.report_waiting(stamp_ns, words, input_faults=_faults_json(slam))
 
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self._mount = mount
@@ -318,6 +318,10 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             self._camera.watch.judge_measured(mount)
         self._outputs.publish_mount(self._frames, mount)
         self._transforms.announce_mount(stamp_ns, self._frames.left, mount)
+
+
+def _faults_json(slam: StereoSlam) -> str:
+    return json.dumps(slam.rig_check.as_dicts())
 
 
 def main() -> None:

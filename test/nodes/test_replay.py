@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,8 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     summaries = [
         json.loads((tmp_path / kind / 'summary.json').read_text()) for kind in ('run', 'replay')
     ]
-    for key in ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'map_updates'):
+    same = ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'map_updates')
+    for key in (*same, 'repeated_frames', 'input_faults'):
         assert summaries[0][key] == summaries[1][key], key
     assert (summaries[1]['frames'], summaries[1]['skipped_frames']) == (FRAMES - 1, 1)
     assert f'frame {DAMAGED} is skipped' in errors
@@ -97,6 +99,15 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     assert masks[0] == masks[1]
     assert len(masks[0]) == summaries[0]['keyframes']
     assert 'keyframes that failed: 0' in out
+
+
+def test_eyes_that_are_exchanged_are_said_also_where_no_map_comes_of_it(tmp_path) -> None:
+    frames = [replace(f, left=f.right, right=f.left) for f in room_drive(5)[0]]
+    drive = write_kitti(tmp_path / 'exchanged', frames)
+    status, _, errors = segfloor('replay', drive, '--out', tmp_path / 'out', '--rate', 0)
+    assert status == 1
+    assert f'{drive}: eyes_swapped, ' in errors
+    assert '%; exchange the two' in errors
 
 
 @pytest.mark.slow

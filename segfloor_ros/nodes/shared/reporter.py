@@ -120,10 +120,10 @@ class Reporter:
         self.health.processed(milliseconds, message)
         self.report(stamp_ns, level, message, **values, processing_ms=f'{milliseconds:.3f}')
 
-    def report_waiting(self, stamp_ns: int, message: str) -> None:
+    def report_waiting(self, stamp_ns: int, message: str, **values: Any) -> None:
         """Publish a status about what cannot be processed yet, and is kept."""
         self.health.waits(message)
-        self.report(stamp_ns, Level.WARN, message)
+        self.report(stamp_ns, Level.WARN, message, **values)
 
     def report_fault(self, stamp_ns: int, error: Exception) -> None:
         """Log a fault and publish a status about it."""
