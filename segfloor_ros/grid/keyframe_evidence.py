@@ -26,6 +26,9 @@ _LEAST_DEEP_M = 0.03
 QUARTILE = 0.675
 """Quartiles of a normal distribution lie this many sigmas from its mean."""
 
+_HIT_ERROR_M = 0.05
+"""An obstacle whose place is less certain than this, and than a cell, marks none."""
+
 _SURE_SHARE = 0.4
 """An obstacle is placed within its cell where this share of a cell's side is one sigma."""
 _FREE_ERROR_M = 0.12
@@ -97,11 +100,12 @@ def gather_evidence(
 
 
 def hit_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
-    """Return up to which distance an obstacle is placed to a cell, so that it marks cells."""
+    """Return up to which distance an obstacle is placed well enough to mark cells."""
     limit_m = free_range_m(scan, settings)
     if scan.error_per_m == 0:
         return limit_m
-    return min(limit_m, math.sqrt(settings.resolution_m / scan.error_per_m))
+    error_m = max(settings.resolution_m, _HIT_ERROR_M)
+    return min(limit_m, math.sqrt(error_m / scan.error_per_m))
 
 
 def _sure_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:

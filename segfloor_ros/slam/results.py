@@ -7,7 +7,7 @@ What tracking hands to mapping: a frame with a pose, and what was seen in it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import WheelPose
-from segfloor_ros.slam.map.residuals import Observations
-from segfloor_ros.slam.tracking.features import Features
-from segfloor_ros.slam.tracking.pose import PoseEstimate
+
+if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
+    from segfloor_ros.slam.map.residuals import Observations
+    from segfloor_ros.slam.tracking.features import Features
+    from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 UNKNOWN_COVARIANCE = 1e6
 NO_POINT = -1

@@ -272,5 +272,5 @@ def test_bad_sizes(sizes):
 
 
 def test_what_cannot_be_done_is_said_at_once(tmp_path):
-    with pytest.raises(InputError, match='choose another --json'):
+    with pytest.raises(InputError, match='give the name of a file'):
         run('--json', tmp_path, fails=True)
