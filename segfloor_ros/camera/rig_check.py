@@ -183,10 +183,11 @@ class RigCheck:
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag
             self._rows_px = 0.0
+            rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             found.append(_not_simultaneous(lag_s, self._frame_s))
         if negative > 0.5:
             found.append(_eyes_swapped(negative))
-        if rows_px > ROWS_PX:
+        if rows_px > ROWS_PX and (lag_s or 'not_simultaneous' not in self.faults):
             found.append(_rows_apart(rows_px))
             self._rows_px = float(np.median(apart[:, 1]))
         self.faults.update({fault.fault: fault for fault in found})
