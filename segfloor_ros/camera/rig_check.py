@@ -175,7 +175,9 @@ class RigCheck:
         seen = np.concatenate(self._looks)
         if len(seen) < MIN_MATCHES:
             return
-        lag_s = self._lag_s(seen[np.isfinite(seen).all(axis=1)])
+        followed = seen[np.isfinite(seen).all(axis=1)]
+        lag_s = self._lag_s(followed)
+        seen = followed if lag_s else seen
         apart = seen[:, 2:4] - lag_s * np.nan_to_num(seen[:, 4:])
         negative = float(np.mean(apart[:, 0] < -ROWS_PX))
         rows_px = float(np.median(np.abs(apart[:, 1])))
