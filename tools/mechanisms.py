@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.mask.contact import fill_to_contact
+from segfloor_ros.floor.mask.filling import fill_to_contact
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'

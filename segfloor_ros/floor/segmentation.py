@@ -1,4 +1,7 @@
-"""The floor segmentation stage: a rectified stereo pair in, the floor out."""
+"""The floor segmentation stage: a rectified stereo pair in, the floor out.
+
+What of an image does not count: what moves, and the border that rectification leaves.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity
-from segfloor_ros.camera.images import blank_border
+from segfloor_ros.camera.images import blank_border, matched_in
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
 from segfloor_ros.floor.disparity.matching import (
@@ -21,30 +24,30 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.photometric import compare, compare_measured
+from segfloor_ros.floor.disparity.photometric import (
+    MIN_TEXTURE_GREY,
+    NOISE_TEXTURE,
+    compare,
+    compare_measured,
+    noise_grey,
+    row_slope,
+    texture_grey,
+)
 from segfloor_ros.floor.disparity.profile import (
     BINS_PER_PX,
     FloorLine,
     FloorProfile,
     fit_profile,
 )
-from segfloor_ros.floor.disparity.texture import (
-    MIN_TEXTURE_GREY,
-    NOISE_TEXTURE,
-    noise_grey,
-    row_slope,
-    texture_grey,
-)
 from segfloor_ros.floor.mask.appearance import unlike_floor
-from segfloor_ros.floor.mask.contact import blank_feet
 from segfloor_ros.floor.mask.filling import (
     beside_something,
+    blank_feet,
     drop_islands,
     fill_gaps,
     fill_regions,
     trim_to_edges,
 )
-from segfloor_ros.floor.mask.hidden import clear_hidden, drop_hidden
 from segfloor_ros.floor.mask.overhead import OverheadMatcher
 from segfloor_ros.floor.mask.pixel_evidence import Comparison, Evidence, HeightTable, judge
 from segfloor_ros.floor.mask.runs import pixels_where
@@ -325,3 +328,23 @@ def _feet(
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:
     pitch, roll, height = (float(value) for value in angles_height)
     return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
+
+
+def drop_hidden(
+    disparity: NDArray[np.float32],
+    hidden: NDArray[np.uint8] | None,
+    hidden_right: NDArray[np.uint8] | None,
+) -> None:
+    """Set disparities (H, W) to 0 where either image shows nothing that counts."""
+    if hidden is not None:
+        disparity[hidden > 0] = 0
+    if hidden_right is not None:
+        disparity[matched_in(hidden_right, disparity)] = 0
+
+
+def clear_hidden(
+    mask: NDArray[np.uint8], hidden: NDArray[np.uint8] | None, columns: tuple[slice, slice]
+) -> None:
+    """Set a mask of the view to no evidence where the left image shows nothing that counts."""
+    if hidden is not None:
+        mask[hidden[columns] > 0] = NO_EVIDENCE

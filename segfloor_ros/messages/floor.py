@@ -10,8 +10,7 @@ from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.errors import InputError
-from segfloor_ros.floor.free_ranges import free_ranges
-from segfloor_ros.floor.observation import FloorObservation, FloorScan
+from segfloor_ros.floor.observation import FloorObservation, FloorScan, free_ranges
 from segfloor_ros.messages.headers import make_header
 from segfloor_ros.messages.images import image_message
 

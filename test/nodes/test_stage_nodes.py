@@ -28,7 +28,7 @@ from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR
 from segfloor_ros.cloud.settings import CloudLabellingSettings
-from segfloor_ros.floor.free_ranges import free_ranges
+from segfloor_ros.floor.observation import free_ranges
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import invert

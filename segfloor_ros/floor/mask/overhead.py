@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.depth import shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import SPECKLE_PX, DisparityMatcher
-from segfloor_ros.floor.disparity.texture import texture_grey
+from segfloor_ros.floor.disparity.photometric import texture_grey
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array, transform_points
 

@@ -25,7 +25,7 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.texture import (
+from segfloor_ros.floor.disparity.photometric import (
     EDGE_SLOPE,
     MIN_TEXTURE_GREY,
     NOISE_TEXTURE,

@@ -143,7 +143,8 @@ class Reporter:
             )
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
-            if time.monotonic() - self._opened_s >= SETTLED_S:
+            # Others may still be starting; a second publisher is wrong from the first moment.
+            if crowded or time.monotonic() - self._opened_s >= SETTLED_S:
                 self.warn(text, about=names + crowded)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
