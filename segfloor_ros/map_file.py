@@ -92,7 +92,7 @@ def write_to(file: IO[bytes], saved: MapFile, compress: bool = True) -> None:
             for name, array in sorted(arrays.items()):
                 member = io.BytesIO()
                 np.save(member, np.ascontiguousarray(array), allow_pickle=False)
-                _add(archive, f'{part}/{name}.npy', member.getbuffer())
+                _add(archive, f'{part}/{name}.npy', member.getvalue())
 
 
 def from_bytes(data: bytes, name: str) -> MapFile:

@@ -32,6 +32,10 @@ class StereoRoom:
         self._rng.bit_generator.state = state
         self._noise = noise
 
+    def reset_noise(self, seed: int = 0) -> None:
+        """Begin the noise anew, so that a test does not depend on those before it."""
+        self._rng = np.random.default_rng(seed)
+
     def view(self, T_world_camera: np.ndarray, camera: StereoCamera = CAMERA) -> np.ndarray:
         """Return the grey image (H, W) uint8 seen from an optical frame."""
         directions = (T_world_camera[:3, :3] @ _rays(camera)).astype(np.float32)

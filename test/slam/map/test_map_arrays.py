@@ -29,6 +29,11 @@ def drive(slam, poses):
     ]
 
 
+@pytest.fixture(autouse=True)
+def the_same_noise_whatever_ran_before():
+    ROOM.reset_noise()
+
+
 @pytest.fixture(scope='module')
 def mapped():
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
@@ -175,7 +180,7 @@ def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mappe
     # It looks at the wall behind, then turns to what is known.
     start = [planar_pose(0.0, 0.1 * min(k, 3), 2.6) for k in range(13)]
     turn = [planar_pose(0.02 * k, 0.3, 2.6 - 0.11 * k) for k in range(25)]
-    on = [planar_pose(0.5 + 0.03 * k, 0.3 - 0.02 * k, -0.1 + 0.03 * k) for k in range(12)]
+    on = [planar_pose(0.5 + 0.03 * k, 0.3 - 0.02 * k, -0.1 + 0.03 * k) for k in range(20)]
     results, _ = drive(slam, start + turn + on)
     apart = [r for r in results if 'outside the loaded map' in r.state]
     assert len(apart) > 10
