@@ -24,7 +24,7 @@ from segfloor_ros.messages.images import (
     image_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.messages.topics import SLAM, TOPICS
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.shared.connections import likeness
 from segfloor_ros.nodes.shared.reporter import SETTLED_S
@@ -184,6 +184,7 @@ def test_a_topic_of_another_type_is_named_as_that(make_graph) -> None:
             '/left/image_raw is published as sensor_msgs/msg/CompressedImage, not as sensor_msgs'
         )
         graph.until(lambda: any(words in s.message for s in graph.statuses), 'the diagnosis')
+    assert all(s.node == SLAM for s in graph.statuses if words in s.message)
 
 
 def test_a_node_of_the_same_name_is_named(make_graph, console) -> None:
