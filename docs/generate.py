@@ -7,8 +7,7 @@ from pathlib import Path
 
 from topic_texts import ABOUT
 
-from segfloor_ros.configuration import STAGE_SETTINGS
-from segfloor_ros.messages.qos import describe
+from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from segfloor_ros.messages.topics import (
     CAMERA,
     CLOUD,
@@ -19,10 +18,10 @@ from segfloor_ros.messages.topics import (
     PACED_BY,
     SLAM,
     Topic,
+    describe,
     published_by,
     subscribed_by,
 )
-from segfloor_ros.node_settings import NODE_SETTINGS
 from segfloor_ros.settings import SettingSpec
 
 PAGES = Path(__file__).parent / 'nodes'

@@ -1,5 +1,5 @@
 """The five stages in lockstep, without ROS: every frame is processed, and the same input gives
-the same bytes.
+the same bytes. The nodes build SLAM here, too.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
+from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
@@ -31,7 +32,8 @@ from segfloor_ros.slam.results import (
     SparseCloud,
 )
 from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, save_slam
-from segfloor_ros.stages import make_slam
+from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes
 
 logger = logging.getLogger(__name__)
@@ -215,3 +217,36 @@ class Pipeline:
             self.fault = f'{type(error).__name__}: {error}'
             logger.warning('keyframe %d failed: %s', keyframe.frame_index, self.fault)
             logger.debug('where it failed:', exc_info=error)
+
+
+def make_slam(
+    camera: StereoCamera,
+    settings: StereoSlamSettings,
+    mount: Mount | None = None,
+    times: StageTimes | None = None,
+    background: bool = False,
+) -> StereoSlam:
+    """Build stereo SLAM with the camera's mount: `mount` when it is known (from tf), else from
+    the settings, and whatever the settings leave open is measured from the floor the camera
+    sees. background: adjust the map beside tracking.
+    """
+    height_m, pitch_rad, roll_rad = (
+        settings.camera_height_m,
+        settings.camera_pitch_rad,
+        settings.camera_roll_rad,
+    )
+    if mount is None and settings.has_mount:
+        mount = Mount(
+            height_m, pitch_rad, roll_rad, settings.camera_forward_m, settings.camera_left_m
+        )
+    meter = None
+    if mount is None:
+        meter = MountEstimator(
+            camera,
+            height_m,
+            pitch_rad,
+            roll_rad,
+            forward_m=settings.camera_forward_m,
+            left_m=settings.camera_left_m,
+        )
+    return StereoSlam(camera, settings, mount, meter, times, background)

@@ -1,14 +1,22 @@
-"""Processes that end with the one that has started them."""
+"""This process and those it starts: how they end, in order, and how many threads they use."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
 import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
+
+VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def end_with_parent(parent_id: int) -> None:
@@ -20,3 +28,81 @@ def end_with_parent(parent_id: int) -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent_id:
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def limit_blas_threads() -> None:
+    """Use one BLAS thread unless the environment says otherwise; call it before NumPy is imported.
+
+    The matrices here are small: a second thread gains little on an idle machine, and on a busy one
+    the two wait for each other. The stages run side by side instead.
+    """
+    for variable in VARIABLES:
+        os.environ.setdefault(variable, '1')
+
+
+class Interrupt(threading.Event):
+    """Set when a signal has come."""
+
+    number = 0
+
+    @property
+    def status(self) -> int:
+        """The exit status that the signal stands for, 0 before one has come."""
+        return 128 + self.number if self.number else 0
+
+
+@contextlib.contextmanager
+def terminated_like_interrupted() -> Iterator[None]:
+    """Let SIGTERM within the block end what is under way with all its clean-ups, status 143."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
+    process and the note that it runs. A started program gets the default handlers again.
+    """
+    received: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    handlers = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        _restore(handlers)
+    if received:
+        signal.raise_signal(received[0])
+
+
+@contextlib.contextmanager
+def first_interrupt_noted() -> Iterator[Interrupt]:
+    """Set an event at the first SIGINT or SIGTERM within the block, so that the work can come to an
+    orderly end; the next one takes its usual course.
+    """
+    event = Interrupt()
+
+    def note(number: int, frame: FrameType | None) -> None:
+        event.number = number
+        event.set()
+        _restore(handlers)
+
+    handlers = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield event
+    finally:
+        _restore(handlers)
+
+
+def _restore(handlers: dict[signal.Signals, signal._HANDLER]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)

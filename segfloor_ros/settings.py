@@ -2,9 +2,8 @@
 
 A stage declares its settings once, with `setting(...)` fields carrying description, unit and
 range. The ROS parameters (names, descriptors, ranges), the checks of YAML files and of the
-command line, and the tables in docs/ are all derived from that declaration.
-
-The robot: what it drives over and under. Declared once for all stages that judge heights.
+command line, and the tables in docs/ are all derived from that declaration. So is the robot: what
+it drives over and under, declared once for all stages that judge heights.
 """
 
 from __future__ import annotations

@@ -9,9 +9,8 @@ import numpy as np
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages.clouds import features_message, labelled_message, sparse_cloud_message
-from segfloor_ros.messages.floor import scan_message
-from segfloor_ros.messages.images import image_message
+from segfloor_ros.messages.images import image_message, scan_message
+from segfloor_ros.messages.maps import features_message, labelled_message, sparse_cloud_message
 from segfloor_ros.messages.poses import PathMessages, odometry_message
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from segfloor_ros.configuration import STAGE_SETTINGS
-from segfloor_ros.node_settings import NODE_SETTINGS
+from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped_scenes

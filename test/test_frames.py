@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.frames import HISTORY_NS, FrameTree
-from segfloor_ros.geometry import make_transform
+from segfloor_ros.geometry import HISTORY_NS, FrameTree, make_transform
 
 S = 1_000_000_000
 

@@ -35,8 +35,8 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import Keyframe
-from segfloor_ros.stages import make_slam
 from segfloor_ros.trajectory import read_trajectory
 from tools.driving import noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS

@@ -18,7 +18,7 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
 from segfloor_ros.geometry import Array
-from segfloor_ros.stages import make_slam
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.timing import StageTimes
 from tools.driving import drive, open_recording
 

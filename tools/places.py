@@ -31,10 +31,10 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
 from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.map_file import from_bytes, to_bytes
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import rss_mb
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory, read_trajectory
 from tools.driving import open_recording

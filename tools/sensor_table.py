@@ -22,11 +22,10 @@ from segfloor_ros.cli.output import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.pipeline import Pipeline, make_slam
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult, KeyframePath
-from segfloor_ros.stages import make_slam
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
 from tools.driving import after_sensors, open_recording
 

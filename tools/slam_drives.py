@@ -13,8 +13,8 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import KeyframePath
-from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, read_trajectory
 from tools.driving import after_sensors, drive, noisy, open_recording

@@ -26,9 +26,8 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.pipeline import KeyframeStages, MapInput
+from segfloor_ros.pipeline import KeyframeStages, MapInput, make_slam
 from segfloor_ros.slam.results import FrameResult, Keyframe
-from segfloor_ros.stages import make_slam
 from segfloor_ros.timing import MemoryLog, ReferenceWorkload, StageTimes, spread_of
 
 IMAGES = 'images'

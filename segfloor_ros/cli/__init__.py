@@ -1,5 +1,5 @@
 """The segfloor command."""
 
-from segfloor_ros.threads import limit_blas_threads
+from segfloor_ros.processes import limit_blas_threads
 
 limit_blas_threads()

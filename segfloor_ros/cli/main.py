@@ -18,8 +18,8 @@ from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.run import run
 from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.silence import own_standard_error
-from segfloor_ros.interrupts import terminated_like_interrupted
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
+from segfloor_ros.processes import terminated_like_interrupted
 
 app = typer.Typer(
     help='Occupancy maps for ground robots from a stereo camera alone.',

@@ -20,8 +20,8 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from segfloor_ros.errors import printable
-from segfloor_ros.interrupts import Interrupt
 from segfloor_ros.measurements import RecordedSensor
+from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
 
 console = Console(markup=False)

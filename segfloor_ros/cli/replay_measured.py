@@ -25,8 +25,7 @@ from segfloor_ros.cli.replay_recorder import ReplayRecorder
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, to_ns
 from segfloor_ros.timing import rss_mb
 
 MEMORY_PERIOD_S = 2.0

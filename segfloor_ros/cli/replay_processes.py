@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from segfloor_ros.errors import MapError
-from segfloor_ros.interrupts import interrupts_deferred
-from segfloor_ros.processes import end_with_parent
+from segfloor_ros.processes import end_with_parent, interrupts_deferred
 from segfloor_ros.timing import rss_mb
 
 INTERRUPT_S = 1.2

@@ -21,11 +21,19 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import diagnostics
-from segfloor_ros.messages.clouds import labelled_arrays
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.maps import labelled_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
-from segfloor_ros.messages.topics import CAMERA, CLOUD, DIAGNOSTICS, FLOOR, GRID, SLAM, TOPICS
+from segfloor_ros.messages.topics import (
+    CAMERA,
+    CLOUD,
+    DIAGNOSTICS,
+    FLOOR,
+    GRID,
+    SLAM,
+    TOPICS,
+    to_ns,
+)
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import MemoryLog, StageTimes
 from segfloor_ros.trajectory import TrackedPose

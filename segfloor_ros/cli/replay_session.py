@@ -24,12 +24,12 @@ from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError, SegfloorError
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
-from segfloor_ros.interrupts import Interrupt
 from segfloor_ros.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.map_files import grid_of
+from segfloor_ros.messages.maps import grid_of
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
+from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import (
     MAP,
     RunResult,

@@ -9,8 +9,8 @@ import typer
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import options, output
 from segfloor_ros.errors import MapError
-from segfloor_ros.interrupts import first_interrupt_noted
 from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
+from segfloor_ros.processes import first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
 
 

@@ -14,7 +14,7 @@ from statistics import median
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from segfloor_ros.messages.headers import make_header, to_ns
+from segfloor_ros.messages.topics import make_header, to_ns
 
 CONNECTIONS = 'connections'
 """Kind of the status that says how many subscribers each topic of a node has."""

@@ -7,10 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-MAX_DISORDER_NS = 500_000_000
-"""A stamp older than the latest by no more is a late message; by more, a recording has begun
-again.
-"""
+from segfloor_ros.geometry import MAX_DISORDER_NS
 
 
 @dataclass(frozen=True)

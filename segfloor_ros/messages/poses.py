@@ -1,6 +1,5 @@
-"""Poses, odometry, paths and transforms. Quaternions are normalised on the way in.
-
-Wheel odometry and IMU as messages.
+"""Poses, odometry, paths, transforms, wheels and IMU as messages. Quaternions are normalised on the
+way in.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from segfloor_ros.camera.ros_messages import NOT_MEASURED
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, make_transform, se3_log
 from segfloor_ros.measurements import ImuSample, WheelPose
-from segfloor_ros.messages.headers import make_header, to_ns
+from segfloor_ros.messages.topics import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
 
 UNKNOWN_TWIST_VARIANCE = 1e6

@@ -2,6 +2,10 @@
 
 The nodes, the documentation and the replay take them from here. Names are relative, so that
 namespaces and remapping apply. Every message about one keyframe carries that keyframe's stamp.
+
+Everything between the nodes of this package is reliable: best effort loses large messages. Only
+what other drivers publish may be taken best effort. A stamp is a whole number of nanoseconds
+everywhere outside messages.
 """
 
 from __future__ import annotations
@@ -9,10 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import (
     CameraInfo,
     CompressedImage,
@@ -24,8 +29,6 @@ from sensor_msgs.msg import (
 )
 from std_msgs.msg import Header, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
-
-from segfloor_ros.messages import qos
 
 CAMERA, SLAM = 'stereo_camera', 'stereo_slam'
 FLOOR, CLOUD, GRID = 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'
@@ -41,6 +44,48 @@ MAP_LOADED, MAP_WANTED, MAP_PART = 'map_file/loaded', 'map_file/wanted', 'map_fi
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
 PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 """Topics that a lossless camera listens to: how far frames and keyframes are."""
+
+NS_PER_S = 1_000_000_000
+
+
+def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+IMAGES = _reliable(30)
+"""Camera images and their calibrations."""
+
+SENSORS = _reliable(400)
+"""Wheel odometry and IMU."""
+
+FRAMES = _reliable(5)
+"""Small images of every frame and the time of a recording, of which only the latest count."""
+
+KEYFRAMES = _reliable(100)
+"""Poses, and everything about a keyframe; deep enough for a burst after the camera's mount was
+measured. As tf2 does, for moving frames, too."""
+
+LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+"""The last value also for those who come later: the map, the camera's mount (REP-2003)."""
+
+LATCHED_BY_MANY = _reliable(KEYFRAMES.depth, DurabilityPolicy.TRANSIENT_LOCAL)
+"""What listens to the last values of many nodes, e.g. to the fixed frames of tf."""
+
+
+def best_effort(profile: QoSProfile) -> QoSProfile:
+    """Return a profile for drivers that publish best effort; messages may be lost."""
+    return QoSProfile(depth=profile.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def describe(profile: QoSProfile) -> str:
+    """Return a profile in words, e.g. `reliable, volatile, depth 30`."""
+    return f'{describe_policies(profile)}, depth {profile.depth}'
+
+
+def describe_policies(profile: QoSProfile) -> str:
+    """Return what both sides must agree on in words, e.g. `reliable, volatile`."""
+    words = (profile.reliability.name, profile.durability.name)
+    return ', '.join(word.lower().replace('_', ' ') for word in words)
 
 
 @dataclass(frozen=True)
@@ -78,13 +123,11 @@ def _images(side: str) -> list[Topic]:
     raw, rectified = f'{side}/image_raw', f'{side}/image_rect'
     packed = '/compressed'
     return [
-        Topic(raw, Image, qos.IMAGES, CAMERA, (SLAM,)),
-        Topic(raw + packed, CompressedImage, qos.IMAGES, CAMERA, (SLAM,), instead_of=raw),
-        Topic(rectified, Image, qos.IMAGES, OTHERS, (SLAM,), instead_of=raw),
-        Topic(
-            rectified + packed, CompressedImage, qos.IMAGES, OTHERS, (SLAM,), instead_of=rectified
-        ),
-        Topic(f'{side}/camera_info', CameraInfo, qos.IMAGES, CAMERA, (SLAM,)),
+        Topic(raw, Image, IMAGES, CAMERA, (SLAM,)),
+        Topic(raw + packed, CompressedImage, IMAGES, CAMERA, (SLAM,), instead_of=raw),
+        Topic(rectified, Image, IMAGES, OTHERS, (SLAM,), instead_of=raw),
+        Topic(rectified + packed, CompressedImage, IMAGES, OTHERS, (SLAM,), instead_of=rectified),
+        Topic(f'{side}/camera_info', CameraInfo, IMAGES, CAMERA, (SLAM,)),
     ]
 
 
@@ -96,55 +139,51 @@ def _rectified_pair(names: tuple[str, ...], profile: QoSProfile, **facts: Any) -
 
 _ALL = [
     *(topic for side in SIDES for topic in _images(side)),
-    Topic('wheel_odometry', Odometry, qos.SENSORS_RELIABLE, OTHERS, (SLAM,), is_optional=True),
-    Topic('depth/image_raw', Image, qos.IMAGES, OTHERS, (SLAM,), instead_of='right/image_raw'),
-    Topic('imu', Imu, qos.SENSORS_RELIABLE, OTHERS, (SLAM,), is_optional=True),
-    Topic('odometry', Odometry, qos.ODOMETRY, SLAM, is_optional=True, on_demand_by=(CLOUD,)),
-    Topic(
-        'initialpose', PoseWithCovarianceStamped, qos.ODOMETRY, OTHERS, (SLAM,), is_optional=True
-    ),
-    Topic('pose', PoseWithCovarianceStamped, qos.ODOMETRY, SLAM),
+    Topic('wheel_odometry', Odometry, SENSORS, OTHERS, (SLAM,), is_optional=True),
+    Topic('depth/image_raw', Image, IMAGES, OTHERS, (SLAM,), instead_of='right/image_raw'),
+    Topic('imu', Imu, SENSORS, OTHERS, (SLAM,), is_optional=True),
+    Topic('odometry', Odometry, KEYFRAMES, SLAM, is_optional=True, on_demand_by=(CLOUD,)),
+    Topic('initialpose', PoseWithCovarianceStamped, KEYFRAMES, OTHERS, (SLAM,), is_optional=True),
+    Topic('pose', PoseWithCovarianceStamped, KEYFRAMES, SLAM),
     Topic(
         'dynamic_mask',
         Image,
-        qos.IMAGES_BEST_EFFORT,
+        best_effort(IMAGES),
         OTHERS,
         (SLAM,),
         is_optional=True,
         also_by=(CAMERA,),
     ),
-    Topic('moving_points', PointCloud2, qos.ODOMETRY, SLAM),
-    Topic(MOVING_MASK, Image, qos.KEYFRAMES, SLAM, (FLOOR,), is_optional=True),
-    Topic(FRAME_DONE, Header, qos.ODOMETRY, SLAM),
-    Topic('camera_mount', TransformStamped, qos.LATCHED, SLAM, (FLOOR,)),
-    Topic('keyframe/odometry', Odometry, qos.KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID)),
-    Topic(MAP_START, TimeReference, qos.KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID), is_optional=True),
-    Topic(MAP_LOADED, UInt8MultiArray, qos.LATCHED, SLAM, (CLOUD, GRID), is_optional=True),
-    Topic(MAP_WANTED, Header, qos.KEYFRAMES, SLAM, (CLOUD, GRID), is_optional=True),
-    Topic(
-        MAP_PART, UInt8MultiArray, qos.KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)
-    ),
-    *_rectified_pair(KEYFRAME_PARTS, qos.KEYFRAMES, subscribers=(FLOOR,)),
-    *_rectified_pair(FRAME_PARTS, qos.FRAMES, is_optional=True, on_demand_by=(FLOOR,)),
-    Topic('keyframe/features', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD, GRID)),
-    Topic('keyframe/path', Path, qos.KEYFRAMES, SLAM, (GRID,)),
-    Topic('map_points', PointCloud2, qos.KEYFRAMES, SLAM, (CLOUD,)),
-    Topic('keyframe/disparity', DisparityImage, qos.KEYFRAMES, FLOOR),
-    Topic('keyframe/floor_mask', Image, qos.KEYFRAMES, FLOOR, (CLOUD,)),
-    Topic('keyframe/floor_overlay', Image, qos.KEYFRAMES, FLOOR),
-    Topic('keyframe/v_disparity', Image, qos.KEYFRAMES, FLOOR),
-    Topic('keyframe/floor_scan', LaserScan, qos.KEYFRAMES, FLOOR, (GRID,)),
-    Topic('scan', LaserScan, qos.KEYFRAMES, FLOOR),
-    Topic('labelled_points', PointCloud2, qos.KEYFRAMES, CLOUD, (GRID,)),
-    Topic('floor_points', PointCloud2, qos.KEYFRAMES, CLOUD),
-    Topic('obstacle_points', PointCloud2, qos.KEYFRAMES, CLOUD),
-    Topic(KEYFRAME_DONE, Header, qos.KEYFRAMES, GRID, also_by=(FLOOR, CLOUD)),
-    Topic('map', OccupancyGrid, qos.LATCHED, GRID),
+    Topic('moving_points', PointCloud2, KEYFRAMES, SLAM),
+    Topic(MOVING_MASK, Image, KEYFRAMES, SLAM, (FLOOR,), is_optional=True),
+    Topic(FRAME_DONE, Header, KEYFRAMES, SLAM),
+    Topic('camera_mount', TransformStamped, LATCHED, SLAM, (FLOOR,)),
+    Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID)),
+    Topic(MAP_START, TimeReference, KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID), is_optional=True),
+    Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, (CLOUD, GRID), is_optional=True),
+    Topic(MAP_WANTED, Header, KEYFRAMES, SLAM, (CLOUD, GRID), is_optional=True),
+    Topic(MAP_PART, UInt8MultiArray, KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)),
+    *_rectified_pair(KEYFRAME_PARTS, KEYFRAMES, subscribers=(FLOOR,)),
+    *_rectified_pair(FRAME_PARTS, FRAMES, is_optional=True, on_demand_by=(FLOOR,)),
+    Topic('keyframe/features', PointCloud2, KEYFRAMES, SLAM, (CLOUD, GRID)),
+    Topic('keyframe/path', Path, KEYFRAMES, SLAM, (GRID,)),
+    Topic('map_points', PointCloud2, KEYFRAMES, SLAM, (CLOUD,)),
+    Topic('keyframe/disparity', DisparityImage, KEYFRAMES, FLOOR),
+    Topic('keyframe/floor_mask', Image, KEYFRAMES, FLOOR, (CLOUD,)),
+    Topic('keyframe/floor_overlay', Image, KEYFRAMES, FLOOR),
+    Topic('keyframe/v_disparity', Image, KEYFRAMES, FLOOR),
+    Topic('keyframe/floor_scan', LaserScan, KEYFRAMES, FLOOR, (GRID,)),
+    Topic('scan', LaserScan, KEYFRAMES, FLOOR),
+    Topic('labelled_points', PointCloud2, KEYFRAMES, CLOUD, (GRID,)),
+    Topic('floor_points', PointCloud2, KEYFRAMES, CLOUD),
+    Topic('obstacle_points', PointCloud2, KEYFRAMES, CLOUD),
+    Topic(KEYFRAME_DONE, Header, KEYFRAMES, GRID, also_by=(FLOOR, CLOUD)),
+    Topic('map', OccupancyGrid, LATCHED, GRID),
 ]
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ALL}
 """All topics by name, in the order of the data flow."""
 
-DIAGNOSTICS = Topic('/diagnostics', DiagnosticArray, qos.DIAGNOSTICS, OTHERS)
+DIAGNOSTICS = Topic('/diagnostics', DiagnosticArray, KEYFRAMES, OTHERS)
 """Published by every node."""
 
 
@@ -164,3 +203,25 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
     if not alternatives:
         return [topic for topic in mine if not topic.instead_of]
     return [t for t in TOPICS.values() if t in mine or node in t.on_demand_by]
+
+
+def to_time(stamp_ns: int) -> Time:
+    """Return the ROS time of a stamp in ns."""
+    sec, nanosec = divmod(int(stamp_ns), NS_PER_S)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def to_ns(time: Time) -> int:
+    """Return a ROS time in ns."""
+    return int(time.sec) * NS_PER_S + int(time.nanosec)
+
+
+def make_header(stamp_ns: int, frame_id: str) -> Header:
+    """Return a header with a stamp in ns and a frame."""
+    return Header(stamp=to_time(stamp_ns), frame_id=frame_id)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message or of a header in ns; 0 for what carries none."""
+    header = message if isinstance(message, Header) else getattr(message, 'header', None)
+    return 0 if header is None else to_ns(header.stamp)

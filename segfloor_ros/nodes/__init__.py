@@ -1,10 +1,10 @@
 """The five ROS 2 nodes: parameters and topics around the stages, nothing else.
 
 In: messages, joined by the stamp of their keyframe. Out: the topics of `messages.topics`.
-The way in is one module per node; `shared` is what they have in common, `slam` the parts of
+The way in is one module per node; `shared` is what they have in common, `slam_*` the parts of
 `stereo_slam`.
 """
 
-from segfloor_ros.threads import limit_blas_threads
+from segfloor_ros.processes import limit_blas_threads
 
 limit_blas_threads()

@@ -13,14 +13,13 @@ from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.configuration import ROBOT_PARAMETERS
+from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.messages import clouds
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages import maps as clouds
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.node_settings import CloudLabellingNodeSettings
-from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin, MapPart
+from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 from segfloor_ros.settings import RobotSettings

@@ -12,16 +12,21 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.camera.ros_messages import eye_calibration
+from segfloor_ros.configuration import FloorSegmentationNodeSettings
 from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.messages.floor import disparity_message, free_scan_message, scan_message
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.images import grey8_image, image_message, right_image
+from segfloor_ros.messages.images import (
+    disparity_message,
+    free_scan_message,
+    grey8_image,
+    image_message,
+    right_image,
+    scan_message,
+)
 from segfloor_ros.messages.poses import pose_array, transform_array
-from segfloor_ros.messages.topics import FRAME_PARTS, KEYFRAME_PARTS, MOVING_MASK
-from segfloor_ros.node_settings import FloorSegmentationNodeSettings
-from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin
+from segfloor_ros.messages.topics import FRAME_PARTS, KEYFRAME_PARTS, MOVING_MASK, to_ns
+from segfloor_ros.nodes.shared.maps import KeyframeJoin
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 from segfloor_ros.nodes.shared.when_idle import WhenIdle

@@ -9,16 +9,15 @@ from typing import Any
 
 from rclpy.timer import Timer
 
+from segfloor_ros.configuration import OccupancyGridNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.messages.clouds import features_arrays, labelled_arrays
-from segfloor_ros.messages.floor import scan_arrays
-from segfloor_ros.messages.map_files import grid_message
+from segfloor_ros.messages.images import scan_arrays
+from segfloor_ros.messages.maps import features_arrays, grid_message, labelled_arrays
 from segfloor_ros.messages.poses import path_arrays
-from segfloor_ros.node_settings import OccupancyGridNodeSettings
-from segfloor_ros.nodes.shared.keyframe_join import KeyframeJoin, MapPart
+from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 

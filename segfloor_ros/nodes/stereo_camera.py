@@ -20,17 +20,15 @@ from segfloor_ros.camera.settings import SENSORS
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
+from segfloor_ros.configuration import StereoCameraNodeSettings
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import MAX_LAG_S, Measurement, MeasurementLog, WheelPose
-from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import RECORDING, Level
-from segfloor_ros.messages.headers import stamp_of, to_time
 from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
-from segfloor_ros.messages.topics import PACED_BY, TOPICS
-from segfloor_ros.node_settings import StereoCameraNodeSettings
+from segfloor_ros.messages.topics import FRAMES, PACED_BY, TOPICS, stamp_of, to_time
 from segfloor_ros.nodes.shared.reporter import SETTLED_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
@@ -86,7 +84,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         }
         self._clock_output: Publisher | None = None
         if own.publish_clock:
-            clock = self._clock_output = self.create_publisher(Clock, '/clock', qos.CLOCK)
+            clock = self._clock_output = self.create_publisher(Clock, '/clock', FRAMES)
             self.at_clean_up(lambda: self.destroy_publisher(clock))
         if own.lossless or not own.rate:
             self._follow_chain()

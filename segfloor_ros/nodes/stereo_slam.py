@@ -8,21 +8,21 @@ import time
 from collections import deque
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
+from segfloor_ros.geometry import MAX_DISORDER_NS
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
-from segfloor_ros.messages.headers import make_header
-from segfloor_ros.messages.join import MAX_DISORDER_NS
-from segfloor_ros.messages.topics import FRAME_DONE
-from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.messages.topics import FRAME_DONE, make_header
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.shared.when_idle import WhenIdle
-from segfloor_ros.nodes.slam.sensor_input import InitialPose, MaskInput, SensorInput
-from segfloor_ros.nodes.slam.slam_maps import SlamMaps
-from segfloor_ros.nodes.slam.slam_outputs import CameraFrames, LostTime, SlamOutputs
-from segfloor_ros.nodes.slam.stereo_input import Pair, PairQueue, StereoInput
+from segfloor_ros.nodes.slam_camera import Pair, PairQueue, StereoInput
+from segfloor_ros.nodes.slam_maps import SlamMaps
+from segfloor_ros.nodes.slam_outputs import CameraFrames, LostTime, SlamOutputs
+from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.saved_slam import (
@@ -33,7 +33,6 @@ from segfloor_ros.slam.saved_slam import (
     saved_camera,
 )
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.stages import make_slam
 
 LOOK_AGAIN_S = 0.2
 REMARK_AGAIN_S = 600.0

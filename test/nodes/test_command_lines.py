@@ -13,8 +13,7 @@ from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.configuration import STAGE_SETTINGS
-from segfloor_ros.messages import qos
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.topics import FRAMES, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 
@@ -62,7 +61,7 @@ def test_a_recording_is_the_clock_of_the_others_where_it_is_asked_to(make_graph,
     graph = make_graph('-p', f'input:={drive}', '-p', 'rate:=50.0', '-p', 'publish_clock:=true')
     times: list[int] = []
     graph.tester.create_subscription(
-        Clock, '/clock', lambda message: times.append(to_ns(message.clock)), qos.CLOCK
+        Clock, '/clock', lambda message: times.append(to_ns(message.clock)), FRAMES
     )
     for side in ('left', 'right'):
         for name in ('image_raw', 'camera_info'):

@@ -18,11 +18,10 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.floor.plane.mount import MountCheck
-from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.poses import odometry_message, transform_message
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -63,7 +62,7 @@ def says(graph, node: str, *words: str, meanwhile: Callable[[], None] = lambda: 
 class Driver:
     """A camera's driver that does something wrong."""
 
-    def __init__(self, graph, image: str = 'image_raw', profile: QoSProfile = qos.IMAGES) -> None:
+    def __init__(self, graph, image: str = 'image_raw', profile: QoSProfile = IMAGES) -> None:
         self._graph = graph
         self._image = image
         node = graph.tester
@@ -86,7 +85,7 @@ class Driver:
 
 def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph, frames) -> None:
     graph = make_graph(*GIVEN, '-p', 'image_reliability:=reliable')
-    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    driver = Driver(graph, profile=best_effort(IMAGES))
     graph.add(StereoSlamNode())
     words = ('/left/image_raw', '/tester', 'best effort', 'stereo_slam.image_reliability')
     status = says(graph, 'stereo_slam', *words)
@@ -95,7 +94,7 @@ def test_images_offered_best_effort_are_named_and_taken_by_parameter(make_graph,
     del driver
     graph.close()
     graph = make_graph(*GIVEN, '-p', 'image_reliability:=best_effort')
-    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    driver = Driver(graph, profile=best_effort(IMAGES))
     graph.add(StereoSlamNode())
     driver.connect()
     for side in ('left', 'right'):
@@ -109,10 +108,10 @@ def test_images_offered_best_effort_are_taken_as_that_by_themselves(
     make_graph, frames, comes_first
 ) -> None:
     graph = make_graph(*GIVEN)
-    driver = Driver(graph, profile=qos.IMAGES_BEST_EFFORT) if comes_first == 'driver' else None
+    driver = Driver(graph, profile=best_effort(IMAGES)) if comes_first == 'driver' else None
     node = graph.add(StereoSlamNode())
     says(graph, 'stereo_slam', '')
-    driver = driver or Driver(graph, profile=qos.IMAGES_BEST_EFFORT)
+    driver = driver or Driver(graph, profile=best_effort(IMAGES))
     driver.connect()
     (info,) = node.get_subscriptions_info_by_topic('/left/image_raw')
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'

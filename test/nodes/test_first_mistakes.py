@@ -15,19 +15,16 @@ from sensor_msgs.msg import CompressedImage, Image
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import HEALTH, Level
-from segfloor_ros.messages.headers import to_time
 from segfloor_ros.messages.images import (
     camera_info_message,
     compressed_message,
     image_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.topics import SLAM, TOPICS
+from segfloor_ros.messages.topics import FRAMES, IMAGES, SLAM, TOPICS, to_time
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.shared.connections import likeness
-from segfloor_ros.nodes.shared.reporter import SETTLED_S
+from segfloor_ros.nodes.shared.reporter import SETTLED_S, likeness
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 GIVEN = (
@@ -164,7 +161,7 @@ def test_one_camera_alone_is_declined_in_one_line_that_says_why(make_graph, cons
     graph = make_graph(*GIVEN)
     graph.add(StereoSlamNode())
     with another_participant() as driver:
-        left = driver.create_publisher(Image, '/left/image_raw', qos.IMAGES)
+        left = driver.create_publisher(Image, '/left/image_raw', IMAGES)
         graph.until(lambda: left.get_subscription_count() == 1, 'the left images are received')
         for frame in frames:
             left.publish(image_message(frame.stamp_ns, 'left', frame.left))
@@ -207,7 +204,7 @@ def test_after_a_bag_has_ended_nobody_asks_for_the_camera(make_graph, console) -
     (frame, *_), _ = room_drive(1)
     graph = make_graph(*GIVEN, '-p', 'use_sim_time:=true')
     node = graph.add(StereoSlamNode())
-    clock = graph.tester.create_publisher(Clock, '/clock', qos.CLOCK)
+    clock = graph.tester.create_publisher(Clock, '/clock', FRAMES)
     names = [
         f'{side}/{what}' for side in ('left', 'right') for what in ('image_raw', 'camera_info')
     ]

@@ -9,15 +9,15 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.floor.pictures import mask_overlay
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.messages.floor import scan_arrays
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import (
     camera_info_message,
     grey8_image,
     image_message,
     rectified_calibration,
+    scan_arrays,
 )
 from segfloor_ros.messages.poses import transform_message
+from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 
 CALIBRATION = rectified_calibration(CAMERA)

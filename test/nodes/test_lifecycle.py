@@ -21,9 +21,8 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.cloud.settings import CloudLabellingSettings
-from segfloor_ros.messages.clouds import labelled_arrays
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import NODES, published_by, subscribed_by
+from segfloor_ros.messages.maps import labelled_arrays
+from segfloor_ros.messages.topics import NODES, published_by, subscribed_by, to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode

@@ -11,9 +11,9 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.messages import qos
 from segfloor_ros.messages.diagnostics import HEALTH, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
+from segfloor_ros.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -53,13 +53,13 @@ def test_a_queue_that_runs_over_is_named_with_its_topic_and_the_node_goes_on(mak
     graph.add(CloudLabellingNode())
     publishers = publish(graph, cloud_messages(1))
     graph.until(lambda: labelled, 'the first keyframe')
-    last = qos.KEYFRAME_DEPTH + 10
+    last = KEYFRAMES.depth + 10
     # Nobody takes a message meanwhile: the graph is not spun.
     for stamp_ns in range(2, last + 1):
         for name, message in cloud_messages(stamp_ns).items():
             publishers[name].publish(message)
     time.sleep(2.5)
-    graph.until(lambda: len(labelled) > qos.KEYFRAME_DEPTH, 'the keyframes of the queue')
+    graph.until(lambda: len(labelled) > KEYFRAMES.depth, 'the keyframes of the queue')
     lost = last - len(labelled)
     assert lost == 9
 

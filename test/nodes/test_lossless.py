@@ -6,8 +6,7 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.messages.diagnostics import HEALTH
-from segfloor_ros.messages.headers import make_header, to_ns
-from segfloor_ros.messages.topics import FRAME_DONE, TOPICS
+from segfloor_ros.messages.topics import FRAME_DONE, TOPICS, make_header, to_ns
 from segfloor_ros.nodes import stereo_camera as pacing
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 

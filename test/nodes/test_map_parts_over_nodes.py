@@ -6,7 +6,7 @@ import pytest
 from stereo_drive import write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 

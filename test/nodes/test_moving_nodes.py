@@ -9,17 +9,17 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.floor.observation import FLOOR
-from segfloor_ros.messages.clouds import FEATURE_DTYPE, MOVING_DTYPE, cloud_array
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import (
     camera_info_message,
     grey8_image,
     image_message,
     rectified_calibration,
 )
+from segfloor_ros.messages.maps import FEATURE_DTYPE, MOVING_DTYPE, cloud_array
 from segfloor_ros.messages.poses import transform_message
+from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.slam.sensor_input import MaskInput
+from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 from segfloor_ros.slam.tracking.images import is_inside
 

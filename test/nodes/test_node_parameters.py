@@ -7,13 +7,12 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter
 
-from segfloor_ros.configuration import STAGE_SETTINGS
+from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS, CloudLabellingNodeSettings
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.node_settings import NODE_SETTINGS, CloudLabellingNodeSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.shared.parameters import command_line_parameters
+from segfloor_ros.nodes.shared.running import command_line_parameters
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 PARAMS = Path(__file__).resolve().parents[2] / 'params'

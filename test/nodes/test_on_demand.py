@@ -8,7 +8,7 @@ from node_messages import STAMP_NS, grid_messages, publish
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.shared import connections
+from segfloor_ros.nodes.shared import reporter as connections
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 

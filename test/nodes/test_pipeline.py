@@ -15,8 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.messages.headers import to_ns
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, published_by
+from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
 
 FRAMES = 14
 

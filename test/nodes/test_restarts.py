@@ -19,12 +19,11 @@ from segfloor_ros.cloud.labels import UNKNOWN, LabelledPoints
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.map_file import MapFile
-from segfloor_ros.messages.clouds import labelled_arrays
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.messages.maps import labelled_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array
-from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM
-from segfloor_ros.nodes.shared.kept_state import KeptState
+from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
+from segfloor_ros.nodes.shared.maps import KeptState
 from segfloor_ros.slam.places.known_views import NEW_TURN_RAD
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
@@ -294,7 +293,7 @@ def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
 @pytest.mark.parametrize('mode', [0o777, 0o750, 0o705])
 def test_a_folder_that_is_not_private_is_not_touched(monkeypatch, tmp_path, mode) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
-    monkeypatch.setattr('segfloor_ros.nodes.shared.kept_state.IN_MEMORY', tmp_path)
+    monkeypatch.setattr('segfloor_ros.nodes.shared.maps.IN_MEMORY', tmp_path)
     kept = KeptState('/robot/open', 30.0)
     keep(kept)
     before = kept._file.read_bytes()
@@ -309,7 +308,7 @@ def test_a_folder_that_is_not_private_is_not_touched(monkeypatch, tmp_path, mode
 
 def test_a_link_in_place_of_the_folder_is_not_followed(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
-    monkeypatch.setattr('segfloor_ros.nodes.shared.kept_state.IN_MEMORY', tmp_path)
+    monkeypatch.setattr('segfloor_ros.nodes.shared.maps.IN_MEMORY', tmp_path)
     kept = KeptState('/robot/linked', 30.0)
     (theirs := tmp_path / 'theirs').mkdir(mode=0o700)
     (theirs / kept._file.name).write_text('mine')

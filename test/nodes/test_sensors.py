@@ -16,12 +16,12 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.ros_messages import imu_sample, wheel_pose
 from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample, WheelPose
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image, right_image
 from segfloor_ros.messages.poses import imu_message, pose_array, wheel_message
+from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.slam.sensor_input import MAX_LATE_S, SensorInput
-from segfloor_ros.nodes.slam.stereo_input import DISCOVERY_S
+from segfloor_ros.nodes.slam_camera import DISCOVERY_S
+from segfloor_ros.nodes.slam_sensors import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
@@ -94,7 +94,7 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
 ) -> None:
     folder, poses = drive
     (folder / 'wheel_odometry.txt').unlink()
-    monkeypatch.setattr('segfloor_ros.nodes.slam.sensor_input.TF_AFTER_S', 0.0)
+    monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.TF_AFTER_S', 0.0)
     arguments = [
         *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
         *('-p', 'publish_odom_tf:=false', '-p', f'camera_height_m:={MOUNT.height_m}'),
@@ -187,7 +187,7 @@ def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> No
 
 def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monkeypatch) -> None:
     now_s = [100.0]
-    monkeypatch.setattr('segfloor_ros.nodes.slam.sensor_input.time.monotonic', lambda: now_s[0])
+    monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.time.monotonic', lambda: now_s[0])
     assert not sensors.is_behind(50 * MS)  # nothing was ever heard
     sensors._receive('imu', imu(40 * MS, ''))
     assert sensors.is_behind(60 * MS)

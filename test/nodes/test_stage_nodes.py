@@ -35,12 +35,7 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.grid.settings import OccupancyGridSettings
-from segfloor_ros.messages.clouds import (
-    labelled_arrays,
-    sparse_cloud_arrays,
-)
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import (
     camera_info_message,
     compressed_message,
@@ -48,12 +43,17 @@ from segfloor_ros.messages.images import (
     image_message,
     rectified_calibration,
 )
+from segfloor_ros.messages.maps import (
+    labelled_arrays,
+    sparse_cloud_arrays,
+)
 from segfloor_ros.messages.poses import (
     path_arrays,
     pose_array,
     transform_array,
     transform_message,
 )
+from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode

@@ -11,12 +11,9 @@ from stereo_drive import room_drive
 from stereo_room import MOUNT
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.frames import FrameTree
-from segfloor_ros.geometry import invert, make_transform
-from segfloor_ros.messages import qos
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.geometry import FrameTree, invert, make_transform
 from segfloor_ros.messages.poses import pose_array, transform_array, transform_message
-from segfloor_ros.messages.topics import SLAM
+from segfloor_ros.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, SLAM, to_ns
 
 tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs could not be built by make')
 
@@ -41,8 +38,8 @@ class Listener:
         self.moving: list[Any] = []
         self.fixed: list[Any] = []
         node, kind = graph.tester, tf2_msgs.TFMessage
-        node.create_subscription(kind, '/tf', self._take_moving, qos.TF)
-        node.create_subscription(kind, '/tf_static', self._take_fixed, qos.TF_STATIC_LISTENER)
+        node.create_subscription(kind, '/tf', self._take_moving, KEYFRAMES)
+        node.create_subscription(kind, '/tf_static', self._take_fixed, LATCHED_BY_MANY)
 
     def stamps(self, child: str) -> list[int]:
         return [to_ns(m.header.stamp) for m in self.moving if m.child_frame_id == child]
@@ -65,8 +62,8 @@ class Broadcaster:
 
     def __init__(self, graph) -> None:
         self._kind = tf2_msgs.TFMessage
-        self.moving = graph.tester.create_publisher(self._kind, '/tf', qos.TF)
-        self.fixed = graph.tester.create_publisher(self._kind, '/tf_static', qos.TF_STATIC)
+        self.moving = graph.tester.create_publisher(self._kind, '/tf', KEYFRAMES)
+        self.fixed = graph.tester.create_publisher(self._kind, '/tf_static', LATCHED)
 
     def send_fixed(self, *links) -> None:
         """links: parent, child, T_parent_child."""

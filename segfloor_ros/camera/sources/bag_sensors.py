@@ -15,8 +15,7 @@ from segfloor_ros.camera import ros_messages
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import BagFile, check_given, open_bag_file
 from segfloor_ros.camera.sources.sensor_files import IMU, WHEEL_ODOMETRY, check_gravity, is_upright
-from segfloor_ros.frames import FrameTree
-from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.geometry import Array, FrameTree, make_transform
 from segfloor_ros.measurements import Measurement, RecordedSensor, WheelPose
 
 ODOMETRY_TYPE, IMU_TYPE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu'

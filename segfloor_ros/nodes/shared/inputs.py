@@ -14,9 +14,8 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from segfloor_ros.messages.headers import stamp_of, to_ns
 from segfloor_ros.messages.join import StampJoiner
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.messages.topics import TOPICS, stamp_of, to_ns
 from segfloor_ros.nodes.shared.reporter import Reporter
 
 LEAST_PERIOD_S = 0.001

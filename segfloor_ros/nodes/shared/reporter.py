@@ -1,21 +1,38 @@
-"""What a node tells about itself: a status per stamp, its health once a second, and the log."""
+"""What a node reports: a status per stamp, its health once a second, who listens to it and who it
+listens to, topics that do not connect, or look like one that nobody publishes; and the log.
+"""
 
 from __future__ import annotations
 
+import difflib
+import math
 import time
 import traceback
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.diagnostics import HEALTH, Health, Level, Status, status_message
+from segfloor_ros.messages.diagnostics import (
+    CONNECTIONS,
+    HEALTH,
+    NEED_LASTS_S,
+    Health,
+    Level,
+    Status,
+    status_message,
+)
 from segfloor_ros.messages.join import StampJoiner
-from segfloor_ros.messages.topics import DIAGNOSTICS, Topic
+from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic, describe_policies
 from segfloor_ros.timing import rss_mb
+
+if TYPE_CHECKING:
+    from segfloor_ros.nodes.shared.inputs import Inputs
 
 LOSS_LASTS_S = 10.0
 
@@ -26,6 +43,21 @@ REPEAT_S = 5.0
 SETTLED_S = 10.0
 """Nodes that are started together are seen one after the other: what is missing is not logged
 before."""
+
+MOST = 3
+
+SIDES = {
+    'left': ('left', 'infra1', 'ir_left', 'cam0'),
+    'right': ('right', 'infra2', 'ir_right', 'cam1'),
+}
+"""How drivers call the two sides."""
+
+FALLS_BEHIND_S = 2.0
+
+KILLED_SEEN_S = 20.0
+"""How long Fast DDS shows a process that was killed."""
+
+REPEAT_TWIN_S = 30.0
 
 
 class LossCounter:
@@ -210,3 +242,196 @@ def one_line(error: Exception) -> str:
     """Return an error in one line; unexpected ones with their type."""
     text = ' '.join(str(error).split())
     return text if isinstance(error, SegfloorError) else f'{type(error).__name__}: {text}'
+
+
+def offered_best_effort(node: Node, topics: Iterable[str]) -> list[str]:
+    """Return the topics that somebody publishes best effort, which reaches no reliable listener."""
+    lossy = ReliabilityPolicy.BEST_EFFORT
+    return [
+        topic
+        for topic in topics
+        if any(
+            info.qos_profile.reliability == lossy
+            for info in node.get_publishers_info_by_topic(topic)
+        )
+    ]
+
+
+def incompatible_topics(
+    node: Node, publishers: Iterable[Publisher], subscriptions: Iterable[Subscription]
+) -> Iterator[tuple[str, str]]:
+    """Yield the topics whose other side cannot connect, each with what to do about it."""
+    name = node.get_name()
+    for subscription in subscriptions:
+        topic, wanted = subscription.topic_name, subscription.qos_profile
+        for other in node.get_publishers_info_by_topic(topic):
+            if not _fits(other.qos_profile, wanted):
+                theirs, ours = describe_policies(other.qos_profile), describe_policies(wanted)
+                text = f'nothing arrives from {_full_name(other)}, which offers {theirs}; {name} '
+                text += f'asks for {ours}; {_remedy(node, other.qos_profile, wanted)}'
+                yield topic, f'{topic}: {text}'
+    for publisher in publishers:
+        topic, offered = publisher.topic_name, publisher.qos_profile
+        for other in node.get_subscriptions_info_by_topic(topic):
+            if not _fits(offered, other.qos_profile):
+                theirs, ours = describe_policies(other.qos_profile), describe_policies(offered)
+                text = f'nothing reaches {_full_name(other)}, which asks for {theirs}; {name} '
+                text += f'offers {ours}; subscribe with what is offered'
+                yield topic, f'{topic}: {text}'
+
+
+def _full_name(other: TopicEndpointInfo) -> str:
+    return f'{other.node_namespace.rstrip("/")}/{other.node_name}'
+
+
+def _fits(offered: QoSProfile, wanted: QoSProfile) -> bool:
+    """Whether a subscription asks for no more than is offered. Of deadlines and the like nothing is
+    asked here, and what discovery says of them cannot be compared.
+    """
+    lossy = offered.reliability == ReliabilityPolicy.BEST_EFFORT
+    fleeting = offered.durability == DurabilityPolicy.VOLATILE
+    return not (lossy and wanted.reliability == ReliabilityPolicy.RELIABLE) and not (
+        fleeting and wanted.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
+def _remedy(node: Node, offered: QoSProfile, wanted: QoSProfile) -> str:
+    durable = DurabilityPolicy.TRANSIENT_LOCAL
+    if wanted.durability == durable and offered.durability != durable:
+        return 'let it publish transient local'
+    if node.has_parameter('image_reliability'):
+        return f'set {node.get_name()}.image_reliability to best_effort, or let it publish reliable'
+    return 'let it publish reliable'
+
+
+def lookalikes(node: Node, topic: str, kind: str) -> list[str]:
+    """Return the published topics of a type, e.g. `sensor_msgs/msg/Image`, that look most like a
+    full topic name; those of the other side of a stereo pair last.
+    """
+    own = {publisher.topic_name for publisher in node.publishers}
+    found = [
+        name
+        for name, kinds in node.get_topic_names_and_types()
+        if kind in kinds and name not in own and node.count_publishers(name)
+    ]
+    return sorted(found, key=lambda name: -likeness(topic, name))[:MOST]
+
+
+def published_kinds(node: Node, topic: str) -> list[str]:
+    """Return the types that a full topic name is published with."""
+    return sorted({info.topic_type for info in node.get_publishers_info_by_topic(topic)})
+
+
+def likeness(wanted: str, name: str) -> float:
+    """Return how much a topic's name looks like another: by its letters, and by its side."""
+    score = difflib.SequenceMatcher(None, wanted.lower(), name.lower()).ratio()
+    for side, words in SIDES.items():
+        if side in wanted:
+            score += any(word in name.lower() for word in words)
+            others = (word for other, them in SIDES.items() if other != side for word in them)
+            score -= any(word in name.lower() for word in others)
+    return score
+
+
+def in_words(names: Sequence[str]) -> str:
+    """Return names as a list in words."""
+    return ', '.join(names[:-1]) + ' and ' * (len(names) > 1) + names[-1] if names else 'nothing'
+
+
+class Connections:
+    """Counts the subscribers of a node's outputs and finds inputs that do not connect."""
+
+    def __init__(self, node: Node, reporter: Reporter, inputs: Inputs) -> None:
+        self._node = node
+        self._reporter = reporter
+        self._inputs = inputs
+        self._reported: dict[str, str] = {}
+        self._last_needed_s = time.monotonic()
+        self._silent_since_s: dict[str, float] = {}
+        self.outputs: dict[str, Publisher] = {}
+        """The publishers by the topic's name as in the code."""
+
+    def count_listeners(self) -> dict[str, str]:
+        """Return the number of subscribers by topic, with that of the status."""
+        counts = {name: str(out.get_subscription_count()) for name, out in self.outputs.items()}
+        counts[DIAGNOSTICS.name] = str(self._reporter.publisher.get_subscription_count())
+        return counts
+
+    def report(self, counts: Mapping[str, str], always: bool) -> None:
+        """Publish the counts when they have changed, or always."""
+        if always or counts != self._reported:
+            self._reported = dict(counts)
+            stamp_ns = self._node.get_clock().now().nanoseconds
+            self._reporter.publish(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
+
+    def are_needed(self, counts: Mapping[str, str], is_needed_otherwise: bool) -> bool:
+        """Whether somebody listens, or did a short time ago."""
+        now_s = time.monotonic()
+        if is_needed_otherwise or any(int(count) for count in counts.values()):
+            self._last_needed_s = now_s
+        return now_s - self._last_needed_s < NEED_LASTS_S
+
+    def find_problems(self) -> None:
+        """Report topics that do not connect, a node of the same name, and queues that grow."""
+        self._find_incompatible()
+        self._find_silent()
+        self._find_twin()
+        topic, waited_s = self._reporter.health.longest_wait()
+        if waited_s > FALLS_BEHIND_S:
+            text = (
+                f'{self._node.get_name()} falls behind: messages on {topic} wait {waited_s:.1f} s; '
+                'lower the rate or the size of the images, or let stereo_slam make fewer keyframes'
+            )
+            self._reporter.diagnose('queues', text)
+
+    def _find_incompatible(self) -> None:
+        subscriptions = self._inputs.subscriptions.values()
+        found = incompatible_topics(self._node, self.outputs.values(), subscriptions)
+        for topic, text in found:
+            self._reporter.diagnose(f'QoS of {topic}', text, Level.ERROR)
+
+    def _find_silent(self) -> None:
+        """Report inputs that nobody publishes, each with what is published that looks like it."""
+        inputs = self._inputs
+        silent = [
+            name
+            for name in inputs.subscriptions
+            if not TOPICS[name].is_optional and not inputs.publisher_count(name)
+        ]
+        now_s = time.monotonic()
+        self._silent_since_s = {name: self._silent_since_s.get(name, now_s) for name in silent}
+        if not silent:
+            self._reporter.over('publishers')
+            return
+        what = f'nobody publishes {in_words(silent)}'
+        hints = [hint for name in silent if (hint := self._hint(name))]
+        text = '; '.join([what, 'start the node that does, or remap', *hints])
+        self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
+        if now_s - min(self._silent_since_s.values()) >= SETTLED_S:
+            line = f'{what}; /diagnostics says what to do'
+            self._reporter.warn(line, 'publishers', repeat_s=math.inf)
+
+    def _hint(self, name: str) -> str:
+        """Return what is published that looks like a topic, in words; '' where nothing does."""
+        topic, kind = self._node.resolve_topic_name(name), TOPICS[name].type_name
+        others = [k for k in published_kinds(self._node, topic) if k != kind]
+        if others:
+            return f'{topic} is published as {in_words(others)}, not as {kind}'
+        found = lookalikes(self._node, topic, kind)
+        if not found:
+            return f'{topic}: no other topic of the type {kind} is published'
+        return f'{topic}: published with this type are {in_words(found)} (-r {name}:={found[0]})'
+
+    def _find_twin(self) -> None:
+        """Report another node of the same name: both would publish on the same topics."""
+        name, namespace = self._node.get_name(), self._node.get_namespace()
+        same = [
+            one for one in self._node.get_node_names_and_namespaces() if one == (name, namespace)
+        ]
+        if len(same) > 1:
+            text = (
+                f'{len(same)} nodes are called {self._node.get_fully_qualified_name()} and publish '
+                'on the same topics; stop the other one, or give this one a namespace; one that '
+                f'was killed is seen for up to {KILLED_SEEN_S:g} s'
+            )
+            self._reporter.diagnose('twin', text, Level.ERROR, repeat_s=REPEAT_TWIN_S)

@@ -15,16 +15,15 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
+from segfloor_ros.configuration import NodeSettings
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level
 from segfloor_ros.messages.topics import TOPICS
-from segfloor_ros.node_settings import NodeSettings
-from segfloor_ros.nodes.shared.connections import Connections
 from segfloor_ros.nodes.shared.inputs import Inputs
-from segfloor_ros.nodes.shared.kept_state import KeptState
-from segfloor_ros.nodes.shared.parameters import NodeParameters
-from segfloor_ros.nodes.shared.reporter import Reporter
+from segfloor_ros.nodes.shared.maps import KeptState
+from segfloor_ros.nodes.shared.reporter import Connections, Reporter
+from segfloor_ros.nodes.shared.running import NodeParameters
 
 Settings = TypeVar('Settings', bound=NodeSettings)
 

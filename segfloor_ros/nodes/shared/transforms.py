@@ -13,13 +13,11 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 
 from segfloor_ros.camera.model import Mount
+from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
-from segfloor_ros.frames import FrameTree
-from segfloor_ros.geometry import Array, invert
-from segfloor_ros.messages import qos
-from segfloor_ros.messages.headers import to_ns
+from segfloor_ros.geometry import Array, FrameTree, invert
 from segfloor_ros.messages.poses import transform_array, transform_message
-from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, to_ns
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult
 
@@ -70,8 +68,8 @@ class TfLink:
         self._type: Any = TFMessage
         node = self._node
         for topic, sent, heard in (
-            ('/tf', qos.TF, qos.TF),
-            ('/tf_static', qos.TF_STATIC, qos.TF_STATIC_LISTENER),
+            ('/tf', KEYFRAMES, KEYFRAMES),
+            ('/tf_static', LATCHED, LATCHED_BY_MANY),
         ):
             output = self._outputs[topic] = node.create_publisher(TFMessage, topic, sent)
             node.at_clean_up(partial(node.destroy_publisher, output))

@@ -9,8 +9,8 @@ from floor_scenes import SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
+from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.stages import make_slam
 
 
 def estimate(scene: Scene, **known) -> Mount | None:

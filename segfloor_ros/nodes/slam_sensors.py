@@ -20,14 +20,13 @@ from sensor_msgs.msg import Image, Imu
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.ros_messages import imu_sample, measures_motion, wheel_pose, xyz
 from segfloor_ros.camera.sources.sensor_files import is_upright
+from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import Measurement, WheelPose
-from segfloor_ros.messages import qos
-from segfloor_ros.messages.headers import to_ns
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.node_settings import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.connections import offered_best_effort
+from segfloor_ros.messages.topics import SENSORS, best_effort, to_ns
+from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -105,7 +104,7 @@ class SensorInput:
             self._node.inputs.reopen()
 
     def _choose_profile(self) -> QoSProfile:
-        return qos.SENSORS if self._takes_best_effort else qos.SENSORS_RELIABLE
+        return best_effort(SENSORS) if self._takes_best_effort else SENSORS
 
     def take(self, stamp_ns: int, lag_ns: int = 0) -> list[Measurement]:
         """Return what has not been returned yet, up to the first measurement of each sensor at or

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.messages import clouds, poses
+from segfloor_ros.configuration import StereoSlamNodeSettings
+from segfloor_ros.messages import maps as clouds
+from segfloor_ros.messages import poses
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.map_files import map_start_message
+from segfloor_ros.messages.maps import map_start_message
 from segfloor_ros.messages.topics import MAP_START, MOVING_MASK
-from segfloor_ros.node_settings import StereoSlamNodeSettings
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult, Keyframe
 

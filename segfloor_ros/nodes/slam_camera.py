@@ -1,12 +1,16 @@
-"""Stereo pairs and their calibration as messages, from whatever a camera's driver publishes."""
+"""What the node `stereo_slam` takes of a camera: stereo pairs and their calibration, from whatever
+its driver publishes, and what is wrong with either, in words.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -18,14 +22,16 @@ from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCal
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.images import EightBitScale, depth_image, grey_image
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.camera.rig_check import InputFault
 from segfloor_ros.camera.ros_messages import eye_calibration
+from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
-from segfloor_ros.messages import qos
+from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.images import same_calibration
-from segfloor_ros.node_settings import StereoSlamNodeSettings
-from segfloor_ros.nodes.shared.connections import offered_best_effort
+from segfloor_ros.messages.topics import IMAGES, NS_PER_S, best_effort
+from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
-from segfloor_ros.nodes.slam.camera_watch import CameraWatch
 
 MAX_KEPT = 100
 """Pairs that are kept while calibration or mount are not known."""
@@ -47,6 +53,13 @@ Pair = dict[str, Any]
 """A left and a right message of the same time, by topic."""
 
 StampedPair = tuple[int, Pair]
+
+RECENT = 10
+SILENT_S = 3.0
+LIVE_NS = 60 * NS_PER_S
+FAULT_LASTS_S = 30.0
+PLAUSIBLE_ROLL_DEG = 20.0
+PLAUSIBLE_PITCH_DEG = 60.0
 
 
 class PairQueue(deque[StampedPair]):
@@ -252,7 +265,7 @@ class StereoInput:
             self._node.inputs.reopen()
 
     def _choose_profile(self) -> QoSProfile:
-        return qos.IMAGES_BEST_EFFORT if self._takes_best_effort else qos.IMAGES
+        return best_effort(IMAGES) if self._takes_best_effort else IMAGES
 
     def _raw_calibration(self) -> StereoCalibration:
         if self._kind.is_depth:
@@ -272,3 +285,117 @@ class StereoInput:
                 f'{topic}: the calibration is not the one in use; ~/reset takes it over'
             )
         self._on_calibration()
+
+
+class CameraWatch:
+    """Notices unsynchronised and missing images, missing calibrations, and an implausible
+    floor, and says what is wrong in the images.
+    """
+
+    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+        self._node = node
+        self._own = own
+
+    def expect(self, left: str, right: str) -> None:
+        """Watch these two topics from now on."""
+        self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
+        self._last_image_s: dict[str, float] = {}
+        self._is_live = False
+
+    def saw_image(self, topic: str, stamp_ns: int) -> None:
+        """Note an image."""
+        self._stamps[topic].append(stamp_ns)
+        now_ns = self._node.get_clock().now().nanoseconds
+        self._last_image_s[topic] = 1e-9 * now_ns
+        self._is_live = abs(now_ns - stamp_ns) < LIVE_NS
+
+    def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
+        """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
+        has begun.
+        """
+        reporter = self._node.reporter
+        reporter.health.count('skipped')
+        if not is_ready:
+            words = 'skipped: calibration or mount of the camera are not known yet'
+            reporter.report(stamp_ns, Level.WARN, words)
+            return
+        reporter.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
+        reporter.diagnose(
+            'skipped',
+            f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
+            'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
+            'play a recording with lossless set on stereo_camera',
+        )
+
+    def find_problems(self, missing_infos: list[str]) -> None:
+        """Diagnose what shows over time. missing_infos: calibrations that images wait for."""
+        for topic in missing_infos:
+            self._node.reporter.diagnose(
+                topic,
+                f'no message on {topic}: images wait for their calibration; let the driver '
+                'publish it, or remap the topic; `segfloor calibrate` makes one',
+                Level.ERROR,
+            )
+        self._find_silence()
+        self._find_mono()
+        self._find_different_stamps()
+
+    def report_faults(self, faults: Iterable[InputFault]) -> None:
+        """Diagnose what was found in the images."""
+        for fault in faults:
+            text = fault.line(' and '.join(self._stamps))
+            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, FAULT_LASTS_S)
+
+    def judge_measured(self, mount: Mount) -> None:
+        """Say so where the mount that was measured from the floor is hard to believe."""
+        pitch, roll = math.degrees(mount.pitch_rad), math.degrees(mount.roll_rad)
+        if abs(roll) > PLAUSIBLE_ROLL_DEG or abs(pitch) > PLAUSIBLE_PITCH_DEG:
+            self._node.reporter.diagnose(
+                'tilt',
+                f'{next(iter(self._stamps))}: the floor seems tilted by {pitch:.1f} deg along and '
+                f'{roll:.1f} deg across the view, which is hardly so; does the camera see the '
+                'floor? else give camera_height_m, camera_pitch_rad and camera_roll_rad',
+                lasts_s=math.inf,
+            )
+
+    def _find_silence(self) -> None:
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
+        for topic, last_s in self._last_image_s.items():
+            # A recording may end or wait for the nodes; a camera may not. The time of one that has
+            # ended stands still.
+            if self._is_live and now_s - last_s > SILENT_S:
+                self._node.reporter.diagnose(
+                    f'silence of {topic}',
+                    f'no image on {topic} for a while; is the camera connected and its driver '
+                    'running?',
+                    Level.ERROR,
+                )
+
+    def _find_mono(self) -> None:
+        """Decline one camera alone."""
+        left, right = self._stamps
+        if len(self._stamps[left]) < RECENT or self._stamps[right]:
+            return
+        if not self._node.get_publishers_info_by_topic(right):
+            self._node.reporter.diagnose(
+                'one camera',
+                f'images come on {left}, but nobody publishes {right}: one camera alone does not '
+                'tell how far away anything is; publish or remap right or depth images',
+                Level.ERROR,
+            )
+
+    def _find_different_stamps(self) -> None:
+        left, right = self._stamps.values()
+        now_s = 1e-9 * self._node.get_clock().now().nanoseconds
+        both_come = all(now_s - last_s < 1.0 for last_s in self._last_image_s.values())
+        if not both_come or len(left) < RECENT or len(right) < RECENT:
+            return
+        gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
+        if gap_ns > 1e9 * self._own.sync_tolerance_s:
+            self._node.reporter.diagnose(
+                'stamps',
+                f'the stamps of {" and ".join(self._stamps)} are {1e-6 * gap_ns:.1f} ms apart, '
+                f'more than sync_tolerance_s = {self._own.sync_tolerance_s:g} s: no pairs; trigger '
+                'both cameras together, or allow more',
+                Level.ERROR,
+            )

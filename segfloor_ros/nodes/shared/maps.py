@@ -1,34 +1,56 @@
-"""The parts of a keyframe, for the nodes behind SLAM.
-
-What a node behind SLAM knows of the map, as a part of a saved map.
+"""The map of a node: its keyframes, joined from their messages; its part of a saved map; and what
+is kept of it where it outlives a crash of the node.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import stat
+import tempfile
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header, UInt8MultiArray
 
-from segfloor_ros.map_file import Arrays, MapFile
-from segfloor_ros.messages.headers import make_header, to_ns
-from segfloor_ros.messages.map_files import (
+from segfloor_ros.errors import InputError
+from segfloor_ros.files.results import replacing
+from segfloor_ros.map_file import Arrays, MapFile, read_map_file, write_to
+from segfloor_ros.messages.maps import (
     is_of_loaded_map,
     map_file_message,
     map_file_of,
     map_start_ns,
 )
-from segfloor_ros.messages.topics import KEYFRAME_DONE, MAP_LOADED, MAP_PART, MAP_START, MAP_WANTED
-from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.messages.topics import (
+    KEYFRAME_DONE,
+    MAP_LOADED,
+    MAP_PART,
+    MAP_START,
+    MAP_WANTED,
+    make_header,
+    to_ns,
+)
+
+if TYPE_CHECKING:
+    from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
 """Gets the stamp and the messages by topic; returns values for the status."""
 
 
 MAX_WAITING = 100
+
+IN_MEMORY = Path('/dev/shm')
+LEAST_SHARE = 20
+"""Times the duration of a save that passes before the next one: keeping costs little time."""
 
 
 class KeyframeJoin:
@@ -177,3 +199,104 @@ class MapPart:
     def _send(self) -> None:
         self._wanted_ns = None
         self._output.publish(map_file_message(self._file()))
+
+
+class KeptState:
+    """A saved map in a folder of this user's own, one per node name and ROS domain; in memory where
+    the system has such a folder, so that no disk is worn.
+
+    A node that ends in order removes it, so that only one that was killed finds it again, and
+    only within `resume_within_s`, so that the next drive does not begin in the map of the last
+    one. With 0 nothing is kept.
+    """
+
+    def __init__(self, node_name: str, resume_within_s: float) -> None:
+        domain = os.environ.get('ROS_DOMAIN_ID') or '0'
+        parent = IN_MEMORY if IN_MEMORY.is_dir() else Path(tempfile.gettempdir())
+        folder = parent / f'segfloor_ros-{os.getuid()}'
+        self._file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
+        self._note = self._file.with_suffix('.json')
+        self._resume_within_s = resume_within_s
+        self._next_save_s = -float('inf')
+        self._writing: threading.Thread | None = None
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a map would be kept now."""
+        return (
+            self._resume_within_s > 0
+            and time.monotonic() >= self._next_save_s
+            and not (self._writing is not None and self._writing.is_alive())
+        )
+
+    def note(self, values: Mapping[str, Any]) -> None:
+        """Keep values of JSON beside the map, now: the last frame before a crash counts."""
+        if self._resume_within_s <= 0:
+            return
+        with contextlib.suppress(OSError):
+            self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            self._check_private()
+            written = self._note.with_suffix('.note')
+            written.write_text(json.dumps(values))
+            written.replace(self._note)
+
+    def save(self, make: Callable[[], MapFile]) -> None:
+        """Keep what `make` returns in place of the last map, unless that was kept only just now; it
+        is written beside the work of the node. A full disk is no reason to stop: the older map
+        stays.
+        """
+        if self.is_due:
+            start_s = time.monotonic()
+            self._writing = threading.Thread(target=self._write, args=(make(), start_s))
+            self._writing.start()
+
+    def _write(self, saved: MapFile, start_s: float) -> None:
+        with contextlib.suppress(OSError):
+            self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            self._check_private()
+            with replacing(self._file) as file:
+                write_to(file, saved, compress=False)
+        now_s = time.monotonic()
+        self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
+
+    def finish(self) -> None:
+        """Wait until the map is written."""
+        if self._writing is not None:
+            self._writing.join()
+
+    def take(self) -> MapFile | None:
+        """Return the map that a killed node of this name left a short time ago, or None; what it
+        noted last is `note` of the header. It is handed out once: a map that ends its node is not
+        tried again.
+        """
+        try:
+            self._check_private()
+            files = [file for file in (self._file, self._note) if file.is_file()]
+            age_s = time.time() - max((file.lstat().st_mtime for file in files), default=0.0)
+            if age_s > self._resume_within_s:
+                return None
+            saved = read_map_file(self._file)
+            if self._note in files:
+                saved.header['note'] = json.loads(self._note.read_text())
+            return saved
+        except (OSError, ValueError, InputError):
+            return None
+        finally:
+            self.remove()
+
+    def remove(self) -> None:
+        """Leave nothing to be taken up; in a folder that is not private, nothing is touched."""
+        self.finish()
+        with contextlib.suppress(OSError):
+            self._check_private()
+            for file in (self._file, self._note):
+                file.unlink(missing_ok=True)
+
+    def _check_private(self) -> None:
+        """Raise PermissionError unless the folder is this user's own, no link, and nobody else can
+        look into it or change it: then nobody else decides what lies there.
+        """
+        found = self._file.parent.lstat()
+        is_own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+        if not is_own or found.st_mode & 0o077:
+            raise PermissionError(f'{self._file.parent} is not private')

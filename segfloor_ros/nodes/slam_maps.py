@@ -12,12 +12,11 @@ from rclpy.timer import Timer
 from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
-from segfloor_ros.messages.headers import make_header
-from segfloor_ros.messages.map_files import map_file_message, map_file_of
-from segfloor_ros.messages.topics import MAP_LOADED, MAP_PART, MAP_WANTED
-from segfloor_ros.node_settings import StereoSlamNodeSettings
+from segfloor_ros.messages.maps import map_file_message, map_file_of
+from segfloor_ros.messages.topics import MAP_LOADED, MAP_PART, MAP_WANTED, make_header
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
