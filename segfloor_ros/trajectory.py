@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.tables import read_table
+from segfloor_ros.files.whole import read_table
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.slam.results import KeyframePath
 

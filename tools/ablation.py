@@ -29,7 +29,7 @@ from segfloor_ros.cloud.labelled_cloud import CloudLabelling
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.evaluation.map_score import MapScore, score_map
-from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert

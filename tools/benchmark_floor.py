@@ -13,9 +13,9 @@ import cv2
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli import options
+from segfloor_ros.cli import terminal as options
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.output import announcing, console, figure_table
+from segfloor_ros.cli.terminal import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
 from tools.disparity_choices import (
     DisparityScore,

@@ -24,15 +24,21 @@ from segfloor_ros.benchmark.stages import (
     machine,
     run_apart,
 )
-from segfloor_ros.cli import options
-from segfloor_ros.cli.benchmark import stage_table, workload_table, write_json
+from segfloor_ros.cli import terminal as options
+from segfloor_ros.cli.commands import stage_table, workload_table, write_json
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.output import Announce, announcing, console, figure_table
+from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.map_score import MapScore, compare, save_overlay, score_map
-from segfloor_ros.evaluation.raster import RoadMapPlan, RoadMapScore
-from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.evaluation.map_score import (
+    MapScore,
+    RoadMapPlan,
+    RoadMapScore,
+    compare,
+    save_overlay,
+    score_map,
+)
+from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.simulation.drive_files import render_once

@@ -12,9 +12,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli import options
+from segfloor_ros.cli import terminal as options
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.output import Announce, announcing, console, figure_table
+from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.trajectory import read_trajectory

@@ -13,7 +13,7 @@ import numpy as np
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
-from segfloor_ros.cli.output import Announce
+from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.measurements import MeasurementLog, RecordedSensor
 from segfloor_ros.simulation.drive_files import render_once

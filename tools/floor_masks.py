@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.cli.output import Announce
+from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation

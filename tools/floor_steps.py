@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, STEP_M, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.cli.output import Announce
+from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation

@@ -35,7 +35,7 @@ from rich.console import Console
 from rich.table import Table
 
 from segfloor_ros.cli.main import main as segfloor
-from segfloor_ros.files.silence import own_standard_error
+from segfloor_ros.files.images import own_standard_error
 from tools.fuzz_damages import DAMAGES
 from tools.fuzz_inputs import KINDS, files_of, words_of
 

@@ -19,8 +19,8 @@ import yaml
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.drive import Drive, plan_drive
-from segfloor_ros.simulation.movers import place
 from segfloor_ros.simulation.scene import Person, Route
+from segfloor_ros.simulation.solids import place
 
 NEAREST_M = 0.8
 """Distance from the robot that people keep."""

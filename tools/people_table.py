@@ -24,28 +24,31 @@ import typer
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.map_score import DEFAULT_RANGE_M, compare, score_map
-from segfloor_ros.evaluation.raster import (
-    FREE,
-    OCCUPIED,
-    Mask,
+from segfloor_ros.evaluation.map_score import (
+    DEFAULT_RANGE_M,
     RoadMapPlan,
-    cell_centres,
-    observable,
+    compare,
+    score_map,
     score_road_maps,
+)
+from segfloor_ros.evaluation.maps import (
+    MapTruth,
+    Mask,
+    cell_centres,
+    load_truth,
+    observable,
     states,
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-from segfloor_ros.evaluation.truth import MapTruth, load_truth
-from segfloor_ros.files.tables import read_table
+from segfloor_ros.files.whole import read_table
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.lockstep import LockstepRun
 from segfloor_ros.results_folder import OutputFolder
 from segfloor_ros.simulation.drive_files import render_once
-from segfloor_ros.simulation.movers import place
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.solids import place
 
 SEEN_AGAIN_S = 10.0
 ENOUGH_S = 1.0

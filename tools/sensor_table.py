@@ -18,10 +18,10 @@ import typer
 from numpy.typing import NDArray
 
 from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.output import announcing, console, figure_table
+from segfloor_ros.cli.terminal import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.map_score import score_map
-from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.pipeline import Pipeline, make_slam
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene

@@ -23,13 +23,12 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labels import LabelledPoints
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.map_score import compare, score_cells
-from segfloor_ros.evaluation.raster import FREE, cell_centres, from_frame, states
-from segfloor_ros.evaluation.truth import MapTruth, load_truth
+from segfloor_ros.evaluation.maps import MapTruth, cell_centres, from_frame, load_truth, states
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
-from segfloor_ros.grid.map_file import OccupancyGrid
+from segfloor_ros.grid.map_file import FREE, OccupancyGrid
 from segfloor_ros.grid.mapper import EvidenceHistory
 from segfloor_ros.grid.rendering import render
 from segfloor_ros.simulation.scene_file import open_scene

@@ -14,19 +14,27 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.cli.options import within
-from segfloor_ros.cli.output import console, figure_table, print_error
+from segfloor_ros.cli.terminal import console, figure_table, print_error, within
 from segfloor_ros.errors import InputError, SettingsError, os_errors
-from segfloor_ros.evaluation.truth import Pose2d
+from segfloor_ros.evaluation.maps import Pose2d
 from segfloor_ros.files.results import add_files, check_target, check_writable
 from segfloor_ros.files.whole import read_json, read_text
 from segfloor_ros.results_folder import OUTPUT_NAMES
-from segfloor_ros.suite import verdicts
 from segfloor_ros.suite.description import Suite, read_suite
-from segfloor_ros.suite.job import LOG, SAVED_MAP, Job, Outcome, package_digest
-from segfloor_ros.suite.measures import known_measures, number
+from segfloor_ros.suite.job import LOG, SAVED_MAP, Job, Outcome, outcomes, package_digest
+from segfloor_ros.suite.measures import (
+    Baseline,
+    Checked,
+    SuiteResult,
+    bounds_of_baseline,
+    check,
+    is_baseline,
+    known_measures,
+    number,
+    read_baseline,
+    write_baseline,
+)
 from segfloor_ros.suite.result_files import MEASURED, pack, unpack
-from segfloor_ros.suite.workers import outcomes
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent', 'time_ratio')
 JUNIT, PAGE, FAILED = 'junit.xml', 'suite.html', 'failed.txt'
@@ -72,24 +80,25 @@ def check_suite(
 ) -> None:
     """Map recordings and hold the results against bounds. Status 1: a bound failed."""
     described = read_suite(suite)
-    known = verdicts.read_baseline(baseline) if baseline is not None else None
+    known = read_baseline(baseline) if baseline is not None else None
     _check_out(out, described)
     if baseline_to_write is not None:
-        check_writable(baseline_to_write, '--write-baseline', verdicts.is_baseline)
+        check_writable(baseline_to_write, '--write-baseline', is_baseline)
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
-    found: dict[str, verdicts.Checked] = {}
+    found: dict[str, Checked] = {}
     with contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results:
         for job, outcome in results:
-            checked = verdicts.check(job.entry, outcome, known)
+            bounds = list(job.entry.bounds)
+            if known is not None:
+                bounds += bounds_of_baseline(known.get(outcome.name, {}), job.entry.slacks)
+            checked = check(outcome, bounds)
             found[checked.name] = checked
             _print_progress(checked, len(found), len(todo))
-    result = verdicts.SuiteResult(
-        described.name, [found[entry.name] for entry in described.entries]
-    )
+    result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
     _finish(result, out, described, known)
     if baseline_to_write is not None:
-        verdicts.write_baseline(result, baseline_to_write)
+        write_baseline(result, baseline_to_write)
         console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)
     if not result.holds:
         raise typer.Exit(1)
@@ -180,9 +189,7 @@ def _pose(values: Any) -> Pose2d | None:
     return x, y, yaw
 
 
-def _finish(
-    result: verdicts.SuiteResult, out: Path, described: Suite, baseline: verdicts.Baseline | None
-) -> None:
+def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:
     """Print the table and what fails, and write the files of the suite."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
     from segfloor_ros.suite.page import junit, page
@@ -200,12 +207,12 @@ def _finish(
     console.print(f'page: {out / PAGE}', highlight=False, soft_wrap=True)
 
 
-def _print_progress(checked: verdicts.Checked, done: int, total: int) -> None:
+def _print_progress(checked: Checked, done: int, total: int) -> None:
     origin = 'kept' if checked.reused else f'{checked.seconds:.0f} s'
     console.print(f'{done}/{total} {checked.name}: {checked.state} ({origin})', highlight=False)
 
 
-def _table(result: verdicts.SuiteResult) -> Table:
+def _table(result: SuiteResult) -> Table:
     table = figure_table('recording', 'result', *HEADINGS)
     for checked in result.recordings:
         state = Text(checked.state, 'green' if checked.holds else 'red')

@@ -11,21 +11,27 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli.options import within
-from segfloor_ros.cli.output import console, figure_table, value_table
+from segfloor_ros.cli.terminal import console, figure_table, value_table, within
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.evaluation.alignment import find_alignment
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import (
     DEFAULT_RANGE_M,
     MapScore,
+    RoadMapPlan,
+    Spread,
     compare,
     save_overlay,
     score_map,
 )
-from segfloor_ros.evaluation.raster import RoadMapPlan, Spread, from_frame
-from segfloor_ros.evaluation.truth import MapTruth, Pose2d, load_truth, read_base_poses
-from segfloor_ros.files.tables import number, read_table
+from segfloor_ros.evaluation.maps import (
+    MapTruth,
+    Pose2d,
+    find_alignment,
+    from_frame,
+    load_truth,
+    read_base_poses,
+)
+from segfloor_ros.files.whole import number, read_table
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
 

@@ -8,16 +8,13 @@ from collections.abc import Callable
 
 import typer
 
-from segfloor_ros.cli.benchmark import benchmark
 from segfloor_ros.cli.check import check_suite
-from segfloor_ros.cli.demo import demo
+from segfloor_ros.cli.commands import benchmark, calibrate, convert, demo, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
-from segfloor_ros.cli.output import print_error
-from segfloor_ros.cli.recordings import calibrate, convert, simulate
 from segfloor_ros.cli.replay import replay
-from segfloor_ros.cli.run import run
+from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.errors import MapError, SegfloorError
-from segfloor_ros.files.silence import own_standard_error
+from segfloor_ros.files.images import own_standard_error
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.processes import terminated_like_interrupted
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli import options, output
+from segfloor_ros.cli import terminal
 from segfloor_ros.configuration import StereoCameraNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.lockstep import MapOptions, SaveMasks
@@ -18,26 +18,26 @@ from segfloor_ros.results_folder import OutputFolder
 
 
 def replay(
-    input: options.Input,
-    out: options.Out,
+    input: terminal.Input,
+    out: terminal.Out,
     rate: Annotated[
         float,
         typer.Option(
             help='Speed against real time, less where the nodes cannot follow; 0: full speed.'
         ),
     ] = 1.0,
-    params: options.Params = None,
-    assignments: options.Set = None,
-    ignore: options.Ignore = None,
-    depth: options.Depth = False,
+    params: terminal.Params = None,
+    assignments: terminal.Set = None,
+    ignore: terminal.Ignore = None,
+    depth: terminal.Depth = False,
     save_masks: Annotated[
         SaveMasks, typer.Option(help='Floor masks to save: none or keyframes.')
     ] = SaveMasks.keyframes,
-    masks: options.Masks = None,
-    save_map: options.SaveMap = None,
-    load_map: options.LoadMap = None,
-    localize: options.Localize = False,
-    report: options.Report = False,
+    masks: terminal.Masks = None,
+    save_map: terminal.SaveMap = None,
+    load_map: terminal.LoadMap = None,
+    localize: terminal.Localize = False,
+    report: terminal.Report = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
     try:
@@ -53,33 +53,33 @@ def replay(
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
     maps = MapOptions(load_map, save_map, localize)
-    configuration = options.configuration(params, assignments, input, masks, ignore, depth)
+    configuration = terminal.configuration(params, assignments, input, masks, ignore, depth)
     # The camera node reads it; it is opened here so that bad input ends at once.
     source = open_source(configuration.stereo_camera)
     if source.takes_depth:
         camera = dataclasses.replace(configuration.stereo_camera, depth=True)
         configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
-    output.print_sensors(source.sensors)
+    terminal.print_sensors(source.sensors)
     inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
     with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
         keep = partial(folder.add_picture, 'floor_masks')
         on_mask = keep if save_masks is SaveMasks.keyframes else None
-        with output.progress_bar('replaying', source.frame_count) as progress:
+        with terminal.progress_bar('replaying', source.frame_count) as progress:
             session = ReplaySession(
                 configuration, params, rate, on_mask, progress, interrupt, maps, loaded
             )
             try:
                 result, found = session.execute()
             except MapError:
-                output.end_if_interrupted(interrupt)
+                terminal.end_if_interrupted(interrupt)
                 raise
         folder.write(result)
-    output.print_summary(input, result.summary)
-    output.console.print(
+    terminal.print_summary(input, result.summary)
+    terminal.console.print(
         f'nodes connected in {found.discovery_s:.1f} s, stopped in {found.shutdown_s:.1f} s; '
         f'keyframes that failed: {found.failed_keyframes}',
         highlight=False,
     )
     status = interrupt.status or found.status
-    output.finish_run(input, out, folder, report, found.notices, status)
+    terminal.finish_run(input, out, folder, report, found.notices, status)

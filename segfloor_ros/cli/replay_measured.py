@@ -18,10 +18,10 @@ from rclpy.context import Context
 from rich.table import Table
 from std_srvs.srv import SetBool
 
-from segfloor_ros.cli.output import value_table
 from segfloor_ros.cli.replay_nodes import NodeGraph, running_nodes
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
+from segfloor_ros.cli.terminal import value_table
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.diagnostics import HEALTH, HEALTH_PERIOD_S, Level, Status, statuses

@@ -9,7 +9,7 @@ def main() -> None:
     """Run the command line; without its libraries, end with one line and status 2."""
     try:
         from segfloor_ros.cli.main import main as run
-        from segfloor_ros.files.silence import own_standard_error
+        from segfloor_ros.files.images import own_standard_error
     except ModuleNotFoundError as error:
         if (error.name or '').startswith('segfloor_ros'):
             raise

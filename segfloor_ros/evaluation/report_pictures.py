@@ -23,16 +23,15 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labels import FLOOR as FLOOR_POINT
 from segfloor_ros.cloud.labels import OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.raster import FREE, OCCUPIED, states
-from segfloor_ros.evaluation.run_summary import MOUNT_FIGURES, read_summary
-from segfloor_ros.evaluation.truth import MapTruth, load_truth
+from segfloor_ros.evaluation.maps import MapTruth, load_truth, states
 from segfloor_ros.files.images import check_same_size, read_mask
 from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
+from segfloor_ros.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.trajectory import read_trajectory
 
 FLOOR_TINT, NO_EVIDENCE_TINT, MOVING_TINT = (80, 190, 60), (60, 200, 240), (60, 60, 230)

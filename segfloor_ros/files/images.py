@@ -5,7 +5,14 @@ How many pixels a decoder takes is set in the package's `__init__`, before OpenC
 
 from __future__ import annotations
 
+import io
+import os
+import sys
+import threading
+import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +22,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros import MAX_PIXELS
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.silence import silent_libraries
 from segfloor_ros.files.whole import read_bytes
 
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
@@ -25,6 +31,10 @@ PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
 
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+_lock = threading.Lock()
+_inside = 0
+_standard_error: int | None = None
 
 
 class CorruptImageError(InputError):
@@ -120,3 +130,45 @@ def _check_png(data: bytes, name: str) -> None:
             return
         position = end + 4
     raise CorruptImageError(f'{name}: the PNG is truncated')
+
+
+def own_standard_error() -> None:
+    """Give this program a way of its own to standard error, so that `silent_libraries` can close
+    the usual one; without it that does nothing. For programs, before anything is written.
+    """
+    global _standard_error
+    if _standard_error is None:
+        _standard_error = os.dup(2)
+        sys.stderr = open(_standard_error, 'w', buffering=1, errors='backslashreplace')  # noqa: SIM115
+    if not sys.warnoptions:
+        warnings.simplefilter('ignore')  # of NumPy, about numbers of the input
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors='backslashreplace')  # names of files may be no text
+
+
+@contextmanager
+def silent_libraries() -> Iterator[None]:
+    """Drop what libraries write to standard error: libpng and libjpeg have no other switch that
+    OpenCV passes on.
+    """
+    global _inside
+    if _standard_error is None:
+        yield
+        return
+    with _lock:
+        if _inside == 0:
+            _point_to(os.devnull)
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                os.dup2(_standard_error, 2)
+
+
+def _point_to(path: str) -> None:
+    file = os.open(path, os.O_WRONLY)
+    os.dup2(file, 2)
+    os.close(file)

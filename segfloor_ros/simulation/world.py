@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.movers import part_solids
 from segfloor_ros.simulation.scene import Lighting, Scene
-from segfloor_ros.simulation.solids import Prism, floors, obstacles
+from segfloor_ros.simulation.solids import Prism, floors, obstacles, part_solids
 from segfloor_ros.simulation.textures import Texture, make_texture
 
 NEAR_M, FAR_M = 0.02, 120.0

@@ -1,9 +1,10 @@
-"""What a suite can bound: the measures of a mapped recording, and bounds on them."""
+"""What a suite can bound: the measures of a mapped recording, bounds on them, and verdicts."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,21 @@ import numpy as np
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
-from segfloor_ros.evaluation.raster import UNKNOWN, resample, states
-from segfloor_ros.evaluation.run_summary import read_summary
-from segfloor_ros.evaluation.truth import Pose2d, load_truth
-from segfloor_ros.files.tables import number as finite_number
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.evaluation.maps import Pose2d, load_truth, resample, states
+from segfloor_ros.files.results import write_file
+from segfloor_ros.files.whole import number as finite_number
+from segfloor_ros.files.whole import read_json
+from segfloor_ros.grid.map_file import UNKNOWN, OccupancyGrid, load_map
+from segfloor_ros.results_folder import read_summary
 from segfloor_ros.trajectory import read_trajectory
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 
 ROUNDING = 1e-9
+
+FORMAT = 1
+Baseline = Mapping[str, Mapping[str, float]]
+"""Measures by recording."""
 
 
 @dataclass(frozen=True)
@@ -249,3 +255,91 @@ def bounds_of_baseline(baseline: Mapping[str, float], slacks: Mapping[str, Slack
 def number(value: float) -> str:
     """Return a value with four significant digits, and whole ones as they are."""
     return f'{value:.0f}' if value == round(value) else f'{value:.4g}'
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a job. problem: why there is no map, '' where there is one. archive: the results
+    folder, packed. start_pose: where the map's frame lies in the truth's. worker: host and process.
+    reused: from the cache.
+    """
+
+    name: str
+    measured: dict[str, float]
+    problem: str = ''
+    archive: bytes = b''
+    start_pose: Pose2d | None = None
+    seconds: float = 0.0
+    worker: str = ''
+    reused: bool = False
+    package: str = ''
+
+
+@dataclass(frozen=True)
+class Checked(Outcome):
+    """What came of a recording, and what its measures say to its bounds."""
+
+    verdicts: tuple[Verdict, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether there is a map and every bound is kept."""
+        return not self.problem and all(verdict.holds for verdict in self.verdicts)
+
+    @property
+    def state(self) -> str:
+        """How it went, in words."""
+        return 'ok' if self.holds else 'no map' if self.problem else 'fails'
+
+    @property
+    def complaints(self) -> list[str]:
+        """A line for each thing that is wrong."""
+        if self.problem:
+            return [f'{self.name}: {self.problem}']
+        return [f'{self.name}: {verdict}' for verdict in self.verdicts if not verdict.holds]
+
+
+@dataclass(frozen=True)
+class SuiteResult:
+    """All recordings of a suite, in its order."""
+
+    name: str
+    recordings: list[Checked]
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything is as it should be."""
+        return all(checked.holds for checked in self.recordings)
+
+
+def check(outcome: Outcome, bounds: Iterable[Bound]) -> Checked:
+    """Hold an outcome against bounds."""
+    # The archive is in the suite's folder by now.
+    known = {**vars(outcome), 'archive': b''}
+    verdicts = tuple(Verdict(bound, outcome.measured.get(bound.measure)) for bound in bounds)
+    return Checked(**known, verdicts=verdicts)
+
+
+def write_baseline(result: SuiteResult, path: Path) -> None:
+    """Write the measures of all recordings that have a map."""
+    measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
+    document = {'version': FORMAT, 'recordings': measures}
+    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
+
+
+def is_baseline(path: Path) -> bool:
+    """Whether a file is one of `write_baseline`."""
+    try:
+        read_baseline(path)
+    except InputError:
+        return False
+    return True
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read what `write_baseline` wrote. Raises InputError."""
+    try:
+        recordings = read_json(path, 'a baseline')['recordings']
+        return {name: known_measures(measures) for name, measures in recordings.items()}
+    except (ValueError, KeyError, AttributeError):
+        raise InputError(f'{path}: not a baseline; write one with --write-baseline') from None

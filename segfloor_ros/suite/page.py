@@ -23,8 +23,7 @@ from segfloor_ros.errors import InputError, printable
 from segfloor_ros.evaluation.report import REPORT_NAME, html_page
 from segfloor_ros.files.images import read_mask
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
-from segfloor_ros.suite.measures import MEASURES, Bound, number
-from segfloor_ros.suite.verdicts import Checked, SuiteResult
+from segfloor_ros.suite.measures import MEASURES, Bound, Checked, SuiteResult, number
 
 COLUMNS = ('tracked_percent', 'path_error_m', 'precision_percent', 'recall_percent',
            'known_area_m2', 'time_ratio', 'memory_peak_mb')  # fmt: skip

@@ -18,12 +18,13 @@ from segfloor_ros.benchmark.stages import (
     measure_map,
     run_apart,
 )
-from segfloor_ros.cli.benchmark import benchmark
+from segfloor_ros.cli.commands import benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError
-from segfloor_ros.evaluation.raster import FREE, OCCUPIED, sample_states, states
+from segfloor_ros.evaluation.maps import sample_states, states
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert, transform_points
+from segfloor_ros.grid.map_file import FREE, OCCUPIED
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.timing import ReferenceWorkload
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from segfloor_ros.cli.evaluate import app
 from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.evaluation.truth import load_truth
+from segfloor_ros.evaluation.maps import load_truth
 
 
 def write_map(folder, shift_cells=0):

@@ -5,29 +5,24 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.alignment import find_alignment
 from segfloor_ros.evaluation.map_score import (
     AGREE_FREE,
     AGREE_OCCUPIED,
     FALSE_FREE,
     MISSED_FLOOR,
+    RoadMapPlan,
+    candidate_edges,
     compare,
     draw_overlay,
+    edges_are_free,
     opened,
+    sample_nodes,
     save_overlay,
     score_cells,
     score_map,
-)
-from segfloor_ros.evaluation.raster import (
-    RoadMapPlan,
-    candidate_edges,
-    edges_are_free,
-    observable,
-    resample,
-    sample_nodes,
     score_road_maps,
 )
-from segfloor_ros.evaluation.truth import MapTruth
+from segfloor_ros.evaluation.maps import MapTruth, find_alignment, observable, resample
 from segfloor_ros.grid.map_file import OccupancyGrid
 
 FEW = RoadMapPlan(nodes=20, repetitions=5)
@@ -160,7 +155,7 @@ def test_estimate_turned_by_a_quarter_lands_where_it_belongs():
     # The estimate's frame lies at (0.3, 0) in the truth, turned left: its x is the truth's y.
     estimate = grid_of(['.#.#.', '  .. ', '#.   '])
     truth = OccupancyGrid(np.zeros((5, 3), np.int8), 0.1, (0.0, 0.0))
-    expected = np.array([[1, 0, -1, -1, -1], [-1, -1, 0, 0, -1], [0, 1, 0, 1, 0]])
+    expected = np.array([[100, 0, -1, -1, -1], [-1, -1, 0, 0, -1], [0, 100, 0, 100, 0]])
     # Column c of the estimate becomes row c; its row r becomes column 2 - r.
     np.testing.assert_array_equal(
         resample(estimate, truth, (0.3, 0.0, np.pi / 2)), expected[::-1].T

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.tables import (
+from segfloor_ros.files.whole import (
     END_NS,
     nanoseconds,
     number,

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.demo import DRIVE, demo
-from segfloor_ros.cli.recordings import simulate as simulate_command
-from segfloor_ros.evaluation.truth import load_truth
-from segfloor_ros.simulation.renderer import RenderingError
+from segfloor_ros.cli.commands import DRIVE, demo
+from segfloor_ros.cli.commands import simulate as simulate_command
+from segfloor_ros.evaluation.maps import load_truth
+from segfloor_ros.simulation.simulation import RenderingError
 
 app = typer.Typer()
 app.command('demo')(demo)

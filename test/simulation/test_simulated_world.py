@@ -7,7 +7,6 @@ import pytest
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
-from segfloor_ros.simulation.movers import is_moving, part_poses
 from segfloor_ros.simulation.scene import Person, Scene
 from segfloor_ros.simulation.scene_file import (
     CLEARANCE_M,
@@ -23,7 +22,9 @@ from segfloor_ros.simulation.solids import (
     cylinder,
     floor_height_m,
     floors,
+    is_moving,
     obstacles,
+    part_poses,
     true_map,
 )
 from segfloor_ros.simulation.textures import GENERATORS, make_texture

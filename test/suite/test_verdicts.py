@@ -8,18 +8,20 @@ from junitparser import JUnitXml
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, save_map
-from segfloor_ros.suite.description import Entry
 from segfloor_ros.suite.job import Outcome
 from segfloor_ros.suite.measures import (
     Bound,
     Slack,
+    SuiteResult,
     Verdict,
     agreement,
     bounds_of_baseline,
+    check,
     measure_run,
+    read_baseline,
+    write_baseline,
 )
 from segfloor_ros.suite.page import junit, page
-from segfloor_ros.suite.verdicts import SuiteResult, check, read_baseline, write_baseline
 
 GOOD = {'tracked_percent': 100.0, 'path_error_m': 0.012, 'recall_percent': 93.0}
 
@@ -54,9 +56,9 @@ def test_a_baseline_allows_what_is_better_and_little_that_is_worse():
 
 def result() -> SuiteResult:
     bounds = (Bound('tracked_percent', least=99), Bound('path_error_m', greatest=0.01))
-    good = check(Entry('good', 'a', bounds=bounds[:1]), Outcome('good', GOOD, seconds=2.5), None)
-    bad = check(Entry('bad', 'b', bounds=bounds), Outcome('bad', GOOD), None)
-    lost = check(Entry('lost', 'c', bounds=bounds), Outcome('lost', {}, 'no map <came>'), None)
+    good = check(Outcome('good', GOOD, seconds=2.5), bounds[:1])
+    bad = check(Outcome('bad', GOOD), bounds)
+    lost = check(Outcome('lost', {}, 'no map <came>'), bounds)
     return SuiteResult('nightly', [good, bad, lost])
 
 
@@ -91,7 +93,7 @@ def test_a_baseline_survives_the_round_trip(tmp_path):
     write_baseline(result(), path)
     assert read_baseline(path) == {'good': GOOD, 'bad': GOOD}
     worse = Outcome('good', {**GOOD, 'recall_percent': 91.5})
-    checked = check(Entry('good', 'a'), worse, read_baseline(path))
+    checked = check(worse, bounds_of_baseline(read_baseline(path)['good'], {}))
     assert checked.complaints == [
         'good: recall_percent: 91.5 %, wanted at least 92 % (baseline 93)'
     ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from segfloor_ros.evaluation.truth import MapTruth
+from segfloor_ros.evaluation.maps import MapTruth
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tools.walls import FINE_M, depth_m
 

@@ -14,7 +14,7 @@ import yaml
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
-from segfloor_ros.files.tables import number, read_lines
+from segfloor_ros.files.whole import number, read_lines
 from segfloor_ros.files.yaml_files import read_yaml
 from segfloor_ros.geometry import Array, invert
 

@@ -24,7 +24,7 @@ from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, rate_of
 from segfloor_ros.camera.sources.sensor_files import DEPTH, check_shared_clock
 from segfloor_ros.camera.sources.source import PairEntry, StereoSource
 from segfloor_ros.errors import CalibrationError, InputError
-from segfloor_ros.files.tables import checked_ns
+from segfloor_ros.files.whole import checked_ns
 from segfloor_ros.measurements import RecordedSensor
 
 STAMPS_FOR_RATE = 20

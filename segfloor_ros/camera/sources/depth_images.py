@@ -22,7 +22,7 @@ from segfloor_ros.camera.sources.sensor_files import DEPTH, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
-from segfloor_ros.files.tables import nanoseconds
+from segfloor_ros.files.whole import nanoseconds
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.measurements import RecordedSensor
 

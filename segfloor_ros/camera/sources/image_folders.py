@@ -41,7 +41,7 @@ from segfloor_ros.camera.sources.pairing import (
 from segfloor_ros.camera.sources.sensor_files import IMU, folder_sensors
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.tables import whole_nanoseconds
+from segfloor_ros.files.whole import whole_nanoseconds
 from segfloor_ros.geometry import invert, make_transform
 from segfloor_ros.measurements import RecordedSensor
 

@@ -24,7 +24,7 @@ from segfloor_ros.camera.sources.sensor_files import check_shared_clock
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
-from segfloor_ros.files.tables import nanoseconds, read_lines
+from segfloor_ros.files.whole import nanoseconds, read_lines
 from segfloor_ros.measurements import RecordedSensor
 
 T = TypeVar('T')

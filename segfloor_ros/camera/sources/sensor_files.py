@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.tables import nanoseconds, number, read_lines, whole_nanoseconds
+from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array
 from segfloor_ros.measurements import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 

@@ -20,8 +20,7 @@ from segfloor_ros.camera.images import to_grey
 from segfloor_ros.camera.settings import StereoCameraSettings
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.images import Grey
-from segfloor_ros.files.silence import silent_libraries
+from segfloor_ros.files.images import Grey, silent_libraries
 from segfloor_ros.files.whole import check_file
 
 VIDEO_SUFFIXES = {'.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.mpg', '.mpeg', '.mjpeg'}

@@ -1,0 +1,357 @@
+"""The commands that map, make recordings and measure: run, demo, simulate, convert, calibrate,
+benchmark.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from importlib import resources, util
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from segfloor_ros.benchmark.stages import (
+    BenchmarkPlan,
+    Workload,
+    as_document,
+    parse_sizes,
+    run_benchmark,
+)
+from segfloor_ros.camera.bag_writer import ImageCoding
+from segfloor_ros.camera.bag_writer import convert as write_bag
+from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.camera.sources.sensor_files import DEPTH
+from segfloor_ros.cli import terminal
+from segfloor_ros.cli.evaluate import map_table
+from segfloor_ros.cli.replay import replay
+from segfloor_ros.cli.terminal import console, figure_table, within
+from segfloor_ros.configuration import Configuration, resolve
+from segfloor_ros.errors import MapError, SettingsError, about
+from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
+from segfloor_ros.evaluation.maps import load_truth
+from segfloor_ros.files.results import add_files, check_writable, write_file
+from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
+from segfloor_ros.processes import first_interrupt_noted
+from segfloor_ros.results_folder import OutputFolder
+
+DEFAULT = BenchmarkPlan()
+
+DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
+"""A drive through the shipped scene corridor1 with its truth, made by `segfloor simulate corridor1
+--supersampling 2 --floor-every 0 --set camera.width=480 --set camera.height=360
+--set camera.noise_sigma=1.0` and `segfloor convert` with JPEG images.
+"""
+
+
+def run(
+    input: terminal.Input,
+    out: terminal.Out,
+    params: terminal.Params = None,
+    assignments: terminal.Set = None,
+    ignore: terminal.Ignore = None,
+    depth: terminal.Depth = False,
+    save_masks: Annotated[
+        SaveMasks, typer.Option(help='Floor masks to save.')
+    ] = SaveMasks.keyframes,
+    save_debug: Annotated[
+        bool,
+        typer.Option(
+            '--save-debug',
+            help='Save pictures of the floor of each keyframe: mask, v-disparity with profile.',
+        ),
+    ] = False,
+    masks: terminal.Masks = None,
+    save_map: terminal.SaveMap = None,
+    load_map: terminal.LoadMap = None,
+    localize: terminal.Localize = False,
+    report: terminal.Report = False,
+    no_map: terminal.NoMap = False,
+) -> None:
+    """Map a recording: every frame, no ROS graph, the same result byte for byte."""
+    maps = MapOptions(load_map, save_map, localize)
+    configuration = terminal.configuration(params, assignments, input, masks, ignore, depth)
+    source = open_source(configuration.stereo_camera)
+    terminal.print_sensors(source.sensors)
+    inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
+    with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
+        with terminal.progress_bar('mapping', source.frame_count) as progress:
+            drive = LockstepRun(
+                source, configuration, folder, save_masks, save_debug, maps, interrupt, no_map
+            )
+            try:
+                result = drive.execute(progress)
+            except MapError:
+                terminal.end_if_interrupted(interrupt)
+                raise
+        folder.write(result)
+        try:
+            drive.save_map()
+        except Exception as error:  # whatever it is, the results are there
+            folder.problems.append(str(error) or type(error).__name__)
+    terminal.print_summary(input, result.summary)
+    remarks, status = [drive.note] if drive.note else [], interrupt.status
+    if drive.no_map and not no_map:
+        folder.problems.append(drive.no_map)
+    if drive.broken_off is not None:
+        remarks.append(f'{drive.broken_off}; the map is of what came before')
+        status = status or 2
+    terminal.finish_run(input, out, folder, report, remarks, status)
+
+
+def demo(
+    out: Annotated[Path, typer.Option('--out', help='Folder for the results.')] = Path(
+        'segfloor_demo'
+    ),
+    rate: Annotated[
+        float, typer.Option(help='Speed against real time; 0: as fast as the nodes take it.')
+    ] = 0.0,
+    lockstep: Annotated[
+        bool, typer.Option('--lockstep', help='Without ROS: one process in place of five nodes.')
+    ] = False,
+) -> None:
+    """Map a recorded drive through a corridor with the five nodes and score the map."""
+    drive = str(DRIVE / 'drive.mcap')
+    if lockstep or util.find_spec('rclpy') is None:
+        console.print('mapping a simulated drive through a corridor, in one process without ROS')
+        run(drive, out)
+    else:
+        console.print('replaying a simulated drive through a corridor through the five nodes')
+        replay(drive, out, rate=rate)
+    _print_scores(out)
+
+
+def _print_scores(out: Path) -> None:
+    """Print how good map and path are; the last line is the path of the report."""
+    # Imported here: evo and matplotlib take a second that no other command should wait for.
+    from segfloor_ros.evaluation.report import write_report
+    from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
+
+    truth = load_truth(DRIVE)
+    grid = load_map(out / 'map.yaml')
+    console.print(map_table(score_map(grid, truth)))
+    path = score_trajectory(match_files(out, DRIVE))
+    console.print(
+        f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
+        f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)',
+        highlight=False,
+    )
+    add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
+    console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
+    console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)
+
+
+def simulate(
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help='Name of a shipped scene, a scene file, or a map_server map (YAML) to drive in.'
+        ),
+    ],
+    out: terminal.Out,
+    set_values: Annotated[
+        list[str] | None,
+        typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
+    ] = None,
+    floor_every: Annotated[
+        int,
+        typer.Option(callback=within(0), help='A true floor mask every so many frames; 0: none.'),
+    ] = 10,
+    disparity: Annotated[
+        bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
+    ] = False,
+    supersampling: Annotated[
+        int,
+        typer.Option(callback=within(1, 4), help='Render so many times finer than the image.'),
+    ] = 1,
+) -> None:
+    """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
+    # Imported here: the simulator takes time that other commands should not wait for.
+    from segfloor_ros.simulation.drive_files import RecordingOptions, record
+    from segfloor_ros.simulation.scene_file import open_scene
+    from segfloor_ros.simulation.simulation import Simulation
+
+    described = open_scene(scene, set_values or ())
+    wanted = RecordingOptions(floor_every, disparity)
+    with (
+        about(scene),
+        Simulation(described, supersampling) as simulation,
+        terminal.progress_bar('rendering', simulation.frame_count) as progress,
+    ):
+        record(simulation, out, wanted, progress)
+        seconds = simulation.drive.times_s[-1]
+        facts = (
+            f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
+        )
+    console.print(f'{facts}: {out}', highlight=False)
+
+
+def convert(
+    input: terminal.Input,
+    out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
+    images: Annotated[
+        ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
+    ] = ImageCoding.raw,
+    params: terminal.Params = None,
+    assignments: terminal.Set = None,
+) -> None:
+    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured."""
+    settings = terminal.configuration(params, assignments, input).stereo_camera
+    source = open_source(settings)
+    terminal.print_sensors(source.sensors)
+    has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)
+    depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
+    with terminal.progress_bar('converting', source.frame_count) as progress:
+        pairs = write_bag(source, out, images, progress, depth)
+    size_mb = sum(f.stat().st_size for f in [out, *out.rglob('*')] if f.is_file()) / 1e6
+    console.print(f'{pairs} pairs, {size_mb:.1f} MB: {out}', highlight=False)
+
+
+def calibrate(
+    folder: Annotated[
+        Path, typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.')
+    ],
+    square_m: Annotated[
+        float,
+        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
+    ],
+    board: Annotated[
+        str, typer.Option(help='Inner corners along the long and the short side.')
+    ] = '9x6',
+    out: Annotated[
+        Path | None,
+        typer.Option('--out', help="Folder for left.yaml and right.yaml; else the pictures'."),
+    ] = None,
+) -> None:
+    """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files."""
+    sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
+    if sides is None:
+        raise SettingsError(f'--board {board}: expected e.g. 9x6')
+    with terminal.progress_bar('searching boards', None) as progress:
+        result = calibrate_folder(folder, square_m, (int(sides[1]), int(sides[2])), out, progress)
+    _print_result(result, out or folder)
+
+
+def _print_result(result: CalibrationResult, folder: Path) -> None:
+    camera = result.calibration.camera
+    rows = [
+        ('pairs used', f'{result.pairs_used} of {result.pairs_total}'),
+        ('reprojection error', f'{result.rms_px:.3f} px RMS'),
+        ('row difference after rectification', f'{result.epipolar_rms_px:.3f} px RMS'),
+        ('focal length, rectified', f'{camera.fx:.1f} px'),
+        ('baseline', f'{camera.baseline_m:.4f} m'),
+    ]
+    console.print(terminal.value_table('calibration', rows, str(folder)))
+    console.print(f'{folder / "left.yaml"}\n{folder / "right.yaml"}', highlight=False)
+
+
+def benchmark(
+    sizes: Annotated[
+        str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
+    ] = ','.join(map(str, DEFAULT.sizes)),
+    frames: Annotated[
+        int, typer.Option(callback=within(2), help='Generated image pairs for all stages.')
+    ] = DEFAULT.frames,
+    seed: Annotated[
+        int, typer.Option(callback=within(0), help='Of the generated data.')
+    ] = DEFAULT.seed,
+    threads: Annotated[
+        int,
+        typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.'),
+    ] = DEFAULT.threads,
+    nodes: Annotated[
+        str | None,
+        typer.Option(
+            metavar='RECORDING',
+            help='Play this recording through the five node processes instead: latency from image '
+            'to map, CPU, memory and losses.',
+        ),
+    ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(callback=within(0.01), help='Speed of --nodes against real time.'),
+    ] = 1.0,
+    json_file: Annotated[
+        Path | None,
+        typer.Option('--json', help='Write all figures of the stages to this file.'),
+    ] = None,
+    params: terminal.Params = None,
+    assignments: terminal.Set = None,
+) -> None:
+    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload."""
+    if nodes is not None:
+        print_node_figures(terminal.configuration(params, assignments, nodes), rate)
+        return
+    configuration = resolve(params, assignments or ())
+    if json_file is not None:
+        check_writable(json_file, '--json')
+    plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
+    with terminal.announcing() as announce:
+        workloads = run_benchmark(plan, configuration, announce)
+    console.print(stage_table(workloads))
+    console.print(workload_table(workloads))
+    write_json(json_file, as_document(plan, workloads))
+
+
+def print_node_figures(configuration: Configuration, rate: float, lossless: bool = False) -> None:
+    """Play the recording of the configuration through the nodes and print what it cost. lossless:
+    lose no frame, as opposed to keeping to the clock.
+    """
+    try:
+        from segfloor_ros.cli.replay_measured import figures_table, measure_nodes
+    except ImportError as error:
+        raise SettingsError(f'to measure the nodes needs ROS 2 ({error})') from None
+    frames = open_source(configuration.stereo_camera).frame_count
+    with terminal.progress_bar('playing', frames) as progress:
+        figures = measure_nodes(configuration, rate, lossless, progress)
+    console.print(figures_table(figures))
+
+
+def write_json(path: Path | None, document: dict[str, Any]) -> None:
+    """Write figures to a file and say where."""
+    if path is None:
+        return
+    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
+    console.print(f'figures: {path}', highlight=False, soft_wrap=True)
+
+
+def stage_table(workloads: list[Workload]) -> Table:
+    """Return the time of every stage as a table."""
+    table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
+    for workload in workloads:
+        table.add_row(Text(workload.name, 'bold'))
+        for name, stage in workload.stages.items():
+            times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
+            ratio = f'{stage["p50_ratio"]:.3f}'
+            table.add_row(f'  {name}', str(stage['count']), *times, ratio)
+        table.add_row('  reference', '', f'{workload.reference_ms:.2f}', '', '', '1.000')
+        table.add_section()
+    table.caption = 'reference: ORB and semi-global matching of a fixed 640x480 pair, timed beside'
+    return table
+
+
+def workload_table(workloads: list[Workload]) -> Table:
+    """Return throughput, map updates and memory of every workload as a table."""
+    table = figure_table(
+        'workload', 'items/s', 's/update', 'p95 s', 'max s', 'peak MB', 'MB/update'
+    )
+    for workload in workloads:
+        updates = (f'{workload.update_s.get(key, 0.0):.4f}' for key in ('mean', 'p95', 'max'))
+        table.add_row(
+            workload.name,
+            f'{workload.items_per_s:.1f}',
+            *updates,
+            f'{workload.memory_mb["peak"]:.0f}',
+            f'{workload.memory_mb["slope_per_update"]:.3f}',
+        )
+    table.caption = (
+        'items: frames, or keyframes where there are no images; update: all that is done once per '
+        'keyframe, the map included; one thread; memory grows by the slope of the second half'
+    )
+    return table
