@@ -21,14 +21,19 @@ from rich.table import Table
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, se3_exp
 from segfloor_ros.map_file import Arrays
-from segfloor_ros.slam.map.map_arrays import fill_map
 from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
-from segfloor_ros.slam.places.loop_closing import move_keyframes, plan_closing, solve_closing
+from segfloor_ros.slam.mapping.bundle_adjustment import (
+    apply_global,
+    copy_map,
+    move_keyframes,
+    solve_global,
+)
+from segfloor_ros.slam.places.loop_closing import plan_closing, solve_closing
 from segfloor_ros.slam.places.loops import path_lengths
 from segfloor_ros.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
 from segfloor_ros.slam.rig import NO_OFFSET, Rig
+from segfloor_ros.slam.saved_slam import fill_map
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 

@@ -82,15 +82,15 @@ SLAM: dict[str, Mechanism] = {
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
         {
-            'slam.places.relocalisation.FRAMES_IN_A_ROW': 1,
-            'slam.places.relocalisation.MIN_AGREEMENT': 0.0,
+            'slam.places.place_recognition.FRAMES_IN_A_ROW': 1,
+            'slam.places.place_recognition.MIN_AGREEMENT': 0.0,
         }
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(
         {
-            'slam.tracking.consensus.differ': lambda a, b: False,
-            'slam.tracking.consensus.KNOWN_NOISE': 1e9,
+            'slam.tracking.pose.differ': lambda a, b: False,
+            'slam.tracking.pose.KNOWN_NOISE': 1e9,
         }
     ),
     'motion so far': Mechanism({'slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),

@@ -1,9 +1,13 @@
 """The stereo rig: its camera, its mount, and the error that all its disparities share, estimated
-while it moves.
+while it moves; and the model of what it measures.
 
 Cheap stereo cameras bend and warm up: a tenth of a milliradian between the two eyes shifts every
 disparity by the same fraction of a pixel and stretches far distances. A moving rig shows it: the
 parallax between keyframes measures the same points without it.
+
+A feature measures (u, v, d): its pixel in the left image and its disparity. The disparity is
+found by correlating the patch around (u, v) with the right image, so its error is independent
+of the error of (u, v), and smaller; (u, v, u_right) would not have that property.
 """
 
 from __future__ import annotations
@@ -11,8 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.geometry import Array
 
 EXPECTED_SIGMA_PX = 0.1
 """A tenth of a milliradian at a focal length of a thousand pixels, px; 0: disparities are true."""
@@ -32,6 +38,17 @@ MEMORY_SIGMA_PX = 0.01
 
 MAX_OFFSET_PX = 0.5
 """More is not an imperfect rectification but a wrong calibration, px."""
+
+CHI2_95 = {2: 5.991, 3: 7.815, 6: 12.59}
+"""95 % quantiles of the chi-squared distribution by degrees of freedom."""
+
+CHI2_50 = {2: 1.386, 3: 2.366}
+"""Medians of the chi-squared distribution by degrees of freedom."""
+
+CHI2_999 = {3: 16.27, 6: 22.46}
+"""99.9 % quantiles of the chi-squared distribution by degrees of freedom."""
+
+MIN_DEPTH_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -89,3 +106,116 @@ class Rig:
     offset: DisparityOffset = field(
         default_factory=lambda: DisparityOffset(EXPECTED_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
     )
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Stereo measurements of N features.
+
+    uvd_px: (N, 3) float64 = (u, v, disparity), disparity NaN where there is none. sigma_px: (N,
+    3) standard deviations.
+    """
+
+    uvd_px: Array
+    sigma_px: Array
+
+    def __len__(self) -> int:
+        return len(self.uvd_px)
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
+        """Return the chosen rows."""
+        return Observations(self.uvd_px[rows], self.sigma_px[rows])
+
+    @property
+    def has_disparity(self) -> NDArray[np.bool_]:
+        """Whether each feature (N,) has a disparity."""
+        return np.isfinite(self.uvd_px[:, 2])
+
+    def without_offset(self, offset_px: float) -> Observations:
+        """Return the same measurements with disparities freed of an error they all share."""
+        return Observations(self.uvd_px - (0.0, 0.0, offset_px), self.sigma_px)
+
+    @property
+    def information(self) -> Array:
+        """Inverse variances (N, 3) in 1/px²; 0 where there is no measurement."""
+        return np.where(np.isfinite(self.uvd_px), 1.0 / self.sigma_px**2, 0.0)
+
+    def with_noise_factor(self, factor: float) -> Observations:
+        """Return the same measurements with standard deviations `factor` times as large."""
+        return Observations(self.uvd_px, self.sigma_px * factor)
+
+    @property
+    def chi2_median(self) -> Array:
+        """The median (N,) of the squared, normalised residual of each feature when all is well."""
+        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_50[3], CHI2_50[2])
+
+    @property
+    def chi2_limit(self) -> Array:
+        """The 95 % bound (N,) on the squared, normalised residual of each feature."""
+        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_95[3], CHI2_95[2])
+
+
+def is_gated(error: Array, covariance: Array) -> bool:
+    """Whether an error (D,) is no larger than its covariance (D, D) allows, with a probability of
+    99.9 % (Mahalanobis distance).
+    """
+    return float(error @ np.linalg.solve(covariance, error)) <= CHI2_999[len(error)]
+
+
+def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:
+    """Return predicted minus measured (u, v, d), (N, 3) px, for points (N, 3) of the left
+    optical frame.
+
+    A disparity that was not measured gives 0. Points must have z > 0.
+    """
+    inverse_z = 1.0 / points[:, 2]
+    predicted = np.stack(
+        [
+            camera.fx * points[:, 0] * inverse_z + camera.cx,
+            camera.fy * points[:, 1] * inverse_z + camera.cy,
+            camera.disparity_times_depth * inverse_z,
+        ],
+        axis=1,
+    )
+    residual = predicted - observations.uvd_px
+    residual[np.isnan(residual)] = 0.0
+    return residual
+
+
+def weighted_jacobian(camera: StereoCamera, points_camera: Array, root: Array) -> Array:
+    """Return J^T W^0.5 (3, 3, N) with J = d(u, v, d) / d(point), for points (N, 3) of the left
+    optical frame and the roots (3, N) of their weights.
+    """
+    x, y, z = points_camera.T
+    J: Array = np.zeros((3, 3, len(z)))
+    J[0, 0], J[1, 1] = root[0] * (camera.fx / z), root[1] * (camera.fy / z)
+    J[2, 0], J[2, 1] = -J[0, 0] * x / z, -J[1, 1] * y / z
+    J[2, 2] = -root[2] * (camera.disparity_times_depth / z**2)
+    return J
+
+
+def with_moment(p: Array, vectors: Array) -> Array:
+    """Return vectors (3, a, N) with p x vector below them (6, a, N), for points p (3, N).
+
+    A derivative with respect to the point becomes that with respect to the twist of T_camera_world
+    <- exp(twist) T_camera_world (Barfoot 2017, eq. 7.183 with rho first).
+    """
+    x, y, z = p
+    a, b, c = vectors
+    return np.stack([a, b, c, y * c - z * b, z * a - x * c, x * b - y * a])
+
+
+def squared_norms(residual: Array, information: Array) -> Array:
+    """Return the squared, normalised residuals (N,)."""
+    return (residual**2 * information).sum(axis=1)
+
+
+def huber_weights(chi2: Array, limit: Array) -> Array:
+    """Return the weights (N,) of the Huber cost whose quadratic part ends at chi2 = limit."""
+    return np.sqrt(np.minimum(1.0, limit / np.maximum(chi2, 1e-12)))
+
+
+def huber_cost(chi2: Array, limit: Array) -> float:
+    """Return the summed Huber cost (Hartley & Zisserman, Multiple View Geometry, A6.8)."""
+    linear = 2.0 * np.sqrt(limit * chi2) - limit
+    return float(np.where(chi2 <= limit, chi2, linear).sum())

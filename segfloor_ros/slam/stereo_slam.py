@@ -19,11 +19,19 @@ from segfloor_ros.geometry import Array, adjoint, invert
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Measurement, Up
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.snapshot import HeldResults, in_merged_map, take_snapshot
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
-from segfloor_ros.slam.moving.motion_search import MotionSearch, Searched
-from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, FrameResult, Keyframe, LastPose, Track
+from segfloor_ros.slam.moving.moving_regions import MotionSearch, Searched
+from segfloor_ros.slam.results import (
+    UNKNOWN_COVARIANCE,
+    FrameResult,
+    HeldResults,
+    Keyframe,
+    LastPose,
+    Track,
+    in_merged_map,
+    take_snapshot,
+)
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings

@@ -8,7 +8,7 @@ from hand_made_maps import row_of_views
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.mapping.fusion import find_duplicates
+from segfloor_ros.slam.mapping.keyframe_mapping import find_duplicates
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam

@@ -259,7 +259,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.map.snapshot.MAX_HELD_KEYFRAMES', 3)
+    monkeypatch.setattr('segfloor_ros.slam.results.MAX_HELD_KEYFRAMES', 3)
     slam = StereoSlam(CAMERA, SETTINGS)
     for frame in frames[:-1]:
         assert slam.process(frame) == []

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.map_file import Arrays, check_lengths
 from segfloor_ros.measurements import Up
-from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX

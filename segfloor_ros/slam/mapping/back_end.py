@@ -17,21 +17,21 @@ import numpy as np
 from segfloor_ros.geometry import Array
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.measurements import Up
-from segfloor_ros.slam.map.map_arrays import fill_map, map_to_arrays
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.places.loop_closing import (
     Closing,
+    KnownMap,
     apply_closing,
     plan_closing,
     solve_closing,
 )
 from segfloor_ros.slam.places.loops import LoopDetector
-from segfloor_ros.slam.places.relocalisation import KnownMap
 from segfloor_ros.slam.results import Track
 from segfloor_ros.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd

@@ -20,20 +20,28 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.residuals import (
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.normal_equations import (
+    Factor,
+    Linearisation,
+    Step,
+    System,
+    cost,
+    factors_of,
+    normal_equations,
+    with_factors,
+)
+from segfloor_ros.slam.results import MIN_SHARED
+from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
+    NO_OFFSET,
     Observations,
+    OffsetEstimate,
     huber_cost,
     huber_weights,
     residuals,
     squared_norms,
 )
-from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.normal_equations import Linearisation, Step, System, normal_equations
-from segfloor_ros.slam.places.loop_closing import move_keyframes
-from segfloor_ros.slam.results import MIN_SHARED
-from segfloor_ros.slam.rig import NO_OFFSET, OffsetEstimate
-from segfloor_ros.slam.sensors.motion_links import Factor, cost, factors_of, with_factors
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""
@@ -322,3 +330,19 @@ def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:
     same &= (sparse_map.xyz_world[ids] == planned.points_world).all(axis=1)
     move_keyframes(sparse_map, now @ correction[order[holder - 1]])
     sparse_map.xyz_world[ids[same]] = adjusted.points_world[same]
+
+
+def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
+    """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
+    edges = sparse_map.edges
+    last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
+    last[edges.point] = edges.keyframe
+    before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
+    motion = invert(T_camera_world) @ before
+    R, t = motion[last, :3, :3], motion[last, :3, 3]
+    for column in (sparse_map.xyz_world, sparse_map.viewing_direction):
+        column[:] = (R @ column[:, :, None])[:, :, 0]
+    sparse_map.xyz_world[:] += t
+    for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
+        keyframe.T_camera_world = pose
+    sparse_map.follow()

@@ -1,5 +1,9 @@
 """Mapping: what happens when a frame becomes a keyframe.
 
+Whatever it should see at the same pixel and depth as a neighbour, and that looks the same, is one
+point: the older one. Keyframes that show what others have seen as well are retired, so that memory
+follows the space covered (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, sections VI-C and VI-E).
+
 A first guess of the disparity everywhere, to two pixels: block matching of shrunken images
 (Konolige, Small Vision Systems, ISRR 1997, as in OpenCV).
 """
@@ -11,23 +15,26 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
-from segfloor_ros.slam.mapping.fusion import fuse_duplicates, retire_redundant
+from segfloor_ros.slam.mapping.normal_equations import factors_of
 from segfloor_ros.slam.results import MIN_SHARED, NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, Rig
-from segfloor_ros.slam.sensors.motion_links import factors_of
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, Rig
+from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.images import Images
-from segfloor_ros.slam.tracking.point_measurement import measure_disparity
+from segfloor_ros.slam.tracking.map_tracking import predict_points
+from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
 
 DISPARITY_REACH_PX = 4
+
 MIN_DISPARITY_PX = 1.0
+
 CONTRADICTED_SHARE = 0.1
 """A feature whose disparity differs by more than this share from that of the point it was matched
 with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
@@ -37,7 +44,9 @@ MIN_LINK_SHARE = 0.1
 """Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
 
 SETTLING_KEYFRAMES = 2
+
 MIN_FOUND_RATIO = 0.25
+
 MIN_KEPT_RATIO = 0.5
 """Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
 
@@ -51,9 +60,27 @@ MAX_DISPARITY_SHARE = 0.5
 """Largest disparity, as a share of the image's width."""
 
 BLOCK_PX = 11
+
 MIN_TEXTURE = 5
+
 STEP = 16
 """OpenCV's disparities are in 1/16 px, and their number is a multiple of 16."""
+
+MAX_APART_PX = 2.0
+"""Distance of two projections, in u, v and disparity, of what may be one point."""
+
+MAX_OCTAVES_APART = 2.5
+
+CANDIDATES = 4
+
+Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
+
+OTHERS = 3
+
+REDUNDANT_SHARE = 0.9
+
+LATEST_KEPT = 3
+"""The latest keyframes are what tracking and the policy lean on."""
 
 
 @dataclass(frozen=True)
@@ -283,3 +310,83 @@ def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Ar
     column, row = ((uv_px.T + 0.5) / factor).astype(np.intp)
     at = disparity[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
     return np.where(at > 0, at * (factor / STEP), np.nan)
+
+
+def fuse_duplicates(
+    camera: StereoCamera,
+    sparse_map: SparseMap,
+    keyframe: KeyframeRecord,
+) -> int:
+    """Merge points of a new keyframe with those of its neighbours; return how many merged."""
+    a, b = find_duplicates(camera, sparse_map, keyframe)
+    separate = ~sparse_map.seen_together(a, b)
+    a, b = a[separate], b[separate]
+    older = sparse_map.stable_id[a] < sparse_map.stable_id[b]
+    sparse_map.merge(np.where(older, a, b), np.where(older, b, a))
+    return len(a)
+
+
+def find_duplicates(
+    camera: StereoCamera,
+    sparse_map: SparseMap,
+    keyframe: KeyframeRecord,
+) -> Pairs:
+    """Return pairs of point rows (N,), (N,): of the keyframe, and of its neighbours alone. Each
+    point occurs at most once.
+    """
+    own = np.unique(keyframe.point_id[keyframe.point_id != NO_POINT])
+    order, _ = sparse_map.covisible(own)
+    around = sparse_map.points_of(order[:NEIGHBOURS])
+    others = around[~np.isin(around, own)]
+    pose = keyframe.T_camera_world
+    here = predict_points(camera, sparse_map, own, pose)
+    there = predict_points(camera, sparse_map, others, pose)
+    if len(here.ids) == 0 or len(there.ids) == 0:
+        return np.zeros(0, np.int32), np.zeros(0, np.int32)
+    neighbours = [k + 1 for k in range(min(CANDIDATES, len(here.ids)))]
+    reach, near = cKDTree(here.uvd_px).query(
+        there.uvd_px, neighbours, distance_upper_bound=MAX_APART_PX
+    )
+    j, column = np.nonzero(np.isfinite(reach))
+    i = np.asarray(near)[j, column]
+    distance = hamming(sparse_map.descriptor[here.ids[i]], sparse_map.descriptor[there.ids[j]])
+    alike = (distance <= MAX_HAMMING) & (
+        np.abs(here.octave[i] - there.octave[j]) <= MAX_OCTAVES_APART
+    )
+    i, j = one_to_one(i[alike], j[alike], distance[alike])
+    return here.ids[i], there.ids[j]
+
+
+def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> None:
+    """Retire candidates (K,) most of whose points others have seen as well, oldest first; never
+    the first keyframe nor the latest.
+    """
+    last = len(sparse_map.keyframes) - LATEST_KEPT
+    for index in sorted(int(k) for k in candidates if 0 < k < last):
+        keyframe = sparse_map.keyframes[index]
+        if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= REDUNDANT_SHARE:
+            order, _ = sparse_map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
+            reference = order[order != index][0]
+            sparse_map.retire(keyframe, sparse_map.keyframes[reference])
+
+
+def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
+    """Return the share of a keyframe's points that at least `OTHERS` other keyframes see at the
+    same pyramid level or a finer one.
+    """
+    rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+    enough = sparse_map.observer_count[keyframe.point_id[rows]] > OTHERS
+    if not len(rows) or enough.mean() < REDUNDANT_SHARE:
+        return float(enough.mean()) if len(rows) else 0.0
+    rows = rows[np.argsort(keyframe.point_id[rows])]
+    ids = keyframe.point_id[rows]
+    edge_point, edge_keyframe, edge_row = sparse_map.edges_of(ids)
+    octave = np.empty(len(edge_row))
+    for k in np.unique(edge_keyframe):
+        mine = edge_keyframe == k
+        octave[mine] = sparse_map.keyframes[k].features.octave[edge_row[mine]]
+    slot = np.searchsorted(ids, edge_point)
+    own_octave = keyframe.features.octave[rows].astype(np.float64)
+    # A level further counts as the same: corners jump between neighbouring levels.
+    as_fine = (edge_keyframe != keyframe.index) & (octave <= own_octave[slot] + 1)
+    return float((np.bincount(slot[as_fine], minlength=len(ids)) >= OTHERS).mean())

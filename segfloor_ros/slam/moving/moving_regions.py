@@ -20,30 +20,40 @@ from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
+from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.moving.scene_flow import (
     TOLERANCE_PX,
     Disparity,
     FlowView,
     FlowVotes,
+    Look,
+    MovingPointMeter,
     SceneFlow,
     SmallCamera,
     static_scale,
 )
+from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.images import Region
 
 DISPARITIES = 64
+
 BLOCK_PX = 5
+
 P1, P2 = 100, 400
 """Of semi-global matching (Hirschmueller 2008), for the sum of differences over a block."""
 
 SPECKLE_PX = 40
+
 MAX_PARALLAX_RAD = float(np.radians(30.0))
+
 FAR_PERCENT = 80
 """What is farther than most of the image stands behind what moves."""
 
 COMPARED_VIEWS = 5
+
 KEPT_VIEWS = 30
+
 MIN_HEIGHT_M = 0.05
 """What is lower may be floor, whose disparities repeat and mirror."""
 
@@ -60,12 +70,17 @@ REACH_M = 0.4
 """From corners of someone who walks to hands and feet."""
 
 NOISE_GREY = 1.0
+
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
 
 MIN_AREA_PX = BLOCK_PX**2
+
 SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
+
+SEARCH_EVERY = 3
+"""Frames between two searches where no keyframe asks for one, e.g. while the robot stands."""
 
 
 @dataclass(frozen=True)
@@ -370,3 +385,58 @@ def _edges(disparity: Disparity) -> NDArray[np.bool_]:
     """Return where (h, w) something nearer begins."""
     nearest = cv2.dilate(disparity, np.ones((3, 3), np.uint8))
     return np.asarray(nearest - disparity > 2 * TOLERANCE_PX)
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search found. disparity: (h, w) of the shrunk image. region: what moves, None for
+    nothing. points: of what moves, in the world.
+    """
+
+    disparity: Disparity
+    region: Region | None
+    points: MovingPoints
+
+
+class MotionSearch:
+    """Searches keyframes, and some of the frames between, for what moves."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._regions = MovingRegions(camera)
+        self._meter = MovingPointMeter()
+        self._frames_since = 0
+
+    def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
+        """Whether to search a frame."""
+        self._frames_since += 1
+        return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
+
+    def search(
+        self,
+        frame: StereoFrame,
+        T_camera_world: Array,
+        T_odom_camera: Array,
+        mount: Mount | None,
+    ) -> Searched:
+        """Find what moves in a frame whose pose is known."""
+        self._frames_since = 0
+        scene = self._regions.search(frame, T_camera_world, T_odom_camera, mount)
+        xyz_world = self._regions.positions(scene.disparity, T_camera_world)
+        points = self._meter.measure(Look(frame.stamp_ns, scene.left, xyz_world), scene.moving)
+        return Searched(scene.disparity, self._regions.enlarged(scene.moving), points)
+
+    def remember(self, keyframe: KeyframeRecord, searched: Searched) -> None:
+        """Compare later frames with this keyframe."""
+        self._regions.remember(keyframe, searched.disparity)
+
+    def seen_through(
+        self,
+        searched: Searched,
+        sparse_map: SparseMap,
+        ids: NDArray[np.int32],
+        keyframe: KeyframeRecord,
+    ) -> NDArray[np.int32]:
+        """Return those of the points (N,) that a keyframe does not observe but sees through."""
+        ids = np.setdiff1d(ids, keyframe.point_id)
+        points = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])
+        return ids[self._regions.seen_through(searched.disparity, points)]

@@ -4,7 +4,7 @@ A corner is followed back by optical flow. If it stands still, it was where its 
 camera's own motion say, up to the error of the depth (Vedula et al., Three-Dimensional Scene Flow,
 ICCV 1999). Corners are judged together with their neighbours at the same depth.
 
-The camera of the shrunk images in which what moves is searched.
+Points of what moves get their velocity in the same way, from one search to the next.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.residuals import MIN_DEPTH_M
+from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.features import spread
 
 AGES_NS = (300_000_000, 900_000_000)
@@ -32,11 +33,13 @@ CORNERS, CELL_PX = 300, 10
 floor, which tells that it stands still, needs its own."""
 
 APART_PX = 3
+
 MIN_CORNER, SURE_CORNER = 3e-4, 1e-3
 """Smaller eigenvalue of a corner, as OpenCV scales it. Between the two a corner may say that it
 stands still, which it hardly does by chance, but not that it moves."""
 
 WINDOW, LEVELS = (9, 9), 3
+
 MAX_RETURN_PX = 0.5
 """Distance up to which a corner that is followed back and forth comes to where it was."""
 
@@ -44,11 +47,13 @@ MAX_ZOOM, MAX_SHIFT_PX = 1.3, 20.0
 """What stands still and changes its size by more, or its place in the image, is not compared."""
 
 FLOW_TOLERANCE_PX = 1.0
+
 STATIC_SIGMAS, QUARTER_SIGMAS = 3.0, 0.319
 """What moves differs by more than so many sigmas, of which a quarter of normal errors is below the
 second."""
 
 NEIGHBOUR_PX = 15.0
+
 MIN_MOVING = 3
 """Fewest corners of a thing that moves."""
 
@@ -65,6 +70,19 @@ TOLERANCE_PX = 0.6
 
 Disparity = NDArray[np.float32]
 """Disparities (h, w) in px of the shrunk image, 0 where none was found."""
+
+MAX_POINTS = 300
+
+MAX_INTERVAL_S = 1.0
+
+MAX_SPEED_M_S = 20.0
+
+METER_WINDOW_PX = 9
+
+METER_LEVELS = 3
+
+MIN_FOLLOWED = 5
+"""Points of a thing that must be followed for its velocity to be known."""
 
 
 @dataclass(frozen=True)
@@ -274,3 +292,63 @@ class SmallCamera:
         z = np.where(front, there[:, 2], 1.0)
         pixel = self.focal * there[:, :2] / z[:, None] + self.centre
         return np.column_stack([pixel, np.where(front, self.disparity_m / z, 0.0)])
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look at the scene. left: shrunk image (h, w) uint8. xyz_world: (h, w, 3) m, NaN where
+    there is no disparity.
+    """
+
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    xyz_world: Array
+
+
+class MovingPointMeter:
+    """Measures the points of what moves."""
+
+    def __init__(self) -> None:
+        self._last: Look | None = None
+
+    def measure(self, look: Look, moving: NDArray[np.uint8]) -> MovingPoints:
+        """Return the points of a moving region (h, w), 255, and their velocities, in world axes.
+        The points of one connected thing share the median velocity.
+        """
+        known = (moving > 0) & np.isfinite(look.xyz_world[..., 0])
+        _, label = cv2.connectedComponents(moving)
+        v, u = np.nonzero(known)
+        step = -(-len(u) // MAX_POINTS) if len(u) else 1
+        v, u = v[::step], u[::step]
+        xyz = look.xyz_world[v, u]
+        velocity = np.full(xyz.shape, np.nan)
+        last, self._last = self._last, look
+        if last is None or len(u) == 0:
+            return MovingPoints(xyz, velocity)
+        interval_s = (look.stamp_ns - last.stamp_ns) * 1e-9
+        if not 0 < interval_s < MAX_INTERVAL_S:
+            return MovingPoints(xyz, velocity)
+        own = (xyz - _positions_then(look, last, u, v)) / interval_s
+        own[np.linalg.norm(own, axis=1) > MAX_SPEED_M_S] = np.nan
+        of = label[v, u]
+        for thing in np.unique(of):
+            followed = (of == thing) & np.isfinite(own[:, 0])
+            if followed.sum() >= MIN_FOLLOWED:
+                velocity[of == thing] = np.median(own[followed], axis=0)
+        return MovingPoints(xyz, velocity)
+
+
+def _positions_then(look: Look, last: Look, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
+    """Return where pixels (N,) were at the last look, (N, 3); NaN where they are not found."""
+    start = np.stack([u, v], axis=1).astype(np.float32).reshape(-1, 1, 2)
+    window = (METER_WINDOW_PX, METER_WINDOW_PX)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        look.left, last.left, start, np.empty_like(start), winSize=window, maxLevel=METER_LEVELS
+    )
+    at = np.rint(np.asarray(found).reshape(-1, 2)).astype(np.intp)
+    height, width = last.left.shape
+    inside = (np.asarray(status).ravel() > 0) & (at >= 0).all(axis=1)
+    inside &= (at[:, 0] < width) & (at[:, 1] < height)
+    then = np.full((len(u), 3), np.nan)
+    then[inside] = last.xyz_world[at[inside, 1], at[inside, 0]]
+    return then

@@ -1,5 +1,9 @@
 """Closing a loop: keyframes and points move so that both ends meet, and become one map.
 
+A known map that was saved by another drive, or made by this one before it got lost, stays beside
+the drive's own. Once several keyframes in a row see it and agree on where it lies, the drive's own
+map is brought into it (Campos et al., ORB-SLAM3, IEEE T-RO 2021, section VI: map merging).
+
 Pose-graph optimisation: keyframes move until their relative poses fit best.
 
 Minimises the sum of e^T W e with e_ij = log(T_i_j Z_i_j^-1) over T_i_j = T_i T_j^-1 by
@@ -19,12 +23,25 @@ from scipy.sparse.linalg import splu
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
-from segfloor_ros.slam.map.records import LoopEdge, Match
-from segfloor_ros.slam.map.residuals import CHI2_95
+from segfloor_ros.map_file import Arrays
+from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.fusion import fuse_duplicates
+from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
+from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
+from segfloor_ros.slam.places.known_views import views_near
+from segfloor_ros.slam.places.loops import (
+    MAX_MISSES,
+    LoopChecks,
+    are_certain,
+    drift,
+    median_depth_m,
+)
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
+from segfloor_ros.slam.rig import CHI2_95, LOCAL_KEYFRAMES, NEIGHBOURS, Rig
+from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
+from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Images
 
 LINK_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
 """Error, m and rad, of the motion between two keyframes that share points; only the ratio to that
@@ -37,9 +54,17 @@ MIN_LOOP_WEIGHT = 0.25
 """A loop that switches an earlier one off contradicts it, and is not closed."""
 
 STEPS = 20
+
 CONVERGED = 1e-4
+
 LOOP_KERNEL = CHI2_95[6]
 """Squared error of a loop at which it begins to lose weight."""
+
+TIMES_A_LOOP = 2
+"""No drift limits where the known map can be: so many times the sightings of a loop are asked for.
+With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
+be no further away than it can have driven, too.
+"""
 
 
 @dataclass(frozen=True)
@@ -115,22 +140,6 @@ def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> Non
     for keyframe in sparse_map.keyframes[max(0, latest - LOCAL_KEYFRAMES) : latest + 1]:
         if keyframe.retired is None:
             fuse_duplicates(camera, sparse_map, keyframe)
-
-
-def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
-    """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
-    edges = sparse_map.edges
-    last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
-    last[edges.point] = edges.keyframe
-    before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
-    motion = invert(T_camera_world) @ before
-    R, t = motion[last, :3, :3], motion[last, :3, 3]
-    for column in (sparse_map.xyz_world, sparse_map.viewing_direction):
-        column[:] = (R @ column[:, :, None])[:, :, 0]
-    sparse_map.xyz_world[:] += t
-    for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
-        keyframe.T_camera_world = pose
-    sparse_map.follow()
 
 
 def _merge(sparse_map: SparseMap, match: Match) -> None:
@@ -234,3 +243,119 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
     step[moving] = -splu(damped.tocsc()).solve(g)
     return step.reshape(-1, 6)
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A keyframe of the drive's own map that sees the known one. own_ids, known_ids: (N,) stable
+    ids of points that both have.
+    """
+
+    match: Match
+    own_ids: NDArray[np.int32]
+    known_ids: NDArray[np.int32]
+
+
+class KnownMap:
+    """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        own: SparseMap,
+        arrays: Arrays,
+        of_drive: bool,
+    ) -> None:
+        self._own = own
+        self._of_drive = of_drive
+        self._camera = rig.camera
+        self._map = SparseMap()
+        fill_map(self._map, arrays)
+        self._places = PlaceRecognition(rig, self._map)
+        self._places.from_arrays(arrays)
+        self._relocaliser = Relocaliser(self._map, self._places)
+        self._checks = LoopChecks(rig, own, self._map)
+        self._sightings: list[Sighting] = []
+        self._misses = 0
+
+    def recognise(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Whether enough keyframes in a row see the known map, this one the last of them."""
+        match = self._look(keyframe, images)
+        if match is not None and self._is_possible(keyframe, match):
+            self._sightings.append(self._sighting(keyframe, match))
+            self._misses = 0
+        else:
+            self._misses += 1
+            if self._misses > MAX_MISSES:
+                self._sightings = []
+        matches = [sighting.match for sighting in self._sightings]
+        return are_certain(self._own, matches, TIMES_A_LOOP)
+
+    def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
+        if self._of_drive and not self._checks.is_within_reach(match):
+            return False
+        return not self._checks.objection(keyframe, match)
+
+    def is_seen(self, images: Images, features: Features, stamp_ns: int) -> bool:
+        """Whether enough frames in a row see the known map, this one the last of them."""
+        found = self._relocaliser.find_surely(images, features, stamp_ns)
+        return found is not None
+
+    def _look(self, keyframe: KeyframeRecord, images: Images) -> Match | None:
+        """Look for the view where the keyframes before saw it, else in the whole known map."""
+        features = keyframe.features
+        if self._sightings:
+            pose = keyframe.T_camera_world @ drift(self._own, self._sightings[-1].match)
+            depth_m = median_depth_m(self._own, keyframe)
+            around = self._map.points_of(views_near(self._map, pose, depth_m, NEIGHBOURS))
+            track = self._places.confirm(images, features, around, pose)
+        else:
+            track = self._relocaliser.find(images, features)
+        if track is None or track.observed is None:
+            return None
+        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
+        ids = track.observed.point_id[rows]
+        order, _ = self._map.covisible(ids)
+        stable_ids = self._map.stable_id[ids]
+        return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable_ids)
+
+    def _sighting(self, keyframe: KeyframeRecord, match: Match) -> Sighting:
+        own = keyframe.point_id[match.rows]
+        both = own != NO_POINT
+        return Sighting(match, self._own.stable_id[own[both]].copy(), match.stable_ids[both])
+
+    def merge(self, own_words: Arrays) -> Arrays:
+        """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
+        words of all keyframes.
+        """
+        latest = self._sightings[-1].match
+        T_known_own = invert(drift(self._own, latest))
+        before = len(self._map.keyframes)
+        arrays = moved(map_to_arrays(self._own), T_known_own)
+        known = self.to_arrays()
+        self.restore(known)
+        fill_map(self._own, arrays)
+        for sighting in self._sightings:
+            match, i = sighting.match, before + sighting.match.keyframe
+            place = self._own.keyframes[match.place]
+            T_i_j = match.T_camera_world @ place.T_world_camera
+            self._own.loops.append(LoopEdge(i, match.place, T_i_j))
+            merge_pairs(self._own, self._rows(sighting.own_ids), self._rows(sighting.known_ids))
+        fuse_latest(self._camera, self._own, before + latest.keyframe)
+        return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
+
+    def to_arrays(self) -> Arrays:
+        """Return the known map and the words of its keyframes."""
+        return map_to_arrays(self._map) | self._places.to_arrays()
+
+    def restore(self, known: Arrays) -> None:
+        """Put the known map, as `to_arrays` returns it, in the place of the drive's own."""
+        self._own.reset()
+        fill_map(self._own, known)
+
+    def _rows(self, stable_ids: NDArray[np.int32]) -> NDArray[np.intp]:
+        """Return the rows (N,) of points in the merged map, -1 for those that are gone."""
+        rows = np.searchsorted(self._own.stable_id, stable_ids)
+        rows = np.minimum(rows, len(self._own.stable_id) - 1)
+        there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
+        return np.where(there, rows, -1)

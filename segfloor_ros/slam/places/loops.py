@@ -2,7 +2,7 @@
 
 Precision comes first: a loop that is missed costs drift, a false one costs the map. The place must
 lie where drift can have put it, several keyframes in a row must see it, each on its own, and they
-must agree.
+must agree on drift and floor, and see the same space from both sides.
 """
 
 from __future__ import annotations
@@ -14,30 +14,85 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
-from segfloor_ros.geometry import Array, invert
+from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import RECENT, views_near
-from segfloor_ros.slam.places.loop_checks import (
-    FREE_DRIFT_M,
-    MAX_DRIFT,
-    LoopChecks,
-    are_certain,
-    drift,
-    median_depth_m,
-)
-from segfloor_ros.slam.places.place_recognition import PlaceRecognition
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition, greatest_speed_mps
 from segfloor_ros.slam.results import MIN_SHARED, NO_POINT, Track
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import MIN_DEPTH_M, Rig
 from segfloor_ros.slam.tracking.images import Images
 
 MIN_SHARED_SHARE = 0.25
 """Keyframes that share so many points are linked already; fewer are shared by chance."""
 
 CANDIDATES = 2
+
 MAX_MISSES = 1
+
 REMEMBERED = 1000
+
+MAX_DRIFT = 0.04
+"""Drift of a path, m per m: stereo odometry drifts by one per cent or less."""
+
+MAX_TURN_DRIFT_RADPM = 0.01
+
+LEAST_DRIFT_M = 0.02
+
+LEAST_DRIFT_RAD = 0.005
+"""Less is no drift: the local adjustments take it away."""
+
+FREE_DRIFT_M = 0.3
+
+FREE_DRIFT_RAD = 0.1
+
+FREE_WAY_M = 0.5
+
+MAX_STEP_UP_M = 0.1
+
+MAX_SLOPE = 0.15
+
+MAX_TILT_RAD = 0.2
+"""Where a robot stands on the same floor again, its camera is about as high and as level as before:
+floors slope, and carts shake."""
+
+MIN_BACK_SHARE = 0.6
+
+MAX_BACK_PX = 4.0
+"""The points of the keyframe must be where the place's own view shows what they are."""
+
+BESIDE_PX = 5.0
+"""Points so near to each other in an image lie on about the same ray."""
+
+IN_FRONT_PX = 3.0
+
+IN_FRONT_SHARE = 0.1
+"""A point is in front of another on its ray where its disparity is larger by so much, and by this
+share."""
+
+MAX_SEEN_THROUGH = 0.2
+"""Share of points that the other side may see through: edges hide what is behind by a few pixels.
+"""
+
+CONFIRMATIONS = 3
+"""Keyframes in a row that must see the place."""
+
+MIN_MOVED_M = 0.2
+
+MIN_TURNED_RAD = 0.2
+"""So far the camera must have moved while it saw the place, or turned: what is alike from one place
+differs from the next."""
+
+AGREE_M = 0.05
+
+AGREE_RAD = 0.02
+"""Keyframes in a row must show the same drift up to this and a share of the depth of the view."""
+
+AGREE_DEPTH_SHARE = 0.02
+
+NEAREST_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -190,3 +245,157 @@ def path_lengths(sparse_map: SparseMap, index: int) -> Array:
     weight = np.linalg.norm(centres[i] - centres[j], axis=1) + 1e-6
     graph = sparse.csr_matrix((weight, (i, j)), shape=(len(centres), len(centres)))
     return np.asarray(dijkstra(graph, directed=False, indices=[index]))[0]
+
+
+class LoopChecks:
+    """Judges whether a keyframe can see a place: of its own map again, or of another, known one."""
+
+    def __init__(self, rig: Rig, sparse_map: SparseMap, known: SparseMap | None = None) -> None:
+        self._rig = rig
+        self._camera = rig.camera
+        self._map = sparse_map
+        self._known = known or sparse_map
+
+    def objection_to_drift(self, keyframe: KeyframeRecord, match: Match, length_m: float) -> str:
+        """Return what speaks against a match in the same map: a way of length_m cannot have drifted
+        so far, or has not drifted; '' for nothing.
+        """
+        moved = match.T_camera_world @ keyframe.T_world_camera
+        moved_m, turned = float(np.linalg.norm(moved[:3, 3])), rotation_angle(moved[:3, :3])
+        if moved_m <= LEAST_DRIFT_M and turned <= LEAST_DRIFT_RAD:
+            return 'no drift'
+        if (
+            moved_m > FREE_DRIFT_M + MAX_DRIFT * length_m
+            or turned > FREE_DRIFT_RAD + MAX_TURN_DRIFT_RADPM * length_m
+        ):
+            return 'more than drift'
+        return ''
+
+    def is_within_reach(self, match: Match) -> bool:
+        """Whether the robot can have come there while it was lost: from the last keyframe of the
+        known map to the first of its own.
+        """
+        first, known = self._map.keyframes[0], self._known.keyframes
+        T_own_known = drift(self._map, match)
+        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
+        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
+        return bool(np.linalg.norm(way[:3, 3]) <= FREE_WAY_M + greatest_speed_mps(known) * lost_s)
+
+    def objection(self, keyframe: KeyframeRecord, match: Match) -> str:
+        """Return what else speaks against a match, '' for nothing."""
+        if not self.is_level(match):
+            return 'another floor'
+        if not self._holds_back(keyframe, match):
+            return 'not seen from the other side'
+        if self._seen_through(keyframe, match) > MAX_SEEN_THROUGH:
+            return 'free space through obstacles'
+        return ''
+
+    def is_level(self, match: Match) -> bool:
+        """Whether the robot stands on the floor of the place, as far as the mount is known."""
+        mount = self._rig.mount
+        if mount is None:
+            return True
+        place = self._known.keyframes[match.place]
+        T_base_left = mount.T_base_left
+        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
+        T = T_base_left @ T_place_now @ invert(T_base_left)
+        up_m = abs(T[2, 3]) - MAX_SLOPE * float(np.linalg.norm(T[:2, 3]))
+        tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+        return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_TILT_RAD)
+
+    def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
+        """Whether the keyframe's own points lie where the place's keyframe sees what they match."""
+        own = keyframe.point_id[match.rows]
+        point, holder, row = self._known.edges_of(match.ids)
+        of_place = holder == match.place
+        slot = np.searchsorted(np.sort(match.ids), point[of_place])
+        slot = np.argsort(match.ids)[slot]
+        measured = own[slot] != NO_POINT
+        slot, row = slot[measured], row[of_place][measured]
+        if len(slot) < MIN_SHARED:
+            return False
+        place = self._known.keyframes[match.place]
+        T_place_world = place.T_camera_world @ invert(match.T_camera_world)
+        local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
+        uv, _ = self._project(transform_points(T_place_world, local))
+        gap = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
+        return float((gap < MAX_BACK_PX).mean()) >= MIN_BACK_SHARE
+
+    def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
+        """Return the larger share of the points of one side that the other sees through, were both
+        the same place: the rays to what is seen are free.
+        """
+        place = self._known.keyframes[match.place]
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        known = place.point_id[place.point_id != NO_POINT]
+        if self._known is self._map:
+            own = np.setdiff1d(own, known)
+        in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
+        in_place = transform_points(place.T_camera_world, self._known.xyz_world[known])
+        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
+        return max(
+            self._share_in_front(transform_points(T_place_now, in_now), in_place),
+            self._share_in_front(transform_points(invert(T_place_now), in_place), in_now),
+        )
+
+    def _share_in_front(self, points: Array, seen: Array) -> float:
+        """Return the share of points (N, 3) that lie in front of what a camera sees (M, 3) beside
+        them, both in its optical frame; 0 where few can be compared.
+        """
+        (uv, disparity), (uv_seen, disparity_seen) = self._project(points), self._project(seen)
+        valid = np.isfinite(uv).all(axis=1) & (uv >= 0).all(axis=1)
+        valid &= (uv < (self._camera.width, self._camera.height)).all(axis=1)
+        visible = np.isfinite(uv_seen).all(axis=1)
+        if not valid.any() or not visible.any():
+            return 0.0
+        gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=BESIDE_PX)
+        beside = np.isfinite(gap)
+        if beside.sum() < MIN_SHARED:
+            return 0.0
+        behind = disparity_seen[visible][np.asarray(near)[beside]]
+        margin = np.maximum(IN_FRONT_PX, IN_FRONT_SHARE * behind)
+        return float((disparity[valid][beside] - behind > margin).mean())
+
+    def _project(self, points: Array) -> tuple[Array, NDArray[np.float64]]:
+        """Return the pixels (N, 2) and disparities (N,) of points (N, 3) of an optical frame; NaN
+        behind the camera.
+        """
+        front = points[:, 2] > MIN_DEPTH_M
+        uvr = self._camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))
+        uvr[~front] = np.nan
+        return uvr[:, :2], uvr[:, 0] - uvr[:, 2]
+
+
+def drift(sparse_map: SparseMap, match: Match) -> Array:
+    """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
+    own = sparse_map.keyframes[match.keyframe].T_camera_world
+    return invert(own) @ match.T_camera_world
+
+
+def are_certain(sparse_map: SparseMap, matches: list[Match], times: int = 1) -> bool:
+    """Whether enough keyframes agree, over enough of a motion. times: as many and as much as for a
+    loop.
+    """
+    if len(matches) < times * CONFIRMATIONS:
+        return False
+    latest = matches[-1]
+    motion = latest.T_camera_world @ invert(matches[0].T_camera_world)
+    moved = float(np.linalg.norm(motion[:3, 3])) >= times * MIN_MOVED_M
+    if not (moved or rotation_angle(motion[:3, :3]) >= times * MIN_TURNED_RAD):
+        return False
+    keyframe = sparse_map.keyframes[latest.keyframe]
+    limit_m = AGREE_M + AGREE_DEPTH_SHARE * median_depth_m(sparse_map, keyframe)
+    for match in matches[:-1]:
+        # Both drifts, at the latest keyframe.
+        gap = keyframe.T_camera_world @ drift(sparse_map, match) @ invert(latest.T_camera_world)
+        if np.linalg.norm(gap[:3, 3]) > limit_m or rotation_angle(gap[:3, :3]) > AGREE_RAD:
+            return False
+    return True
+
+
+def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
+    """Return the median depth of what a keyframe sees."""
+    ids = keyframe.point_id[keyframe.point_id != NO_POINT]
+    depth = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])[:, 2]
+    return max(float(np.median(depth)), NEAREST_M) if len(ids) else NEAREST_M

@@ -17,7 +17,7 @@ import numpy as np
 
 from segfloor_ros.geometry import Array, rotation_angle
 from segfloor_ros.measurements import Up
-from segfloor_ros.slam.map.residuals import is_gated
+from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 
 SIGMA_SEEN_M = 0.003

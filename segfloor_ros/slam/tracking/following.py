@@ -12,15 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, transform_points
-from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import MIN_TRACKED, Track
-from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.tracking.consensus import MIN_AGREEMENT, Agreement, Consensus
+from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations, Rig
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import Images, Region, follow_pixels, is_inside
-from segfloor_ros.slam.tracking.map_tracking import TRACKED_POINTS, Prediction, predict_points
-from segfloor_ros.slam.tracking.point_measurement import align_pixels, measure_disparity
+from segfloor_ros.slam.tracking.map_tracking import (
+    TRACKED_POINTS,
+    Prediction,
+    align_pixels,
+    predict_points,
+)
+from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
+from segfloor_ros.slam.tracking.pose import MIN_AGREEMENT, Agreement, Consensus
 
 MAX_FOLLOWED = 250
 SIGMA_FLOW_PX = 1.0

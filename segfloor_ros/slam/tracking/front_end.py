@@ -12,16 +12,17 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.loop_checks import greatest_speed_mps
-from segfloor_ros.slam.places.place_recognition import PlaceRecognition
-from segfloor_ros.slam.places.relocalisation import Relocaliser, is_within
+from segfloor_ros.slam.places.place_recognition import (
+    PlaceRecognition,
+    Relocaliser,
+    greatest_speed_mps,
+    is_within,
+)
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, LastPose, ObservedFeatures, Track
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
-from segfloor_ros.slam.tracking.consensus import differ
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
-from segfloor_ros.slam.tracking.firm_points import count_firm
 from segfloor_ros.slam.tracking.following import MIN_FOUND, Follower
 from segfloor_ros.slam.tracking.images import (
     ImageRotation,
@@ -40,7 +41,8 @@ from segfloor_ros.slam.tracking.motion import (
     TrackingState,
     sigma_m,
 )
-from segfloor_ros.slam.tracking.pose_information import PoseInformation, with_patch_noise
+from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
+from segfloor_ros.slam.tracking.pose import PoseInformation, differ
 
 RECOVERY_RATIO = MIN_FOUND
 """Share of the points expected in view that a camera which was lost must find: far points alone

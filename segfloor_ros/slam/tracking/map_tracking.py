@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.residuals import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import (
     SEEN_BY_SEVERAL,
@@ -27,13 +26,7 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, Rig
-from segfloor_ros.slam.tracking.consensus import (
-    KNOWN_NOISE,
-    MIN_AGREEMENT,
-    Agreement,
-    Consensus,
-)
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, Rig
 from segfloor_ros.slam.tracking.features import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
@@ -43,8 +36,19 @@ from segfloor_ros.slam.tracking.features import (
     match_unguided,
 )
 from segfloor_ros.slam.tracking.images import Images, Region, is_inside
-from segfloor_ros.slam.tracking.point_measurement import align_pixels, measure_disparity
-from segfloor_ros.slam.tracking.pose import PoseEstimate, solve_pnp
+from segfloor_ros.slam.tracking.patch_alignment import (
+    MIN_SIGMA_PIXEL,
+    align_patches,
+    measure_disparity,
+)
+from segfloor_ros.slam.tracking.pose import (
+    KNOWN_NOISE,
+    MIN_AGREEMENT,
+    Agreement,
+    Consensus,
+    PoseEstimate,
+    solve_pnp,
+)
 
 SIGMA_PIXEL = 0.6
 """Standard deviation of a corner's position at the finest pyramid level, px; grows with the
@@ -332,3 +336,26 @@ class LocalMap:
             depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
             self._depth_m = max(float(np.median(depth)), MIN_DEPTH_M)
         return self._depth_m
+
+
+def align_pixels(
+    left: NDArray[np.float32],
+    observations: Observations,
+    rows: NDArray[np.intp],
+    sparse_map: SparseMap,
+    ids: NDArray[np.int32],
+    T_camera_world: Array,
+) -> NDArray[np.bool_]:
+    """Move observations, in place, from where they are to where the patches of their points lie.
+
+    left: (H, W) float32. rows, ids: (N,) the observations and their points. T_camera_world: the
+    pose as known so far. Returns which patches were found (N,); the others stay as they were.
+    """
+    points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
+    zoom = sparse_map.patch_distance_m[ids] / np.linalg.norm(points, axis=1)
+    template = sparse_map.patch[ids].astype(np.float32)
+    found = align_patches(template, left, observations.uvd_px[rows, :2], zoom)
+    sound = rows[found.sound]
+    observations.uvd_px[sound, :2] = found.uv_px[found.sound]
+    observations.sigma_px[sound, :2] = np.clip(found.sigma_px[found.sound], MIN_SIGMA_PIXEL, None)
+    return found.sound

@@ -16,8 +16,8 @@ from segfloor_ros.geometry import (
     se3_exp,
     se3_log,
 )
-from segfloor_ros.slam.map.residuals import is_gated
 from segfloor_ros.slam.results import LastPose
+from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 

@@ -1,25 +1,36 @@
-"""Sub-pixel alignment of image patches.
+"""Patches of an image: where they lie in another one, to a fraction of a pixel, and how well they
+determine that.
 
 Corners and descriptors find *which* point a feature is; where it is to a tenth of a pixel or
 better, the grey levels around it determine. A patch on the floor does not only shift between two
 views, it is sheared and stretched too; so the fit has an affine part, and a gain and an offset
 for brightness (Lucas and Kanade 1981; Baker and Matthews, Lucas-Kanade 20 Years On, 2004, for
-the parametrised form).
+the parametrised form). A patch determines how far it shifted as well as its slopes allow against
+the noise of the camera (the Cramer-Rao bound; Foerstner and Guelch 1987): an edge only across
+itself, a plain face not at all. Patches that overlap hold the same pixels and err together.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.depth import disparity_at
 from segfloor_ros.geometry import Array
+from segfloor_ros.slam.rig import Observations
+from segfloor_ros.slam.tracking.images import Images
 
 HALF_PATCH_PX = 5
+
 SIDE_PX = 2 * HALF_PATCH_PX + 1
+
 STEPS = 4
+
 AFFINE_SIGMA = 0.3
 """Prior standard deviation of the affine part, px per px; the floor under a low camera reaches
 0.5.
@@ -32,11 +43,38 @@ MAX_UNEXPLAINED = 0.5
 """Share of a patch's variance that may remain after a fit."""
 
 MAX_SHIFT_PX = 2.0
+
 MAX_LAST_STEP_PX = 0.1
+
 MAX_SHIFT_STEP_PX = 1.0
+
 MAX_SLOPE_STEP = 0.3
 
 Patches = NDArray[np.float32]
+
+MIN_SIGMA_PIXEL = 0.15
+
+MIN_SIGMA_DISPARITY = 0.1
+
+MIN_CORRELATION = 0.7
+
+REACH_PX = 5
+
+MIN_RATIO = 0.15
+"""Smaller over larger eigenvalue of the structure tensor (Harris and Stephens 1988); of corners and
+textures it is more, of an edge with the noise of a camera less."""
+
+CELLS, PER_CELL = 80, 3
+"""Parts into which an image is divided, and points of each that count."""
+
+NOISE_SLOPE = 0.04
+"""Mean square of a slope of noise of unit variance, smoothed by one pixel: 1 / (8 pi)."""
+
+ALIASED = 0.3
+"""Share of the slopes across an edge that its sampling in steps of pixels shows along it."""
+
+LEAST_SHIFT = 1e-4
+"""Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
 
 
 @dataclass(frozen=True)
@@ -202,3 +240,121 @@ def _remap(image: NDArray[np.float32], u: Patches, v: Patches) -> Patches:
             borderMode=cv2.BORDER_REPLICATE,
         )
     return values
+
+
+def measure_disparity(
+    images: Images,
+    observations: Observations,
+    rows: NDArray[np.intp],
+    guess_px: Array,
+    reach_px: int = 0,
+) -> None:
+    """Set, in place, the disparities of observations `rows` (N,) near a guess (N,); NaN where
+    there is none within the reach. A depth camera needs no guess.
+    """
+    uv_px = observations.uvd_px[rows, :2]
+    if images.depth_scale:
+        disparity, sigma = disparity_at(images.right, images.depth_scale, uv_px)
+    else:
+        disparity, sigma = refine_disparity(images.left, images.right, uv_px, guess_px, reach_px)
+    observations.uvd_px[rows, 2] = disparity
+    observations.sigma_px[rows, 2] = np.clip(sigma, MIN_SIGMA_DISPARITY, None)
+
+
+def refine_disparity(
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    uv_px: Array,
+    guess_px: Array,
+    reach_px: int,
+) -> tuple[Array, Array]:
+    """Find the disparity of each feature within `reach_px` of a guess.
+
+    left, right: rectified grey images (H, W) float32. uv_px: (N, 2) in the left image. guess_px:
+    (N,). First the best whole-pixel shift by normalised correlation, then the affine alignment of
+    the patch along the row. Returns disparity (N,) and its standard deviation (N,) in pixels, NaN
+    where there is no clear peak inside the reach.
+    """
+    disparity: Array = np.full(len(uv_px), np.nan)
+    sigma: Array = np.full(len(uv_px), np.nan)
+    if len(uv_px) == 0:
+        return disparity, sigma
+    template = sample_patches(left, uv_px)
+    uv_right = uv_px.astype(np.float64)
+    uv_right[:, 0] -= guess_px
+    rows = np.arange(len(uv_px))
+    if reach_px > 0:
+        score = correlation_along_row(template, right, uv_right, reach_px)
+        peak = score.argmax(axis=1)
+        inside = (peak > 0) & (peak < 2 * reach_px)
+        rows = np.flatnonzero(inside & (score[rows, peak] >= MIN_CORRELATION))
+        uv_right[rows, 0] += peak[rows] - reach_px
+    found = align_patches(template[rows], right, uv_right[rows], np.ones(len(rows)), along_row=True)
+    rows, found_u = rows[found.sound], found.uv_px[found.sound, 0]
+    disparity[rows] = uv_px[rows, 0] - found_u
+    sigma[rows] = found.sigma_px[found.sound, 0]
+    return disparity, sigma
+
+
+def count_firm(image: NDArray[Any], uv_px: Array) -> int:
+    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures; of many
+    in one part of the image some.
+    """
+    firm = uv_px[_is_firm(image, uv_px)]
+    cell = (firm // np.sqrt(image.size / CELLS)).astype(np.intp)
+    _, counts = np.unique(cell, axis=0, return_counts=True)
+    return int(np.minimum(counts, PER_CELL).sum())
+
+
+def _is_firm(image: NDArray[Any], uv_px: Array) -> NDArray[np.bool_]:
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    height, width = image.shape
+    columns, rows = np.rint(uv_px).astype(np.intp).T
+    steps = np.arange(-REACH_PX, REACH_PX + 1)
+    patches = smooth[
+        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
+        np.clip(columns[:, None, None] + steps, 0, width - 1),
+    ].astype(np.float32)
+    by_x = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]
+    by_y = patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]
+    xx, xy, yy = ((a * b).sum(axis=(1, 2)) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
+    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    return np.asarray(middle - spread > MIN_RATIO * (middle + spread))
+
+
+def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observations:
+    """Return observations (N) whose pixels have at least the noise that the patches of a grey image
+    (H, W) around them allow: on an edge, that along it.
+    """
+    shift = _shift_information(image, observations.uvd_px[:, :2])
+    variance = np.linalg.inv(shift + LEAST_SHIFT * np.eye(2))
+    sigma = observations.sigma_px.copy()
+    sigma[:, :2] = np.maximum(sigma[:, :2], np.sqrt(np.einsum('nii->ni', variance)))
+    return replace(observations, sigma_px=sigma)
+
+
+def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:
+    """Return the information (N, 2, 2) in 1/px² that patches around pixels (N, 2) give of their
+    shift, freed of what noise alone would show.
+    """
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    height, width = image.shape
+    columns, rows = np.rint(uv_px).astype(np.intp).T
+    steps = np.arange(-HALF_PATCH_PX - 1, HALF_PATCH_PX + 2)
+    patches = smooth[
+        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
+        np.clip(columns[:, None, None] + steps, 0, width - 1),
+    ].astype(np.float32)
+    by_u = (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]) / 2
+    by_v = (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]) / 2
+    slopes = np.stack([by_u, by_v], axis=1).reshape(len(uv_px), 2, SIDE_PX**2)
+    energy, axes = np.linalg.eigh(slopes @ np.swapaxes(slopes, 1, 2))
+    of_noise = NOISE_SLOPE * GREY_NOISE**2 * SIDE_PX**2
+    apparent = 2 * of_noise + ALIASED * energy[:, 1:]
+    known = np.maximum(energy - apparent, 0.0) / GREY_NOISE**2
+    known /= 1 + MIN_SIGMA_PIXEL**2 * known
+    if len(uv_px):
+        tree = cKDTree(uv_px)
+        crowd = tree.query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
+        known /= np.asarray(crowd)[:, None]
+    return np.asarray((axes * known[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)

@@ -7,12 +7,11 @@ import pytest
 from bundle_problems import CAMERA, disturbed, make_problem
 
 from segfloor_ros.geometry import se3_exp, transform_points
-from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.mapping import normal_equations
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, adjust
-from segfloor_ros.slam.mapping.normal_equations import inverse_cholesky
+from segfloor_ros.slam.mapping.normal_equations import Link, inverse_cholesky
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-from segfloor_ros.slam.sensors.motion_links import Link
 
 
 def test_returns_to_the_truth_from_a_disturbed_start():

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.slam.map.map_arrays import fill_map
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
-from segfloor_ros.slam.places.loop_closing import move_keyframes
+from segfloor_ros.slam.mapping.bundle_adjustment import (
+    apply_global,
+    copy_map,
+    move_keyframes,
+    solve_global,
+)
 from segfloor_ros.slam.rig import NO_OFFSET
+from segfloor_ros.slam.saved_slam import fill_map
 from tools.map_costs import CAMERA, bend, made_up_map, ring
 
 COUNT = 80

@@ -9,11 +9,10 @@ from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.slam.map.records import Match
-from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.loop_checks import LoopChecks, are_certain
+from segfloor_ros.slam.places.loops import LoopChecks, are_certain
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import Observations, Rig
 
 MOUNT = Mount(0.4, 0.15)
 POINTS, _ = SCENES['wall']

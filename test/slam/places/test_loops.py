@@ -9,8 +9,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.map.records import Match
-from segfloor_ros.slam.places.loop_checks import LoopChecks
-from segfloor_ros.slam.places.loop_closing import move_keyframes
+from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
+from segfloor_ros.slam.places.loops import LoopChecks
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 

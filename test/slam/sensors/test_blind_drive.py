@@ -12,8 +12,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert
 from segfloor_ros.measurements import ImuSample, WheelPose
-from segfloor_ros.slam.map.residuals import Observations
 from segfloor_ros.slam.results import Track
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import Images

@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.measurements import ImuSample, Up
+from segfloor_ros.measurements import ImuSample
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity
-from segfloor_ros.slam.sensors.motion_links import Level, with_factors
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 """Up in the first camera: it looks 7 degrees down and hardly rolls."""
@@ -83,21 +82,3 @@ def test_a_measurement_is_given_to_one_keyframe():
     up = gravity.up_camera(pose(6.0, False))
     assert degrees_between(up.direction, UP) < 1.0
     assert gravity.up_camera(pose(6.0, False)) is None
-
-
-def test_a_keyframe_that_tilts_is_turned_back():
-    tilt = Rotation.from_rotvec([0.02, 0.3, -0.01]).as_matrix()
-    poses = np.stack([make_transform(tilt, np.zeros(3))])
-    level = Level(0, Up(Rotation.from_rotvec([0.0, 0.3, 0.0]).apply(UP), 0.01), UP)
-    before = np.linalg.norm(level.error(poses))
-    assert before > 0.015
-    from test_motion_links import empty_system
-
-    from segfloor_ros.geometry import se3_exp
-
-    for _ in range(3):
-        step = with_factors(empty_system(1), poses, (level,)).solve(0.0)
-        poses = se3_exp(step.twists) @ poses
-    assert np.linalg.norm(level.error(poses)) < 0.01 * before
-    # Turning about up is free.
-    assert Rotation.from_matrix(poses[0, :3, :3]).magnitude() == pytest.approx(0.3, abs=0.03)

@@ -7,10 +7,8 @@ import pytest
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.geometry import Array, invert, se3_exp, se3_log, transform_points
-from segfloor_ros.slam.map.residuals import Observations
-from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.tracking.consensus import Consensus
-from segfloor_ros.slam.tracking.pose import refine_pose
+from segfloor_ros.slam.rig import Observations, Rig
+from segfloor_ros.slam.tracking.pose import Consensus, refine_pose
 
 STILL, MOVING = 60, 140
 TRUTH = se3_exp(np.array([0.02, -0.01, 0.05, 0.004, 0.02, -0.006]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.slam.tracking.firm_points import count_firm
+from segfloor_ros.slam.tracking.patch_alignment import count_firm
 
 RNG = np.random.default_rng(3)
 

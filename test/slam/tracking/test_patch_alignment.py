@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from segfloor_ros.slam.tracking.patch_alignment import align_patches, sample_patches
-from segfloor_ros.slam.tracking.point_measurement import refine_disparity
+from segfloor_ros.slam.tracking.patch_alignment import (
+    align_patches,
+    refine_disparity,
+    sample_patches,
+)
 
 
 class Texture:

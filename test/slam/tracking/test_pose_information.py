@@ -7,11 +7,11 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.measurements import WheelPose
-from segfloor_ros.slam.map.residuals import Observations
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking.pose import PoseEstimate
-from segfloor_ros.slam.tracking.pose_information import PoseInformation, with_patch_noise
+from segfloor_ros.slam.tracking.patch_alignment import with_patch_noise
+from segfloor_ros.slam.tracking.pose import PoseEstimate, PoseInformation
 
 RNG = np.random.default_rng(3)
 START = RNG.bit_generator.state

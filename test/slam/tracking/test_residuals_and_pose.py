@@ -5,7 +5,7 @@ import pytest
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import invert, se3_exp, se3_log, transform_points
-from segfloor_ros.slam.map.residuals import (
+from segfloor_ros.slam.rig import (
     Observations,
     huber_cost,
     huber_weights,

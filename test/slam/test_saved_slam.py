@@ -138,13 +138,13 @@ def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch)
     monkeypatch.setattr(
         'segfloor_ros.slam.tracking.front_end.RECOVERY_RATIO', 1.0
     )  # the whole map alone
-    monkeypatch.setattr('segfloor_ros.slam.places.relocalisation.MIN_AGREEMENT', 1.01)
+    monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.MIN_AGREEMENT', 1.01)
     assert not slam.process(other.frame(31, here))[0].tracked
     assert slam.process(ROOM.frame(32, here))[0].tracked
 
 
 def test_who_is_lost_must_see_what_is_expected_all_over_the_image(mapped, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.places.relocalisation.MIN_AGREEMENT', 1.01)
+    monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.MIN_AGREEMENT', 1.01)
     slam = loaded(mapped, localize=True)
     results = [slam.process(ROOM.frame(k, there(25)[10]))[0] for k in range(5)]
     assert not any(result.tracked for result in results)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import invert, se3_exp, se3_log
-from segfloor_ros.slam.map.residuals import CHI2_95
-from segfloor_ros.slam.mapping.normal_equations import System
+from segfloor_ros.geometry import invert, make_transform, se3_exp, se3_log
+from segfloor_ros.measurements import Up
+from segfloor_ros.slam.mapping.normal_equations import Level, Link, System, chi2, cost, with_factors
+from segfloor_ros.slam.rig import CHI2_95
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-from segfloor_ros.slam.sensors.motion_links import Link, chi2, cost, with_factors
+
+UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 
 RNG = np.random.default_rng(4)
 POSES = np.stack([se3_exp(RNG.normal(size=6) * 0.4) for _ in range(3)])
@@ -73,3 +76,17 @@ def test_a_step_brings_free_poses_where_they_were_measured():
 def test_without_links_the_system_stays_as_it_is():
     system = empty_system(2)
     assert with_factors(system, POSES, ()) is system
+
+
+def test_a_keyframe_that_tilts_is_turned_back():
+    tilt = Rotation.from_rotvec([0.02, 0.3, -0.01]).as_matrix()
+    poses = np.stack([make_transform(tilt, np.zeros(3))])
+    level = Level(0, Up(Rotation.from_rotvec([0.0, 0.3, 0.0]).apply(UP), 0.01), UP)
+    before = np.linalg.norm(level.error(poses))
+    assert before > 0.015
+    for _ in range(3):
+        step = with_factors(empty_system(1), poses, (level,)).solve(0.0)
+        poses = se3_exp(step.twists) @ poses
+    assert np.linalg.norm(level.error(poses)) < 0.01 * before
+    # Turning about up is free.
+    assert Rotation.from_matrix(poses[0, :3, :3]).magnitude() == pytest.approx(0.3, abs=0.03)
