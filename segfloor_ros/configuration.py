@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.cloud.labelled_cloud import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
-from segfloor_ros.floor.settings import FloorSegmentationSettings
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings
+from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.settings import GONE, RobotSettings, StageSettings, setting, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
 

@@ -39,8 +39,7 @@ from segfloor_ros.evaluation.map_score import (
     score_map,
 )
 from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.grid.map_file import OccupancyGrid, save_map
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings, save_map
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.floor.disparity.matching import DisparityMatcher, TwoScaleMatcher
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings
 
 TRUTH_STEPS_PER_PX = 4
 NUM_DISPARITIES = 64

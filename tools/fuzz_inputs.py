@@ -20,7 +20,7 @@ from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, CorridorImages
 from segfloor_ros.camera.bag_writer import convert
 from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.main import app
 from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR

@@ -144,14 +144,10 @@ FLOOR: dict[str, Mechanism] = {
     ),
     'trimming to edges': Mechanism({'floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(
-        {
-            'floor.mask.overhead.OverheadMatcher.positions': lambda *_, **__: np.zeros(
-                (2, 0), np.float32
-            )
-        }
+        {'floor.scan.OverheadMatcher.positions': lambda *_, **__: np.zeros((2, 0), np.float32)}
     ),
     'boards known by their ends': Mechanism(
-        {'floor.mask.overhead._with_boards': lambda disparity, known, telling: telling}
+        {'floor.scan._with_boards': lambda disparity, known, telling: telling}
     ),
 }
 """What makes the masks and the floor scan."""

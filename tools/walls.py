@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import LabelledPoints
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.map_score import compare, score_cells
 from segfloor_ros.evaluation.maps import MapTruth, cell_centres, from_frame, load_truth, states
@@ -30,7 +30,7 @@ from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.map_file import FREE, OccupancyGrid
 from segfloor_ros.grid.mapper import EvidenceHistory
-from segfloor_ros.grid.rendering import render
+from segfloor_ros.grid.raster import render
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import KeyframeFeatures

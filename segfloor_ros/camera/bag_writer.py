@@ -1,6 +1,5 @@
-"""Writing stereo pairs to rosbag2 (mcap), by `rosbags`, without a ROS install.
-
-What a robot measures besides images as ROS messages of a bag, by `rosbags`.
+"""Stereo pairs, and what a robot measures besides, as a rosbag2 (mcap), by `rosbags`, without a ROS
+install.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import is_disparity
-from segfloor_ros.camera.ros_messages import NOT_MEASURED
+from segfloor_ros.camera.images import NOT_MEASURED
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, os_errors

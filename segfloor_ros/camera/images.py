@@ -1,6 +1,7 @@
-"""Decoding of images to grey, and of 16-bit grey to 8 bits.
+"""Images as grey pixels, and what else ROS messages say, of `rclpy` as well as of `rosbags`.
 
-The black border that rectification leaves around an image: nothing was seen there.
+Encodings are decoded, 16 bits brought to 8, and the black border is found that rectification
+leaves: nothing was seen there. Messages tell calibrations and what wheels and IMUs have measured.
 """
 
 from __future__ import annotations
@@ -11,8 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros import MAX_PIXELS
+from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
+from segfloor_ros.geometry import Array, transform_from_quaternion
+from segfloor_ros.measurements import ImuSample, WheelPose
 
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
@@ -39,6 +44,9 @@ _MARGIN_PX = 12
 """Blocks that are matched and windows of texture reach so far: the border's edge is no texture."""
 _LEAST_PX = 40
 """Black pixels of the scene that touch the image's edge are fewer, at half the resolution."""
+
+NOT_MEASURED = -1.0
+"""First element of a covariance of what an IMU does not measure (sensor_msgs/Imu)."""
 
 
 def grey_image(message: Any, name: str) -> Grey:
@@ -166,3 +174,61 @@ def matched_in(region: NDArray[np.uint8], disparity_px: NDArray[np.float32]) -> 
     at = columns - disparity_px
     hit = cv2.remap(region, at, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(hit > 0)
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the stamp in a message's header in ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def eye_calibration(info: Any, name: str) -> EyeCalibration:
+    """Return the calibration of one eye of a CameraInfo. name: of the topic, for messages. Raises
+    CalibrationError or InputError.
+    """
+    width, height = int(info.width), int(info.height)
+    if width * height > MAX_PIXELS:
+        raise InputError(f'{name}: a calibration of images of {width}x{height} pixels is not taken')
+    # ROS 1 names the matrices in capitals, ROS 2 does not.
+    K, D, R, P = (getattr(info, n if hasattr(info, n) else n.lower()) for n in 'KDRP')
+    return EyeCalibration(width, height, K, D, R, P, info.distortion_model, name)
+
+
+def wheel_pose(message: Any, name: str) -> WheelPose:
+    """Return the pose that an Odometry of the wheels tells, NaN where it is none. name: of the
+    topic.
+    """
+    pose = message.pose.pose
+    try:
+        T_wheels_base = rigid_motion(pose.position, pose.orientation, name)
+    except InputError:
+        T_wheels_base = np.full((4, 4), np.nan)
+    return WheelPose(stamp_ns(message), T_wheels_base)
+
+
+def imu_sample(message: Any, T_left_imu: Array) -> ImuSample:
+    """Return a sample of an Imu at a pose (4, 4) in the rectified left optical frame."""
+    gyro, accel = xyz(message.angular_velocity), xyz(message.linear_acceleration)
+    return ImuSample.seen_from(T_left_imu, stamp_ns(message), gyro, accel)
+
+
+def measures_motion(message: Any) -> bool:
+    """Whether an Imu measures both angular velocity and acceleration."""
+    covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
+    return all(covariance[0] != NOT_MEASURED for covariance in covariances)
+
+
+def rigid_motion(translation: Any, rotation: Any, name: str) -> Array:
+    """Return the transform (4, 4) of a vector and a quaternion. Raises InputError where that is no
+    rotation.
+    """
+    quat_xyzw = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
+    length = float(np.linalg.norm(quat_xyzw))
+    if not abs(length - 1) < 0.01:
+        raise InputError(f'{name}: the orientation is no rotation; its length is {length:.3g}')
+    return transform_from_quaternion(xyz(translation), quat_xyzw)
+
+
+def xyz(vector: Any) -> Array:
+    """Return the components (3,) of a vector or point."""
+    return np.array([vector.x, vector.y, vector.z])

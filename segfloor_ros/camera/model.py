@@ -1,4 +1,4 @@
-"""The rectified stereo camera and its place on the robot."""
+"""The stereo camera: its settings, the rectified pair of pinholes and its place on the robot."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import CalibrationError
+from segfloor_ros.errors import CalibrationError, SettingsError
 from segfloor_ros.geometry import R_ROS_OPTICAL, Array, make_transform
+from segfloor_ros.settings import StageSettings, setting
+
+SENSORS = ('wheel_odometry', 'imu')
+"""Sensors of a recording that can be left out."""
 
 
 @dataclass(frozen=True)
@@ -138,3 +142,63 @@ class StereoFrame:
     left: NDArray[np.uint8]
     right: NDArray[Any]
     excluded: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True)
+class StereoCameraSettings(StageSettings):
+    """Where images come from and how left and right are paired."""
+
+    input: str = setting('', 'Recording or device to read: folder, bag, video or device.')
+    rate_hz: float = setting(
+        0.0,
+        'Frame rate of a recording without time stamps; 0 takes 10 Hz.',
+        within=(0.0, 1000.0),
+    )
+    pairing_tolerance_s: float = setting(
+        0.01,
+        'Largest difference of stamps at which a left and a right image are one pair.',
+        within=(0.0, 1.0),
+    )
+    left_calibration: str = setting(
+        '', 'Calibration file of the left camera; empty: the one that lies with the recording.'
+    )
+    right_calibration: str = setting(
+        '', 'Calibration file of the right camera; empty: the one that lies with the recording.'
+    )
+    bit_depth: int = setting(
+        0,
+        'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
+        unit='bits',
+        within=(0, 16),
+    )
+    left_image_topic: str = setting('', 'Left image topic in a bag; empty: found by its name.')
+    right_image_topic: str = setting('', 'Right image topic in a bag; empty: found by its name.')
+    wheel_odometry_topic: str = setting(
+        '', 'Wheel odometry topic in a bag; empty: found by its type.'
+    )
+    depth: bool = setting(
+        False,
+        'Take depth images in place of the right ones; without right images it is done anyway.',
+    )
+    depth_topic: str = setting('', 'Depth image topic in a bag; empty: found by its name.')
+    imu_topic: str = setting('', 'IMU topic in a bag; empty: found by its type.')
+    ignore: str = setting(
+        '', 'Sensors of the recording to leave out, with commas: wheel_odometry, imu.'
+    )
+
+    masks: str = setting(
+        '',
+        'Folder of masks of what moves: %06d.png by frame index, of the left image as recorded, '
+        '255 = moving; empty: none.',
+    )
+
+    @property
+    def ignored_sensors(self) -> frozenset[str]:
+        """The names in `ignore`. Raises SettingsError for one that is no sensor."""
+        names = frozenset(self.ignore.replace(',', ' ').split())
+        unknown = sorted(names - set(SENSORS))
+        if unknown:
+            raise SettingsError(
+                f'stereo_camera.ignore: {unknown[0]} is no sensor; known are {", ".join(SENSORS)}'
+            )
+        return names

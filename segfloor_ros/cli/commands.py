@@ -26,7 +26,6 @@ from segfloor_ros.camera.bag_writer import ImageCoding
 from segfloor_ros.camera.bag_writer import convert as write_bag
 from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
 from segfloor_ros.cli.replay import replay
@@ -38,6 +37,7 @@ from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.files.results import add_files, check_writable, write_file
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
+from segfloor_ros.measurements import DEPTH
 from segfloor_ros.processes import first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
 

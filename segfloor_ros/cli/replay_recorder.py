@@ -18,7 +18,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import LabelledPoints
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import diagnostics
 from segfloor_ros.messages.images import grey8_image

@@ -14,18 +14,17 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from segfloor_ros.camera.settings import SENSORS
-from segfloor_ros.camera.sources.sensor_files import DEPTH
+from segfloor_ros.camera.model import SENSORS
 from segfloor_ros.cli.replay_nodes import NodeGraph, running_nodes
 from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
 from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling
-from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError, SegfloorError
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
 from segfloor_ros.map_file import MapFile
+from segfloor_ros.measurements import DEPTH
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.maps import grid_of
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM

@@ -1,25 +1,26 @@
 """The labelling stage: which points of the sparse cloud are floor and which are obstacles.
 
 The published method takes the label from the mask at the latest look. Here every look counts:
-log-odds per point, from the mask and from the height above the local floor.
-
-What speaks for floor (negative) and for an obstacle (positive).
-
-What is remembered of every point, in the order of the cloud's ids.
+log-odds per point, negative for floor and positive for an obstacle, from the mask and from the
+height above the local floor. They are kept in the order of the cloud's ids. The grid gets the
+sparse cloud with a label per point; a PLY file (binary, little endian) holds the same.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
-from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.errors import InputError
+from segfloor_ros.files.whole import read_bytes
 from segfloor_ros.floor.observation import FLOOR as MASK_FLOOR
 from segfloor_ros.floor.observation import NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.settings import RobotSettings
 from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
 
 _HEIGHT_SIGMA_M, _HEIGHT_SIGMA_PER_M = 0.02, 0.01
@@ -44,6 +45,22 @@ _COLUMNS: dict[str, tuple[type, float]] = {
 """Type and first value. belief: what the evidence says, with hysteresis; label, confidence: what
 is told of it. judged_z_m: where the point was when that was decided, in frame `map`.
 """
+
+UNKNOWN = 0
+FLOOR = 1
+OBSTACLE = 2
+
+VERTEX = np.dtype(
+    [
+        ('x', '<f4'),
+        ('y', '<f4'),
+        ('z', '<f4'),
+        ('id', '<i4'),
+        ('label', 'u1'),
+        ('confidence', '<f4'),
+    ]
+)
+_PLY_TYPES = {'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
 class CloudLabelling:
@@ -242,3 +259,57 @@ class PointTable:
 
 def _empty(count: int) -> dict[str, NDArray[Any]]:
     return {name: np.full(count, first, kind) for name, (kind, first) in _COLUMNS.items()}
+
+
+@dataclass(frozen=True)
+class LabelledPoints:
+    """The labelled cloud as arrays over points. point_id: (N,) int32 ascending. xyz_map: (N,
+    3) float32, metres. label: (N,) uint8 of `UNKNOWN`, `FLOOR`, `OBSTACLE`. confidence: (N,)
+    float32 in [0, 1], how sure the label is.
+    """
+
+    point_id: NDArray[np.int32]
+    xyz_map: NDArray[np.float32]
+    label: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+
+
+def _header(count: int) -> bytes:
+    lines = ['ply', 'format binary_little_endian 1.0', 'comment frame map, metres']
+    lines.append('comment label 0 unknown, 1 floor, 2 obstacle')
+    lines.append(f'element vertex {count}')
+    names = VERTEX.names or ()
+    lines += [f'property {_PLY_TYPES[VERTEX[name].str[1:]]} {name}' for name in names]
+    return ('\n'.join([*lines, 'end_header']) + '\n').encode()
+
+
+def write_ply(path: Path, points: LabelledPoints) -> None:
+    """Write the points with x y z id label confidence, frame `map`, metres."""
+    vertices = np.zeros(len(points.point_id), VERTEX)
+    for axis, name in enumerate('xyz'):
+        vertices[name] = points.xyz_map[:, axis]
+    vertices['id'] = points.point_id
+    vertices['label'] = points.label
+    vertices['confidence'] = points.confidence
+    path.write_bytes(_header(len(vertices)) + vertices.tobytes())
+
+
+def read_ply(path: Path) -> LabelledPoints:
+    """Read a file of `write_ply`. Raises InputError naming the file when it is not one."""
+    content = read_bytes(path)
+    head, mark, body = content.partition(b'end_header\n')
+    count = len(body) // VERTEX.itemsize
+    if not mark or head + mark != _header(count) or len(body) != count * VERTEX.itemsize:
+        raise InputError(f'{path}: not a whole labelled cloud')
+    vertices = np.frombuffer(body, VERTEX)
+    return LabelledPoints(
+        point_id=vertices['id'].astype(np.int32),
+        xyz_map=np.stack([vertices[name] for name in 'xyz'], axis=1).astype(np.float32),
+        label=vertices['label'].copy(),
+        confidence=vertices['confidence'].astype(np.float32),
+    )
+
+
+@dataclass(frozen=True)
+class CloudLabellingSettings(RobotSettings):
+    """The robot that floor and obstacles are judged for."""

@@ -20,15 +20,14 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud.labels import FLOOR as FLOOR_POINT
-from segfloor_ros.cloud.labels import OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.cloud.labelled_cloud import FLOOR as FLOOR_POINT
+from segfloor_ros.cloud.labelled_cloud import OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.maps import MapTruth, load_truth, states
 from segfloor_ros.files.images import check_same_size, read_mask
 from segfloor_ros.files.whole import read_text
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
 from segfloor_ros.results_folder import MOUNT_FIGURES, read_summary

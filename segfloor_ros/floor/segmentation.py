@@ -1,6 +1,7 @@
 """The floor segmentation stage: a rectified stereo pair in, the floor out.
 
-What of an image does not count: what moves, and the border that rectification leaves.
+What moves and the border that rectification leaves do not count. For people there are pictures of
+mask and v-disparity.
 """
 
 from __future__ import annotations
@@ -9,13 +10,13 @@ import dataclasses
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import blank_border, matched_in
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.histograms import filtered_v_disparity
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
     COARSE_ABOVE_PX,
@@ -38,8 +39,9 @@ from segfloor_ros.floor.disparity.profile import (
     FloorLine,
     FloorProfile,
     fit_profile,
+    pixels_where,
 )
-from segfloor_ros.floor.mask.appearance import unlike_floor
+from segfloor_ros.floor.disparity.view import FloorView, column_step, filtered_v_disparity
 from segfloor_ros.floor.mask.filling import (
     beside_something,
     blank_feet,
@@ -48,21 +50,24 @@ from segfloor_ros.floor.mask.filling import (
     fill_regions,
     trim_to_edges,
 )
-from segfloor_ros.floor.mask.overhead import OverheadMatcher
-from segfloor_ros.floor.mask.pixel_evidence import Comparison, Evidence, HeightTable, judge
-from segfloor_ros.floor.mask.runs import pixels_where
-from segfloor_ros.floor.mask.view import FloorView, column_step
+from segfloor_ros.floor.mask.pixel_evidence import (
+    Comparison,
+    Evidence,
+    HeightTable,
+    judge,
+    unlike_floor,
+)
 from segfloor_ros.floor.observation import (
     FLOOR,
     NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
     FloorScan,
+    FloorSegmentationSettings,
     VDisparity,
 )
 from segfloor_ros.floor.plane.frame_plane import expectations, plane_of_frame
-from segfloor_ros.floor.scan import FloorScanner
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.tracking.images import join
 from segfloor_ros.timing import NoTimes, StageTimes
@@ -79,6 +84,8 @@ _LEAST_SHARE = 0.5
 """
 _BOARD = 2
 """Table tops are thinner than what stands: so many times what is seen of them counts."""
+
+_COLOURS_BGR = {FLOOR: (60, 200, 60), NO_EVIDENCE: (200, 120, 40), NOT_FLOOR: (60, 60, 200)}
 
 
 class FloorSegmentation:
@@ -348,3 +355,33 @@ def clear_hidden(
     """Set a mask of the view to no evidence where the left image shows nothing that counts."""
     if hidden is not None:
         mask[hidden[columns] > 0] = NO_EVIDENCE
+
+
+def mask_overlay(left: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the left image (H, W) uint8 tinted by the mask (H, W), as (H, W, 3) BGR: green is
+    floor, blue no evidence, red not floor.
+    """
+    tint = np.zeros((*mask.shape, 3), np.uint8)
+    for value, colour in _COLOURS_BGR.items():
+        tint[mask == value] = colour
+    return cv2.addWeighted(cv2.cvtColor(left, cv2.COLOR_GRAY2BGR), 0.65, tint, 0.35, 0)
+
+
+def v_disparity_picture(observation: FloorObservation) -> NDArray[np.uint8]:
+    """Return the filtered v-disparity with the floor's profile in green, (H, B, 3) BGR: rows are
+    rows of the de-rolled image, columns bins of disparity; the brighter the more pixels.
+    """
+    counted, profile = observation.v_disparity, observation.profile_px
+    height, bins = len(profile), counted.counts.shape[1]
+    rows = np.arange(counted.first_row, counted.first_row + len(counted.counts))
+    inside = (rows >= 0) & (rows < height)
+    light = np.log1p(counted.counts[inside].astype(np.float64))
+    grey = np.zeros((height, bins), np.uint8)
+    grey[rows[inside]] = 255 * light / max(light.max(initial=0.0), 1e-6)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    known = np.flatnonzero(np.isfinite(profile))
+    if len(known):
+        points = np.stack([counted.bins_per_px * profile[known], known], axis=1)
+        line = np.rint(points).astype(np.int32)[:, None]
+        cv2.polylines(picture, [line], False, _COLOURS_BGR[FLOOR], 1)
+    return picture.astype(np.uint8)

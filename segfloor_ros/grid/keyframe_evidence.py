@@ -1,6 +1,5 @@
-"""What one keyframe says about the floor around it, compact and in the keyframe's base frame.
-
-The evidence of keyframes as arrays, for a file, and back.
+"""What one keyframe says about the floor around it, compact and in the keyframe's base frame; as
+arrays, for a file, and back.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.results import KeyframeFeatures
 

@@ -1,6 +1,6 @@
 """The occupancy grid stage: from labelled points and floor scans to the map.
 
-The evidence of all keyframes in order, and the raster that follows from it.
+It keeps the evidence of all keyframes in order, and the raster that follows from it.
 """
 
 from __future__ import annotations
@@ -10,22 +10,19 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labels import LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.fold import EvidenceFolder
+from segfloor_ros.grid.fold import EvidenceFolder, Pose2d
 from segfloor_ros.grid.keyframe_evidence import (
     KeyframeEvidence,
     evidence_from_arrays,
     evidence_to_arrays,
     gather_evidence,
 )
-from segfloor_ros.grid.log_odds import LogOddsRaster
-from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.grid.placing import Pose2d
-from segfloor_ros.grid.rendering import render
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings
+from segfloor_ros.grid.raster import LogOddsRaster, render
 from segfloor_ros.map_file import Arrays, check_lengths
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 

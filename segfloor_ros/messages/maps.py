@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2, PointField, TimeReference
 from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.map_file import FORMAT, MapFile, from_bytes, to_bytes

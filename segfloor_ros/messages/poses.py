@@ -22,7 +22,7 @@ from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import Imu
 
-from segfloor_ros.camera.ros_messages import NOT_MEASURED
+from segfloor_ros.camera.images import NOT_MEASURED
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, make_transform, se3_log
 from segfloor_ros.measurements import ImuSample, WheelPose

@@ -10,12 +10,11 @@ from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
+from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.configuration import FloorSegmentationNodeSettings
-from segfloor_ros.floor.pictures import mask_overlay, v_disparity_picture
 from segfloor_ros.floor.plane.mount import MountCheck
-from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
 from segfloor_ros.messages.images import (
     disparity_message,
     free_scan_message,

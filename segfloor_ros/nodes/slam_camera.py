@@ -21,10 +21,9 @@ from sensor_msgs.msg import CameraInfo
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.images import EightBitScale, depth_image, grey_image
+from segfloor_ros.camera.images import EightBitScale, depth_image, eye_calibration, grey_image
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.rig_check import InputFault
-from segfloor_ros.camera.ros_messages import eye_calibration
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.diagnostics import Level

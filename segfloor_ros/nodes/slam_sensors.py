@@ -18,8 +18,8 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, Imu
 
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
-from segfloor_ros.camera.ros_messages import imu_sample, measures_motion, wheel_pose, xyz
-from segfloor_ros.camera.sources.sensor_files import is_upright
+from segfloor_ros.camera.images import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.camera.sources.files import is_upright
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.measurements import Measurement, WheelPose

@@ -16,14 +16,13 @@ from rosgraph_msgs.msg import Clock
 
 from segfloor_ros.camera.bag_writer import IMU_FRAME
 from segfloor_ros.camera.images import Grey
-from segfloor_ros.camera.settings import SENSORS
+from segfloor_ros.camera.model import SENSORS
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.camera.sources.sensor_files import DEPTH
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.configuration import StereoCameraNodeSettings
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.measurements import MAX_LAG_S, Measurement, MeasurementLog, WheelPose
+from segfloor_ros.measurements import DEPTH, MAX_LAG_S, Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message

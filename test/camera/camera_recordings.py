@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import StereoSource, open_source
 
 WIDTH, HEIGHT = 64, 48

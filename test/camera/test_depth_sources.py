@@ -32,7 +32,7 @@ from segfloor_ros.camera.depth import (
     disparity_of_depth,
     seen_from_right,
 )
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import IMAGE, find_depth_topics
 from segfloor_ros.errors import InputError
 

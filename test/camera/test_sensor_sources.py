@@ -20,7 +20,7 @@ from camera_recordings import (
 )
 
 from segfloor_ros.camera.sources import StereoSource
-from segfloor_ros.camera.sources.bag_sensors import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
+from segfloor_ros.camera.sources.bag import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
 from segfloor_ros.errors import InputError, SettingsError
 from segfloor_ros.measurements import ImuSample, MeasurementLog, WheelPose
 

@@ -6,7 +6,7 @@ from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.calibration.files import read_calibration
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 
 

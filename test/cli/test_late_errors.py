@@ -21,7 +21,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 
 from segfloor_ros.camera.bag_writer import convert
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import make_transform

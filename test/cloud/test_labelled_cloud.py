@@ -3,9 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
-from segfloor_ros.cloud.settings import CloudLabellingSettings
+from segfloor_ros.cloud.labelled_cloud import (
+    FLOOR,
+    OBSTACLE,
+    UNKNOWN,
+    CloudLabelling,
+    CloudLabellingSettings,
+    LabelledPoints,
+)
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, SparseCloud
 

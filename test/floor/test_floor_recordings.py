@@ -14,9 +14,8 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.floor.disparity.profile import FloorLine
-from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 OUTLINES = Path(__file__).with_name('library_floor_outlines.yaml')
 LIBRARY_MOUNT = Mount(1.27, np.radians(5.9), np.radians(0.4))

@@ -21,9 +21,8 @@ from floor_scenes import (
 from segfloor_ros.camera.depth import disparity_of_depth
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.disparity.profile import FloorLine
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 SETTINGS = FloorSegmentationSettings()
 

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from segfloor_ros.grid.log_odds import FREE_FROM, OCCUPIED_FROM, ZERO, LogOddsRaster, steps
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN
-from segfloor_ros.grid.rendering import render
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGridSettings
+from segfloor_ros.grid.raster import FREE_FROM, OCCUPIED_FROM, ZERO, LogOddsRaster, render, steps
 
 PATH = np.array([[0.05, 0.05]])
 

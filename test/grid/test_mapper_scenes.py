@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from conftest import Drive, World, cells_at, centres, no_points
 
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.grid.settings import OccupancyGridSettings
+from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.grid.map_file import OccupancyGridSettings
 
 MakeDrive = Callable[..., Drive]
 ROOM = World(walls=((4, -3, 4, 3), (-1, 2, 4, 2), (-1, -2, 4, -2)))

@@ -7,9 +7,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.camera.ros_messages import eye_calibration
-from segfloor_ros.cloud.labels import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.geometry import make_transform, se3_exp

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import bag_file, open_source
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.ros_bag import use_rosbag2_py

@@ -6,9 +6,8 @@ import numpy as np
 from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.floor.pictures import mask_overlay
-from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings
+from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
 from segfloor_ros.messages.images import (
     camera_info_message,
     grey8_image,

@@ -15,7 +15,7 @@ from ros_graph import fresh_graph
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.cloud.labels import UNKNOWN, LabelledPoints
+from segfloor_ros.cloud.labelled_cloud import UNKNOWN, LabelledPoints
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.map_file import MapFile

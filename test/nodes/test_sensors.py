@@ -12,8 +12,8 @@ from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, depth_of_room
 
+from segfloor_ros.camera.images import imu_sample, wheel_pose
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.camera.ros_messages import imu_sample, wheel_pose
 from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
 from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.images import grey8_image, right_image

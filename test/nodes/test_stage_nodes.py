@@ -23,18 +23,14 @@ from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.camera.ros_messages import eye_calibration
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling
-from segfloor_ros.cloud.labels import FLOOR
-from segfloor_ros.cloud.settings import CloudLabellingSettings
-from segfloor_ros.floor.observation import free_ranges
+from segfloor_ros.cloud.labelled_cloud import FLOOR, CloudLabelling, CloudLabellingSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings, free_ranges
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from segfloor_ros.geometry import invert
-from segfloor_ros.grid.map_file import load_map
+from segfloor_ros.grid.map_file import OccupancyGridSettings, load_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.settings import OccupancyGridSettings
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.images import (
     camera_info_message,

@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.commands import DRIVE, demo
 from segfloor_ros.cli.commands import simulate as simulate_command

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 from tools.benchmark_floor import benchmark_floor, disparity_table, steps_table
 from tools.disparity_choices import (
     TruePair,

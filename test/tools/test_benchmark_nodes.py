@@ -10,7 +10,7 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA
 
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError

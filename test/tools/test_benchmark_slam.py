@@ -13,7 +13,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError

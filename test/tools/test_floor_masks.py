@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.camera.settings import StereoCameraSettings
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.simulation.scene_file import open_scene

@@ -1,7 +1,5 @@
 """Messages of a bag file as Python objects: by `rosbags`, without a ROS install, or by the reader
-that a ROS install has.
-
-Which topics of a bag are the stereo pair.
+that a ROS install has; and which of its topics are the stereo pair.
 """
 
 from __future__ import annotations
@@ -13,8 +11,8 @@ from os.path import commonpath
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from segfloor_ros.camera.settings import StereoCameraSettings
-from segfloor_ros.camera.sources.pairing import SIDES, is_side, side_pairs
+from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.camera.sources.files import SIDES, is_side, side_pairs
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import check_file
 from segfloor_ros.files.yaml_files import read_yaml

@@ -1,45 +1,47 @@
-"""Guessing what kind of recording an input is."""
+"""Guessing what kind of recording an input is; videos and devices, whose frames show the left image
+beside the right one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import count
 from pathlib import Path
 
-from segfloor_ros.camera.settings import StereoCameraSettings
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.calibration.files import find_calibration
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
+from segfloor_ros.camera.images import to_grey
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources.bag import open_bag
 from segfloor_ros.camera.sources.bag_file import is_bag
-from segfloor_ros.camera.sources.depth_images import is_tum_rgbd, open_tum_rgbd
 from segfloor_ros.camera.sources.image_folders import (
     has_image_sides,
     is_euroc,
     is_kitti,
+    is_tum_rgbd,
     open_euroc,
     open_image_folders,
     open_kitti,
+    open_tum_rgbd,
 )
-from segfloor_ros.camera.sources.source import MaskFolder, StereoSource
-from segfloor_ros.camera.sources.video import is_device, is_video, open_device, open_video
+from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, MaskFolder, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import Grey, silent_libraries
+from segfloor_ros.files.whole import check_file
 
 KINDS = (
     'a KITTI odometry folder, an EuRoC folder, image folders left and right with left.yaml and '
     'right.yaml, a TUM RGB-D folder, a ROS bag (.mcap, .db3, .bag), or a video or device with a '
     'calibration'
 )
-
-
-Openers = tuple[
-    tuple[Callable[[Path], bool], Callable[[Path, StereoCameraSettings], StereoSource]], ...
-]
-FOLDERS: Openers = (
-    (is_tum_rgbd, open_tum_rgbd),
-    (is_kitti, open_kitti),
-    (is_euroc, open_euroc),
-    (is_bag, open_bag),
-    (has_image_sides, open_image_folders),
-)
-FILES: Openers = ((is_bag, open_bag), (is_video, open_video))
-"""What recognises a kind of recording, and what opens it."""
 
 
 def open_source(settings: StereoCameraSettings) -> StereoSource:
@@ -75,3 +77,92 @@ def _open(settings: StereoCameraSettings) -> StereoSource:
         if recognises(path):
             return open_path(path, settings)
     raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
+
+
+def is_video(path: Path) -> bool:
+    """Whether `path` is named like a video file."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def is_device(name: str) -> bool:
+    """Whether `name` is a camera device: its number, or /dev/video with its number."""
+    return re.fullmatch('(/dev/video)?[0-9]{1,3}', name) is not None
+
+
+def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
+    """Open a side-by-side video with the calibration beside it or in the settings.
+
+    Raises InputError or CalibrationError.
+    """
+    check_file(path)
+    calibration = find_calibration(str(path), (path.parent,), settings)
+    return _video_source(str(path), calibration, settings, is_live=False)
+
+
+def open_device(name: str, settings: StereoCameraSettings) -> StereoSource:
+    """Open a side-by-side camera device. Raises InputError or CalibrationError."""
+    calibration = find_calibration(f'device {name}', (Path.cwd(),), settings)
+    return _video_source(name, calibration, settings, is_live=True)
+
+
+def _video_source(
+    name: str, calibration: StereoCalibration, settings: StereoCameraSettings, is_live: bool
+) -> StereoSource:
+    """Return the frames of a video, stamped by their number and the frame rate, or of a device,
+    stamped on arrival.
+    """
+    size = (2 * calibration.left.width, calibration.left.height)
+
+    def entries(source: StereoSource) -> Iterator[PairEntry]:
+        with _opened(name, size, is_live) as video:
+            for index in count():
+                with silent_libraries():
+                    ok, image = video.read()
+                if not ok:
+                    return
+                stamp_ns = time.time_ns() if is_live else round(index * 1e9 / source.rate_hz)
+                yield PairEntry(index, stamp_ns, partial(_halves, image))
+
+    with _opened(name, size, is_live) as video:
+        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        rate_hz = settings.rate_hz or video.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE_HZ
+    frame_count = None if is_live or frames <= 0 else frames
+    return StereoSource(name, calibration, entries, frame_count=frame_count, rate_hz=rate_hz)
+
+
+@contextmanager
+def _opened(name: str, size: tuple[int, int], is_live: bool) -> Iterator[cv2.VideoCapture]:
+    with silent_libraries():
+        video = cv2.VideoCapture(int(name.removeprefix('/dev/video')) if is_live else name)
+    try:
+        if not video.isOpened():
+            what = 'the device' if is_live else 'the video'
+            raise InputError(f'{name}: cannot open {what}; is it there and readable?')
+        if is_live:
+            video.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            video.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        yield video
+    finally:
+        video.release()
+
+
+def _halves(image: NDArray[np.uint8]) -> tuple[Grey, Grey]:
+    grey = to_grey(image)
+    half = grey.shape[1] // 2
+    return grey[:, :half].copy(), grey[:, half:].copy()
+
+
+Openers = tuple[
+    tuple[Callable[[Path], bool], Callable[[Path, StereoCameraSettings], StereoSource]], ...
+]
+FOLDERS: Openers = (
+    (is_tum_rgbd, open_tum_rgbd),
+    (is_kitti, open_kitti),
+    (is_euroc, open_euroc),
+    (is_bag, open_bag),
+    (has_image_sides, open_image_folders),
+)
+FILES: Openers = ((is_bag, open_bag), (is_video, open_video))
+"""What recognises a kind of recording, and what opens it."""
+
+VIDEO_SUFFIXES = {'.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.mpg', '.mpeg', '.mjpeg'}

@@ -1,4 +1,6 @@
-"""What every source of stereo pairs has in common, and the masks that may go with its frames."""
+"""What every source of stereo pairs has in common: masks that may go with its frames, decoding
+ahead, and the pairing of left and right images by their stamps.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,3 +203,118 @@ def prefetched(items: Generator[T, None, None] | Iterator[T]) -> Iterator[T]:
         worker.shutdown(cancel_futures=True)
         if isinstance(items, Generator):
             items.close()
+
+
+def check_forward(where: str, last_ns: Sequence[int], stamp_ns: int) -> None:
+    """Raise InputError when `stamp_ns` is earlier than the last one, if there was one."""
+    if last_ns and stamp_ns < last_ns[-1]:
+        raise InputError(
+            f'{where}: the stamp goes backwards, from {last_ns[-1] / 1e9:.9f} s to '
+            f'{stamp_ns / 1e9:.9f} s; cut the recording there and use one part'
+        )
+
+
+@dataclass(frozen=True)
+class Stamped(Generic[T]):
+    """Something with a stamp."""
+
+    stamp_ns: int
+    item: T
+
+
+class StampPairing(Generic[T]):
+    """Pairs each image with the nearest of the other side, if that is within the tolerance.
+
+    Images are added in the order of their arrival, side 0 the left, side 1 the right. One that
+    comes one place late on its side is put where it belongs; one that comes later still means
+    that the clock went backwards, an InputError. A side waits for the other with at most
+    `limit` images. names: of both sides, for messages.
+
+    pairs, and by side: unpaired, images without a partner; duplicates, images with a stamp that
+    was there before.
+    """
+
+    def __init__(self, tolerance_s: float, names: tuple[str, str], limit: int | None = 64) -> None:
+        self.pairs = 0
+        self.unpaired = [0, 0]
+        self.duplicates = [0, 0]
+        self._smallest_gap_ns: int | None = None
+        self._tolerance_ns = round(tolerance_s * 1e9)
+        self._names = names
+        self._limit = limit
+        self._queues: tuple[deque[Stamped[T]], deque[Stamped[T]]] = deque(), deque()
+        self._latest: list[list[int]] = [[], []]
+        self._closing = False
+
+    def add(self, side: int, stamp_ns: int, item: T) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
+        """Take in an image and yield the pairs that are complete now."""
+        latest, queue = self._latest[side], self._queues[side]
+        if stamp_ns in latest:
+            self.duplicates[side] += 1
+            return
+        if len(latest) == 2:
+            check_forward(self._names[side], latest[:1], stamp_ns)
+        late = bool(latest) and stamp_ns < latest[-1]
+        # The last image of a side stays in its queue, so a late one always finds its place.
+        queue.insert(len(queue) - 1 if late else len(queue), Stamped(stamp_ns, item))
+        self._latest[side] = sorted([*latest, stamp_ns])[-2:]
+        yield from self._complete_pairs()
+        if self._overflows(side):
+            self._drop(side)
+
+    def finish(self) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
+        """Yield the last pairs; nothing is added after this."""
+        self._closing = True
+        yield from self._complete_pairs()
+        for side in (0, 1):
+            while self._queues[side]:
+                self._drop(side)
+
+    def report(self) -> None:
+        """Warn of images that were left out. Raises InputError when there was no pair at all."""
+        names = f'{self._names[0]} and {self._names[1]}'
+        if not self.pairs:
+            gap = self._smallest_gap_ns
+            nearest = '' if gap is None else f'; the nearest are {gap / 1e9:.6f} s apart'
+            raise InputError(
+                f'{names}: no two images within {self._tolerance_ns / 1e9:g} s{nearest}; are both '
+                'cameras on one clock? else raise stereo_camera.pairing_tolerance_s'
+            )
+        if any(self.unpaired):
+            logger.warning('%s: %d and %d images have no partner', names, *self.unpaired)
+        if any(self.duplicates):
+            logger.warning('%s: %d and %d images came twice', names, *self.duplicates)
+
+    def _complete_pairs(self) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
+        left, right = self._queues
+        while self._decidable(0) and self._decidable(1):
+            gap_ns = left[0].stamp_ns - right[0].stamp_ns
+            early = 0 if gap_ns < 0 else 1
+            if self._next_is_nearer(early):
+                self._drop(early)
+            elif abs(gap_ns) <= self._tolerance_ns:
+                self.pairs += 1
+                yield left.popleft(), right.popleft()
+            else:
+                self._smallest_gap_ns = min(abs(gap_ns), self._smallest_gap_ns or abs(gap_ns))
+                self._drop(early)
+
+    def _decidable(self, side: int) -> bool:
+        """Whether the first image of a side can be paired: its successor, which might fit better,
+        is there, or need not be waited for.
+        """
+        count = len(self._queues[side])
+        return count > 1 or (count == 1 and (self._closing or self._overflows(1 - side)))
+
+    def _overflows(self, side: int) -> bool:
+        return self._limit is not None and len(self._queues[side]) > self._limit
+
+    def _next_is_nearer(self, early: int) -> bool:
+        queue, target_ns = self._queues[early], self._queues[1 - early][0].stamp_ns
+        if len(queue) < 2:
+            return False
+        return abs(queue[1].stamp_ns - target_ns) < abs(queue[0].stamp_ns - target_ns)
+
+    def _drop(self, side: int) -> None:
+        self._queues[side].popleft()
+        self.unpaired[side] += 1

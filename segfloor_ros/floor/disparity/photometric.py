@@ -3,9 +3,8 @@
 Semi-global matching prefers surfaces that face the camera and, where texture is weak, agrees with
 whatever repeats: the blocks of a compressed image, its neighbours. Here the right image is drawn
 as it would look were everything floor, and compared with the left one. What then agrees about as
-well as it does with the matched disparities cannot be said not to be floor.
-
-Where the image has enough texture for a disparity to mean something.
+well as it does with the matched disparities cannot be said not to be floor. Texture, beyond the
+noise of the image, says where a disparity means something.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.disparity.profile import FloorProfile
+from segfloor_ros.floor.disparity.view import FloorView
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
-from segfloor_ros.floor.mask.view import FloorView
 
 _STEP_PX = 2
 """Every so many pixels of the image are compared, in rows and in columns."""

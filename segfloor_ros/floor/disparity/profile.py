@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import NOISE_PX
-from segfloor_ros.floor.mask.runs import pixels_where
 from segfloor_ros.floor.observation import VDisparity
 from segfloor_ros.geometry import Array
 
@@ -190,3 +189,10 @@ def _prior_information(prior: Array, line: FloorLine, camera: StereoCamera) -> A
     )
     scaled = jacobian / sigma[:, None]
     return scaled.T @ scaled
+
+
+def pixels_where(picture: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return rows and columns (N,) of the pixels that are set, as np.nonzero does; faster."""
+    at = np.flatnonzero(picture).astype(np.int32)
+    rows, columns = np.divmod(at, np.int32(picture.shape[1]))
+    return rows, columns

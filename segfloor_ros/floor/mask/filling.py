@@ -1,6 +1,5 @@
-"""Floor where the image alone cannot tell: between floor, and where the picture goes on alike.
-
-Floor up to the foot of what stands on it.
+"""Floor where the image alone cannot tell: between floor, where the picture goes on alike, and up
+to the base of what stands on it.
 
 Plain floor shows nothing that both cameras see alike, but what stands behind it does: an upright
 surface has the disparity of the floor on which it stands. Where a plain stretch that begins with
@@ -10,15 +9,16 @@ meets the floor, all of it is floor.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.disparity.photometric import EDGE_SLOPE
-from segfloor_ros.floor.disparity.profile import FloorProfile
+from segfloor_ros.floor.disparity.profile import FloorProfile, pixels_where
+from segfloor_ros.floor.disparity.view import FloorView
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
-from segfloor_ros.floor.mask.runs import Runs, pixels_where
-from segfloor_ros.floor.mask.view import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 _STEP_PX = 2
@@ -334,3 +334,47 @@ def blank_feet(
     before, at, after = (slope[rows + i, found].astype(np.float32) for i in (-1, 0, 1))
     bend = np.maximum(2 * at - before - after, 1)
     return rows + np.clip((after - before) / (2 * bend), -0.5, 0.5), found
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The stretches of a picture of `shape` (R, W): row, first column and the column after the
+    last one, each (N,) intp, in the order of the pixels.
+    """
+
+    shape: tuple[int, int]
+    row: NDArray[np.intp]
+    first: NDArray[np.intp]
+    stop: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, picture: NDArray[np.bool_]) -> Runs:
+        """Return the stretches of a picture (R, W) bool."""
+        height, width = picture.shape
+        apart = np.zeros(height * (width + 1) + 1, np.bool_)
+        apart[:-1].reshape(height, width + 1)[:, 1:] = picture
+        edges = np.flatnonzero(apart[1:] != apart[:-1]) + 1
+        row, first = np.divmod(edges[::2], width + 1)
+        first -= 1
+        return cls((height, width), row, first, first + edges[1::2] - edges[::2])
+
+    def before(self, values: NDArray[np.uint8], outside: int) -> NDArray[np.uint8]:
+        """Return the values (R, W) of the pixels right before the stretches, (N,)."""
+        found = values[self.row, np.maximum(self.first - 1, 0)]
+        return np.where(self.first > 0, found, np.uint8(outside))
+
+    def after(self, values: NDArray[np.uint8], outside: int) -> NDArray[np.uint8]:
+        """Return the values (R, W) of the pixels right after the stretches, (N,)."""
+        last = self.shape[1] - 1
+        found = values[self.row, np.minimum(self.stop, last)]
+        return np.where(self.stop <= last, found, np.uint8(outside))
+
+    def painted(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the picture (R, W) of the chosen ones (N,) of the stretches."""
+        height, width = self.shape
+        start = self.row[chosen] * width + self.first[chosen]
+        length = self.stop[chosen] - self.first[chosen]
+        edges = np.zeros(2 * len(start) + 2, np.intp)
+        edges[1:-1:2], edges[2:-1:2], edges[-1] = start, start + length, height * width
+        inside = np.arange(len(edges) - 1) % 2 == 1
+        return np.repeat(inside, np.diff(edges)).reshape(height, width)

@@ -1,6 +1,9 @@
 """What each pixel says: floor, not floor, or nothing.
 
 A pixel is judged by its own disparity: its height above the floor that has the same disparity.
+Where there is no texture, how bright a surface is tells it from the floor around it: a black tyre,
+the shade below a car. What looks like no more than a few of the floor's own pixels is floor only if
+that was measured.
 """
 
 from __future__ import annotations
@@ -14,9 +17,8 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.depth import measured_sigma_px
 from segfloor_ros.floor.disparity.matching import NOISE_PX, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
-from segfloor_ros.floor.mask.view import FloorView
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.disparity.view import FloorView
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 
 _MIN_DISPARITY_PX = 2.5
 """Farther floor is not judged."""
@@ -32,6 +34,17 @@ _MEAN_SIGMAS = 0.7
 """Two sigmas of such a mean, which errs by 0.35 of what one height does."""
 _MOST_SIGMAS = np.float32(10)
 _LEAST_KNOWN = 0.2
+
+_WINDOW_SHARE = 0.25
+"""Of the image's width: floor so near looks alike. A sun, a lamp and dust change it slowly."""
+_FEW = 0.1
+"""Where floor covers less than this share of the window, all floor of the image counts."""
+_SIGMAS = 2.0
+"""One in twenty of the floor's own pixels differs by more."""
+_SMOOTH_PX = 5
+_SHRINK = 4
+_STEP_GREY = 1.0
+"""Grey levels are whole: no surface is known better."""
 
 
 @dataclass(frozen=True)
@@ -177,3 +190,43 @@ def _below_contact(
     ends = np.bincount(end * np.int32(width) + columns, minlength=size)
     covered -= ends.reshape(-1, width).astype(np.int16)
     return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
+
+
+def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which pixels of an image (R, W) are darker or brighter than nearly all of the floor
+    (R, W) around them.
+
+    What is measured as floor may be a thing that is hardly higher: the mean is taken twice, the
+    second time without what stood out.
+    """
+    grey = cv2.blur(image, (_SMOOTH_PX, _SMOOTH_PX)).astype(np.float32)
+    odd: NDArray[np.bool_] = np.zeros(image.shape, np.bool_)
+    for _ in range(2):
+        counted = (floor & ~odd).astype(np.float32)
+        if not counted.any():
+            return odd
+        mean, variance = _around(grey, counted)
+        odd = (grey - mean) ** 2 > _SIGMAS**2 * (variance + _STEP_GREY**2)
+    return odd
+
+
+def _around(
+    grey: NDArray[np.float32], counted: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return mean and variance (R, W) of what counts around each pixel. Both change slowly: they
+    are computed at a quarter of the resolution.
+    """
+    width, height = grey.shape[1], grey.shape[0]
+    small = (max(1, width // _SHRINK), max(1, height // _SHRINK))
+    side = int(_WINDOW_SHARE * small[0]) | 1
+    sums = []
+    for value in (counted, counted * grey, counted * grey**2):
+        shrunk = cv2.resize(value, small, interpolation=cv2.INTER_AREA)
+        share = cv2.blur(shrunk, (side, side), borderType=cv2.BORDER_CONSTANT)
+        sums.append(share + np.float32(_FEW / counted.mean() * value.mean()))
+    mean = sums[1] / sums[0]
+    variance = np.maximum(sums[2] / sums[0] - mean**2, 0)
+    return (
+        cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR),
+        cv2.resize(variance, (width, height), interpolation=cv2.INTER_LINEAR),
+    )

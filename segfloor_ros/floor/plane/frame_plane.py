@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.histograms import rising
-from segfloor_ros.floor.disparity.profile import HEIGHT_SIGMA, PITCH_SIGMA_RAD, FloorLine
-from segfloor_ros.floor.mask.runs import pixels_where
-from segfloor_ros.floor.mask.view import column_step
+from segfloor_ros.floor.disparity.profile import (
+    HEIGHT_SIGMA,
+    PITCH_SIGMA_RAD,
+    FloorLine,
+    pixels_where,
+)
+from segfloor_ros.floor.disparity.view import column_step, rising
 from segfloor_ros.floor.plane.plane_fit import (
     HEIGHT_RANGE_M,
     PlaneFit,

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.disparity.histograms import (
+from segfloor_ros.floor.disparity.view import (
+    FloorView,
     filtered_v_disparity,
     obstacle_rows,
     rising,
     u_disparity,
     v_disparity,
 )
-from segfloor_ros.floor.mask.view import FloorView
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings
 
 
 def test_u_disparity_counts_per_column_and_ignores_no_match():

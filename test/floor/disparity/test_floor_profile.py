@@ -12,8 +12,7 @@ from segfloor_ros.floor.disparity.profile import (
     fit_profile,
     spline_basis,
 )
-from segfloor_ros.floor.observation import VDisparity
-from segfloor_ros.floor.settings import FloorSegmentationSettings
+from segfloor_ros.floor.observation import FloorSegmentationSettings, VDisparity
 
 SETTINGS = FloorSegmentationSettings()
 

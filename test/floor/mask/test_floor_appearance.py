@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from floor_scenes import FLOORS, Scene, box, floor_patch, wall
 
-from segfloor_ros.floor.mask.appearance import unlike_floor
-from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.floor.mask.pixel_evidence import unlike_floor
+from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 
 def floor_image(rng, sigma):

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
+from segfloor_ros.floor.disparity.view import FloorView
 from segfloor_ros.floor.mask.filling import beside_something, drop_islands
-from segfloor_ros.floor.mask.view import FloorView
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.floor.settings import FloorSegmentationSettings
 
 
 def test_patches_much_smaller_than_the_floor_are_dropped():

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from segfloor_ros.floor.mask.runs import Runs, pixels_where
+from segfloor_ros.floor.disparity.profile import pixels_where
+from segfloor_ros.floor.mask.filling import Runs
 
 PICTURE = np.array([[1, 1, 0, 0, 1], [0, 0, 0, 0, 0], [0, 1, 1, 1, 0], [1, 0, 0, 1, 1]], bool)
 VALUES = np.arange(20, dtype=np.uint8).reshape(4, 5)

@@ -1,31 +1,33 @@
-"""Stamps of recordings: read, checked and made; and two streams of images paired by them.
-
-Names that stereo recordings give to their two sides.
-
-Pairs of image files: what KITTI, EuRoC and plain image folders have in common.
-"""
+"""Files of one recording: images with stamps, wheel odometry and IMU samples."""
 
 from __future__ import annotations
 
 import logging
 import re
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.sources.sensor_files import check_shared_clock
-from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
+from segfloor_ros.camera.sources.source import (
+    DEFAULT_RATE_HZ,
+    PairEntry,
+    Stamped,
+    StampPairing,
+    StereoSource,
+    check_forward,
+)
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
-from segfloor_ros.files.whole import nanoseconds, read_lines
-from segfloor_ros.measurements import RecordedSensor
+from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
+from segfloor_ros.geometry import Array
+from segfloor_ros.measurements import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 
 T = TypeVar('T')
 
@@ -49,6 +51,16 @@ SIDES = (
 """Words for left and right inside a name, the usual ones first."""
 
 IMAGE_SUFFIXES = {'.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff', '.webp'}
+
+WHEEL_ODOMETRY, IMU = 'wheel_odometry', 'imu'
+WHEEL_FILE, IMU_FILE = 'wheel_odometry.txt', 'imu.csv'
+TUM_COLUMNS = 't x y z qx qy qz qw'
+IMU_COLUMNS = 'stamp in ns, angular velocity x y z in rad/s, acceleration x y z in m/s²'
+ACCEL_RANGE_M_S2 = (7.0, 13.0)
+"""Median acceleration felt on earth; outside of it the unit or the columns are wrong."""
+
+UPRIGHT = 0.8
+"""Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
 
 
 def read_times(path: Path) -> list[int]:
@@ -76,15 +88,6 @@ def check_times(path: Path, stamps: Sequence[int], images: Sequence[Path]) -> No
         )
 
 
-def check_forward(where: str, last_ns: Sequence[int], stamp_ns: int) -> None:
-    """Raise InputError when `stamp_ns` is earlier than the last one, if there was one."""
-    if last_ns and stamp_ns < last_ns[-1]:
-        raise InputError(
-            f'{where}: the stamp goes backwards, from {last_ns[-1] / 1e9:.9f} s to '
-            f'{stamp_ns / 1e9:.9f} s; cut the recording there and use one part'
-        )
-
-
 def stamps_of_rate(count: int, rate_hz: float) -> list[int]:
     """Return `count` stamps in ns from 0 on at `rate_hz`, or at the usual rate where that is 0."""
     return [round(i * 1e9 / (rate_hz or DEFAULT_RATE_HZ)) for i in range(count)]
@@ -95,112 +98,6 @@ def rate_of(stamps_ns: Sequence[int]) -> float:
     intervals = np.diff(stamps_ns)
     intervals = intervals[intervals > 0]
     return float(1e9 / np.median(intervals)) if intervals.size else DEFAULT_RATE_HZ
-
-
-@dataclass(frozen=True)
-class Stamped(Generic[T]):
-    """Something with a stamp."""
-
-    stamp_ns: int
-    item: T
-
-
-class StampPairing(Generic[T]):
-    """Pairs each image with the nearest of the other side, if that is within the tolerance.
-
-    Images are added in the order of their arrival, side 0 the left, side 1 the right. One that
-    comes one place late on its side is put where it belongs; one that comes later still means
-    that the clock went backwards, an InputError. A side waits for the other with at most
-    `limit` images. names: of both sides, for messages.
-
-    pairs, and by side: unpaired, images without a partner; duplicates, images with a stamp that
-    was there before.
-    """
-
-    def __init__(self, tolerance_s: float, names: tuple[str, str], limit: int | None = 64) -> None:
-        self.pairs = 0
-        self.unpaired = [0, 0]
-        self.duplicates = [0, 0]
-        self._smallest_gap_ns: int | None = None
-        self._tolerance_ns = round(tolerance_s * 1e9)
-        self._names = names
-        self._limit = limit
-        self._queues: tuple[deque[Stamped[T]], deque[Stamped[T]]] = deque(), deque()
-        self._latest: list[list[int]] = [[], []]
-        self._closing = False
-
-    def add(self, side: int, stamp_ns: int, item: T) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
-        """Take in an image and yield the pairs that are complete now."""
-        latest, queue = self._latest[side], self._queues[side]
-        if stamp_ns in latest:
-            self.duplicates[side] += 1
-            return
-        if len(latest) == 2:
-            check_forward(self._names[side], latest[:1], stamp_ns)
-        late = bool(latest) and stamp_ns < latest[-1]
-        # The last image of a side stays in its queue, so a late one always finds its place.
-        queue.insert(len(queue) - 1 if late else len(queue), Stamped(stamp_ns, item))
-        self._latest[side] = sorted([*latest, stamp_ns])[-2:]
-        yield from self._complete_pairs()
-        if self._overflows(side):
-            self._drop(side)
-
-    def finish(self) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
-        """Yield the last pairs; nothing is added after this."""
-        self._closing = True
-        yield from self._complete_pairs()
-        for side in (0, 1):
-            while self._queues[side]:
-                self._drop(side)
-
-    def report(self) -> None:
-        """Warn of images that were left out. Raises InputError when there was no pair at all."""
-        names = f'{self._names[0]} and {self._names[1]}'
-        if not self.pairs:
-            gap = self._smallest_gap_ns
-            nearest = '' if gap is None else f'; the nearest are {gap / 1e9:.6f} s apart'
-            raise InputError(
-                f'{names}: no two images within {self._tolerance_ns / 1e9:g} s{nearest}; are both '
-                'cameras on one clock? else raise stereo_camera.pairing_tolerance_s'
-            )
-        if any(self.unpaired):
-            logger.warning('%s: %d and %d images have no partner', names, *self.unpaired)
-        if any(self.duplicates):
-            logger.warning('%s: %d and %d images came twice', names, *self.duplicates)
-
-    def _complete_pairs(self) -> Iterator[tuple[Stamped[T], Stamped[T]]]:
-        left, right = self._queues
-        while self._decidable(0) and self._decidable(1):
-            gap_ns = left[0].stamp_ns - right[0].stamp_ns
-            early = 0 if gap_ns < 0 else 1
-            if self._next_is_nearer(early):
-                self._drop(early)
-            elif abs(gap_ns) <= self._tolerance_ns:
-                self.pairs += 1
-                yield left.popleft(), right.popleft()
-            else:
-                self._smallest_gap_ns = min(abs(gap_ns), self._smallest_gap_ns or abs(gap_ns))
-                self._drop(early)
-
-    def _decidable(self, side: int) -> bool:
-        """Whether the first image of a side can be paired: its successor, which might fit better,
-        is there, or need not be waited for.
-        """
-        count = len(self._queues[side])
-        return count > 1 or (count == 1 and (self._closing or self._overflows(1 - side)))
-
-    def _overflows(self, side: int) -> bool:
-        return self._limit is not None and len(self._queues[side]) > self._limit
-
-    def _next_is_nearer(self, early: int) -> bool:
-        queue, target_ns = self._queues[early], self._queues[1 - early][0].stamp_ns
-        if len(queue) < 2:
-            return False
-        return abs(queue[1].stamp_ns - target_ns) < abs(queue[0].stamp_ns - target_ns)
-
-    def _drop(self, side: int) -> None:
-        self._queues[side].popleft()
-        self.unpaired[side] += 1
 
 
 def side_pairs(names: Iterable[str]) -> list[tuple[str, str]]:
@@ -335,3 +232,124 @@ def check_equal_numbers(name: str, left: Sequence[Path], right: Sequence[Path]) 
             f'{name}: {len(left)} left and {len(right)} right images; every left image needs its '
             'right one: complete the copy, or remove the images without partner'
         )
+
+
+def folder_sensors(
+    folder: Path, ignored: Collection[str], T_left_imu: Array | None = None, imu: Path | None = None
+) -> list[RecordedSensor]:
+    """Return the sensors whose files lie in a folder; depth images count as not used.
+
+    T_left_imu: (4, 4), the frame of what the file `imu` holds in the rectified left optical one.
+    Raises InputError when a file that is used is bad.
+    """
+    files: list[tuple[str, Path, Callable[[Path], Sequence[Measurement]]]] = [
+        (WHEEL_ODOMETRY, folder / WHEEL_FILE, read_wheel_odometry),
+        (IMU, imu or folder / IMU_FILE, lambda path: read_imu(path, T_left_imu)),
+    ]
+    found = [
+        _sensor(name, path, read, name not in ignored)
+        for name, path, read in files
+        if path.exists()
+    ]
+    depth = [*(folder / DEPTH).glob('*.png')]
+    if depth:
+        found.append(RecordedSensor(DEPTH, str(folder / DEPTH), len(depth), False))
+    return found
+
+
+def _sensor(
+    name: str, path: Path, read: Callable[[Path], Sequence[Measurement]], used: bool
+) -> RecordedSensor:
+    if not used:
+        return RecordedSensor(name, str(path), sum(1 for _ in read_lines(path)), False)
+    measurements = read(path)
+    return RecordedSensor(name, str(path), len(measurements), True, lambda: measurements)
+
+
+def read_wheel_odometry(path: Path) -> list[WheelPose]:
+    """Return the poses of a file in the TUM format. Raises InputError naming file and line."""
+    table, stamps_ns = _read_table(path, 8, TUM_COLUMNS, nanoseconds)
+    norms = np.linalg.norm(table[:, 3:7], axis=1)
+    bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
+    if len(bad):
+        raise InputError(
+            f'{path}, pose {bad[0] + 1}: the quaternion has length {norms[bad[0]]:.3g}, not 1; '
+            f'expected {TUM_COLUMNS}'
+        )
+    from scipy.spatial.transform import Rotation  # see geometry.py
+
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(table[:, 3:7]).as_matrix()
+    poses[:, :3, 3] = table[:, :3]
+    return [WheelPose(int(stamp), pose) for stamp, pose in zip(stamps_ns, poses, strict=True)]
+
+
+def read_imu(path: Path, T_left_imu: Array | None = None) -> list[ImuSample]:
+    """Return the samples of a file with the columns of EuRoC's data.csv. A YAML file of the same
+    name tells by `T_BS` where the IMU is; T_left_imu: (4, 4), and where that frame is in the
+    rectified left optical one.
+
+    Raises InputError naming file and line, or CalibrationError.
+    """
+    table, stamps_ns = _read_table(path, 7, IMU_COLUMNS, whole_nanoseconds)
+    check_gravity(str(path), table[:, 3:6])
+    beside = path.with_suffix('.yaml')
+    T = np.eye(4) if T_left_imu is None else T_left_imu
+    T = T @ read_body_pose(beside) if beside.exists() else T
+    return [
+        ImuSample.seen_from(T, int(stamp), row[:3], row[3:6])
+        for stamp, row in zip(stamps_ns, table, strict=True)
+    ]
+
+
+def check_gravity(where: str, accel_m_s2: Array) -> None:
+    """Raise InputError unless accelerations (N, 3) are about those on earth."""
+    felt = float(np.nanmedian(np.linalg.norm(accel_m_s2, axis=1)))
+    if not ACCEL_RANGE_M_S2[0] <= felt <= ACCEL_RANGE_M_S2[1]:
+        raise InputError(
+            f'{where}: the median acceleration is {felt:.3g}, but gravity alone is 9.81 m/s²; '
+            'correct the unit or the columns, or leave it out with --ignore imu'
+        )
+
+
+def is_upright(accel_m_s2: Array) -> bool:
+    """Whether up is about up in the image for what an IMU at rest feels (3,): its axes may be those
+    of the image.
+    """
+    return bool(-accel_m_s2[1] > UPRIGHT * np.linalg.norm(accel_m_s2))
+
+
+def check_shared_clock(sensors: Sequence[RecordedSensor], stamps_ns: Sequence[int]) -> None:
+    """Raise InputError when a sensor that is used measured at no time of the images."""
+    for sensor in sensors:
+        times = sorted(m.stamp_ns for m in sensor.read()) if sensor.used else []
+        if times and (times[-1] < stamps_ns[0] or times[0] > stamps_ns[-1]):
+            raise InputError(
+                f'{sensor.where}: its stamps, {times[0] / 1e9:.3f} to {times[-1] / 1e9:.3f} s, do '
+                f'not meet those of the images, {stamps_ns[0] / 1e9:.3f} to '
+                f'{stamps_ns[-1] / 1e9:.3f} s; bring them to one clock, or leave it out with '
+                f'--ignore {sensor.name}'
+            )
+
+
+def _read_table(
+    path: Path, columns: int, expected: str, read_stamp: Callable[[str], int]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the numbers (N, columns - 1) after the stamps, and the stamps (N,) in ns, ascending;
+    of several lines with the same stamp the first counts.
+    """
+    rows: dict[int, list[float]] = {}
+    for where, line in read_lines(path):
+        words = line.replace(',', ' ').split()
+        try:
+            values = [number(word) for word in words[1:columns]]
+            stamp_ns = read_stamp(words[0])
+        except ValueError as error:
+            raise InputError(f'{where}: expected {expected} ({error})') from None
+        if len(values) != columns - 1:
+            raise InputError(f'{where}: expected {expected}')
+        rows.setdefault(stamp_ns, values)
+    if not rows:
+        raise InputError(f'{path}: holds no measurement; expected {expected}')
+    stamps = sorted(rows)
+    return np.array([rows[stamp] for stamp in stamps]), np.array(stamps, np.int64)
