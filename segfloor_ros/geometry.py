@@ -143,9 +143,9 @@ def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
     return make_transform(Rotation.from_quat(quat_xyzw.copy()).as_matrix(), translation)
 
 
-def rotation_angle(R: Array) -> float:
-    """Return the angle of a (3, 3) rotation in radians, in [0, pi]."""
-    return float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)))
+def rotation_angle(R: Array) -> Any:
+    """Return the angles (...) of rotations (..., 3, 3) in radians, in [0, pi]."""
+    return np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1.0, 1.0))
 
 
 class FrameTree:

@@ -31,6 +31,7 @@ NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 
 PLACES = 80
 """More than are driven past: a place that is seen again makes no keyframe."""
+STEP_M = 0.05
 FRAME_NS = 100_000_000
 RECEIVED = ('map', 'labelled_points', 'odometry', 'keyframe/path')
 REJOIN_S = 60.0
@@ -38,7 +39,7 @@ REJOIN_S = 60.0
 
 @pytest.fixture(scope='module')
 def drive():
-    return room_drive(PLACES, step_m=0.05, arc_rad=NEW_VIEW_RAD)
+    return room_drive(PLACES, step_m=STEP_M, arc_rad=NEW_VIEW_RAD)
 
 
 class Journey:
@@ -91,13 +92,23 @@ class Journey:
                 count -= 1
         assert count == 0, 'no more keyframes are made'
         return (
-            grid_arrays(self._of('map', answer.stamp_ns), 'map'),
-            labelled_arrays(self._of('labelled_points', answer.stamp_ns), 'labelled_points'),
+            grid_arrays(self.wait_for('map', answer.stamp_ns), 'map'),
+            labelled_arrays(self.wait_for('labelled_points', answer.stamp_ns), 'labelled_points'),
         )
+
+    def received(self, name: str) -> list:
+        """Return the messages of a topic so far."""
+        return self._received[name]
+
+    def settle(self) -> None:
+        """Drive on until every node had the time to keep its map beside its work."""
+        for _ in range(5):
+            self.step()
+            time.sleep(0.1)
 
     def latest(self, name: str):
         """Return the last message of a topic."""
-        return self._received[name][-1]
+        return self.received(name)[-1]
 
     def truth(self, stamp_ns: int) -> np.ndarray:
         """Return the true pose (4, 4) of a frame."""
@@ -110,7 +121,9 @@ class Journey:
         truth = self._truth[to_ns(message.header.stamp)]
         return float(np.linalg.norm(T_odom_base[:3, 3] - truth[:3, 3]))
 
-    def _of(self, name: str, stamp_ns: int):
+    def wait_for(self, name: str, stamp_ns: int):
+        """Return the message of a topic with a stamp."""
+
         def found():
             return [m for m in self._received[name] if to_ns(m.header.stamp) == stamp_ns]
 
@@ -136,6 +149,7 @@ def journey(tmp_path_factory, drive):
 def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     chain = journey.chain
     grid, cloud = journey.keyframes(1)
+    journey.settle()
     chain.kill(node)
     journey.miss(2)
     chain.start(node)
@@ -178,6 +192,7 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
 def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(journey) -> None:
     chain = journey.chain
     grid, _ = journey.keyframes(1)
+    journey.settle()
     last = journey.latest('odometry')
     chain.kill(SLAM)
     chain.start(SLAM)
@@ -187,25 +202,35 @@ def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(jou
         return replace(journey.next(), left=dark, right=dark)
 
     chain.wake(covered)
-    answer = chain.drive([covered() for _ in range(10)])[-1]
-    assert 'held where the drive was broken off' in answer.message
-    chain.graph.until(lambda: stamp_of(journey.latest('odometry')) == answer.stamp_ns, 'it')
+    # How many frames wake the node depends on the machine: the robot may just have come back.
+    moved_m, frames = 0.0, 10
+    while moved_m < 0.3:
+        answer = chain.drive([covered() for _ in range(frames)])[-1]
+        assert 'held where the drive was broken off' in answer.message
+        journey.wait_for('odometry', answer.stamp_ns)
+        moved_m, frames = journey.odometry_error_m(), 1
     held = journey.latest('odometry')
     np.testing.assert_allclose(place_of(held), place_of(last), atol=1e-6)
     since_s = 1e-9 * (stamp_of(held) - stamp_of(last))
     # A robot that nobody sees may be carried at a walking pace: three sigma.
     sigma_m = np.sqrt(held.pose.covariance[0])
     assert sigma_m >= 0.5 * since_s
-    moved_m = journey.odometry_error_m()
-    assert 0.3 < moved_m < 3 * sigma_m
+    assert moved_m < 3 * sigma_m
+    begun = len(journey.received('odometry'))
     journey.rejoin()
     grid_after, _ = journey.keyframes(1)
     path = path_arrays(journey.latest('keyframe/path'))
     assert path.stamp_ns[0] == 0
     truth = journey.truth(path.stamp_ns[-1])
     assert np.linalg.norm(path.T_map_base[-1][:3, 3] - truth[:3, 3]) < 0.03
-    # `odom` is continuous: what was not seen is now between it and the map.
-    assert journey.odometry_error_m() > 0.5 * moved_m
+    # `odom` is continuous: it goes on from where it was held, frame by frame, however far the robot
+    # is from there; what was not seen is now between it and the map. Poses that were provisional
+    # come a second time.
+    places = {stamp_of(held): place_of(held)}
+    for message in journey.received('odometry')[begun:]:
+        places.setdefault(stamp_of(message), place_of(message))
+    steps_m = np.linalg.norm(np.diff(list(places.values()), axis=0), axis=1)
+    assert steps_m.max() < 3 * STEP_M
     known, known_after = known_cells(grid), known_cells(grid_after)
     assert len(known & known_after.keys()) >= 0.98 * len(known)
 

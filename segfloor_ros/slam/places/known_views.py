@@ -47,8 +47,8 @@ SECOND_VISIT = 3.0
 as far."""
 
 LOOK_AGAIN = 6.0
-"""What is known may have changed: keyframes so many times as far apart as new ones keep the map of
-it up to date.
+"""What is known may have changed: on a second visit keyframes so many times as far apart as new
+ones keep the map of it up to date, and twice as far apart with every visit that made one.
 """
 
 COVERED_SHARE = 0.95
@@ -76,15 +76,13 @@ def views_near(
     """Return up to `limit` keyframes that a camera which sees things at about `depth_m` stands
     near to and looks the same way as, the nearest first.
     """
-    active = [k for k in sparse_map.keyframes if k.retired is None]
-    relative = np.stack([k.T_camera_world for k in active]) @ invert(T_camera_world)
-    cosine = (np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    turned_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    relative = _from_views(sparse_map, T_camera_world)
+    turned_rad = rotation_angle(relative[:, :3, :3])
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
     distance = np.maximum(moved_m / (REACH_RATIO * depth_m), turned_rad / REACH_RAD)
+    distance[[k.retired is not None for k in sparse_map.keyframes]] = np.inf
     order = np.argsort(distance, kind='stable')
-    near = order[distance[order] < 1.0][:limit]
-    return np.array([active[k].index for k in near], np.intp)
+    return order[distance[order] < 1.0][:limit]
 
 
 def view_novelty(
@@ -100,19 +98,16 @@ def view_novelty(
     It is measured from the nearest of the latest keyframes that saw much of the same. Those of an
     earlier visit count from further away, if together they saw what is tracked and no part of the
     view was out of their sight; they do not count so far away from the latest that the place should
-    be looked at again.
+    be looked at again, ever farther with every visit: keyframes of a place grow with the logarithm
+    of its visits.
     """
     latest = len(sparse_map.keyframes) - 1
     recent, shared = sparse_map.covisible(ids)
     recent = recent[(recent > latest - RECENT) & (shared >= ALIKE_SHARE * len(ids))]
     around = views_near(sparse_map, T_camera_world, depth_m, len(sparse_map.keyframes))
-    earlier = around[around <= latest - RECENT]
-    new = {
-        int(k): novelty(sparse_map.keyframes[k].T_camera_world @ invert(T_camera_world), depth_m)
-        for k in (latest, *recent, *earlier)
-    }
-    nearest = min(value for k, value in new.items() if k > latest - RECENT)
-    earlier = earlier[[new[int(k)] < SECOND_VISIT for k in earlier]]
+    new = novelty(_from_views(sparse_map, T_camera_world), depth_m)
+    nearest = float(new[np.append(recent, latest)].min())
+    earlier = around[(around <= latest - RECENT) & (new[around] < SECOND_VISIT)]
     if nearest <= 1 or len(earlier) == 0:
         return nearest
     known = np.isin(ids, sparse_map.points_of(earlier)).mean()
@@ -121,8 +116,15 @@ def view_novelty(
         covered_share(camera, views, T_camera_world, depth_m) < COVERED_SHARE
     ):
         return nearest
-    known_view = min(new[int(k)] for k in earlier) / SECOND_VISIT
-    return min(nearest, max(known_view, nearest / LOOK_AGAIN))
+    # The keyframes of one visit follow each other, also those that are retired by now.
+    visits = 1 + (np.diff(np.flatnonzero(new < SECOND_VISIT)) > 1).sum()
+    again = nearest / (LOOK_AGAIN * 2.0 ** (visits - 1))
+    return max(float(new[earlier].min()) / SECOND_VISIT, again)
+
+
+def _from_views(sparse_map: SparseMap, T_camera_world: Array) -> Array:
+    """Return the motions (K, 4, 4) to a camera from all keyframes, in their axes."""
+    return np.stack([k.T_camera_world for k in sparse_map.keyframes]) @ invert(T_camera_world)
 
 
 def covered_share(
@@ -181,10 +183,10 @@ def is_keyframe(view: View, max_frames: int) -> bool:
     return b and (a1 or a2 or a3)
 
 
-def novelty(T_known_now: Array, median_depth_m: float) -> float:
-    """Return the motion (4, 4) from a known view in units of what makes a view new.
+def novelty(T_known_now: Array, median_depth_m: float) -> Array:
+    """Return the motions (..., 4, 4) from known views in units of what makes a view new, (...).
     median_depth_m: of what is seen.
     """
-    moved = float(np.linalg.norm(T_known_now[:3, 3]))
-    turned = rotation_angle(T_known_now[:3, :3])
-    return max(moved / (NEW_MOTION_RATIO * median_depth_m), turned / NEW_TURN_RAD)
+    moved_m = np.linalg.norm(T_known_now[..., :3, 3], axis=-1)
+    turned_rad = rotation_angle(T_known_now[..., :3, :3])
+    return np.maximum(moved_m / (NEW_MOTION_RATIO * median_depth_m), turned_rad / NEW_TURN_RAD)
