@@ -100,11 +100,12 @@ class Journey:
         """Return the messages of a topic so far."""
         return self._received[name]
 
-    def settle(self) -> None:
-        """Drive on until every node had the time to keep its map beside its work."""
+    def settle(self):
+        """Drive on until every node had the time to keep its map; return the last odometry."""
         for _ in range(5):
-            self.step()
+            answer = self.step()
             time.sleep(0.1)
+        return self.wait_for('odometry', answer.stamp_ns)
 
     def latest(self, name: str):
         """Return the last message of a topic."""
@@ -192,8 +193,7 @@ def test_a_camera_that_is_killed_is_taken_up_again(journey, tmp_path) -> None:
 def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(journey) -> None:
     chain = journey.chain
     grid, _ = journey.keyframes(1)
-    journey.settle()
-    last = journey.latest('odometry')
+    last = journey.settle()
     chain.kill(SLAM)
     chain.start(SLAM)
     dark = np.zeros_like(journey.next().left)

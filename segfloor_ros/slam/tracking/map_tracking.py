@@ -328,7 +328,7 @@ class LocalMap:
     def is_new_view(self, T_camera_world: Array) -> bool:
         """Whether a camera that sees no point has come to where the last keyframe was not."""
         T_last_now = self._map.keyframes[-1].T_camera_world @ invert(T_camera_world)
-        return novelty(T_last_now, self._depth_m) > 1
+        return bool(novelty(T_last_now, self._depth_m) > 1)
 
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""
