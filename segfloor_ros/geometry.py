@@ -148,6 +148,12 @@ def rotation_angle(R: Array) -> Any:
     return np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1.0, 1.0))
 
 
+def is_within(motion: Array, reach: tuple[float, float]) -> bool:
+    """Whether a motion (4, 4) is at most as far as a reach in metres and a turn in radians."""
+    moved_m = float(np.linalg.norm(motion[:3, 3]))
+    return moved_m <= reach[0] and rotation_angle(motion[:3, :3]) <= reach[1]
+
+
 class FrameTree:
     """Keeps fixed transforms for good and moving ones for ten seconds.
 

@@ -9,7 +9,7 @@ from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import Observations
+from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
@@ -69,7 +69,7 @@ def seen(points, index, point_id, x=0.0):
 
 def row_of_views(count, ids, spacing_m, xyz=WALL):
     """A map whose keyframes stand side by side and see the points `ids` of ten."""
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     add(sparse_map, keyframe(0, [NO_POINT] * 10), np.arange(10), xyz)
     for index in range(1, count):
         add(sparse_map, keyframe(index, ids, x=spacing_m * index))

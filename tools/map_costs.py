@@ -112,9 +112,9 @@ def _arrays(poses: Array, xyz: Array, owner: Any, point: Any, length: Any, uvd: 
 def measure(count: int) -> dict[str, float]:
     """Return the times in ms for a map of so many keyframes."""
     rng = np.random.default_rng(count)
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     fill_map(sparse_map, made_up_map(count, rng))
-    places = PlaceRecognition(Rig(CAMERA), sparse_map)
+    places = PlaceRecognition(sparse_map)
     words = rng.integers(0, NUM_WORDS, count * FEATURES)
     places.from_arrays({'words': words, 'word_count': np.full(count, FEATURES)})
     features = Features(

@@ -75,7 +75,7 @@ SLAM: dict[str, Mechanism] = {
     'depth check of matches': Mechanism(
         {'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}
     ),
-    'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MIN_KEPT_RATIO': 0.0}),
+    'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
     'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
     'keyframes where few points are found': Mechanism({'slam.places.known_views.FEW_FOUND': 0.0}),
@@ -99,7 +99,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
-    'points seen through': Mechanism({'slam.map.sparse_map.GONE_AFTER': 1 << 30}),
+    'points seen through': Mechanism({'slam.map.sparse_map.PROOF': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""

@@ -39,6 +39,23 @@ MIN_SHARED = 15
 MIN_TRACKED = 20
 """Fewest points that must agree for a pose to be believed; chance gives five or six."""
 
+SAME = 0.5, 0.3
+"""Two poses further apart than this, in m and rad, are two places."""
+
+MAJORITY = 0.5
+"""Share that must agree: a wrong pose has followers too, but not most."""
+
+CHANCE_SHARE = 0.1
+"""Share of the points of a view of which no more may be found by chance: far ones alone fit many
+places."""
+
+MOST = 0.6
+"""Share of what is expected at a pose that must be found there: what looks alike shows less."""
+
+PROOF = 3
+"""Keyframes that must show something for it to be believed: that a point stands still, or is gone,
+that a view adds nothing, that a place is seen again. What moves fits hardly two."""
+
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images; of more, every second one goes without."""
 

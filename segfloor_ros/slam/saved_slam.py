@@ -57,10 +57,7 @@ def save_slam(slam: StereoSlam, camera: StereoCamera) -> MapFile:
     """Return what SLAM knows. Raises MapError before there is a map."""
     if slam.mount is None or not slam.map.keyframes:
         raise MapError('there is no map yet that could be saved')
-    header = {
-        'camera': asdict(camera),
-        'mount': asdict(slam.mount),
-    }
+    header = {'camera': asdict(camera), 'mount': asdict(slam.mount)}
     return MapFile(header, {PART: slam.to_arrays()})
 
 

@@ -29,15 +29,9 @@ class StereoSlamSettings(StageSettings):
         'Roll of the camera, positive to its right; not a number: measured from the floor seen.',
         within=(-0.8, 0.8),
     )
-    camera_forward_m: float = setting(
-        0.0,
-        'Left camera ahead of the base.',
-        within=(-10.0, 10.0),
-    )
+    camera_forward_m: float = setting(0.0, 'Left camera ahead of the base.', within=(-10.0, 10.0))
     camera_left_m: float = setting(
-        0.0,
-        'Left camera to the left of the middle of the base.',
-        within=(-10.0, 10.0),
+        0.0, 'Left camera to the left of the middle of the base.', within=(-10.0, 10.0)
     )
     num_features: int = setting(1000, 'Features per image, spread over it.', within=(200, 10000))
     fast_threshold: int = setting(
@@ -47,9 +41,7 @@ class StereoSlamSettings(StageSettings):
         within=(2, 60),
     )
     max_speed_mps: float = setting(
-        40.0,
-        'A motion faster than this is implausible and ends tracking.',
-        within=(0.1, 100.0),
+        40.0, 'A motion faster than this is implausible and ends tracking.', within=(0.1, 100.0)
     )
     detect_moving: bool = setting(True, 'Leave out what moves, as far as the stereo pairs show it.')
     mask_dilation_px: int = setting(

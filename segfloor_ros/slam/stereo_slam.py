@@ -80,16 +80,16 @@ class StereoSlam:
         times: StageTimes | None = None,
         background: bool = False,
     ) -> None:
-        self.map = SparseMap()
         self.rig = Rig(camera, mount)
+        self.map = SparseMap(self.rig)
         self._mount_meter = mount_meter
         self._camera = camera
         self._settings = settings
         self._times = times or StageTimes()
         self.sensors = BodyMotion()
         self.rig_check = RigCheck()
-        self.front_end = FrontEnd(self.rig, settings, self.map, self.sensors)
-        self.back_end = BackEnd(self.rig, settings, self.map, self.front_end, background)
+        self.front_end = FrontEnd(settings, self.map, self.sensors)
+        self.back_end = BackEnd(settings, self.map, self.front_end, background)
         self._held = HeldResults()
         self._moving = MotionSearch(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
@@ -215,7 +215,7 @@ class StereoSlam:
         T_world_camera = T_left_base @ T_map_base @ self.mount.T_base_left
         if self.back_end.submap is Submap.LOST:
             self._drop_submap()
-        self.front_end.search_near(T_world_camera, reach_m, reach_rad)
+        self.front_end.search_near(T_world_camera, (reach_m, reach_rad))
 
     def close(self) -> None:
         """End the background threads, if there are any."""

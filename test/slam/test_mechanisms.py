@@ -31,7 +31,7 @@ def test_what_is_seen_again_is_not_mapped_twice():
     there = [planar_pose(0.05 * k, 0, 0.04 * k) for k in range(12)]
     last = drive(slam, StereoRoom(), there + there[::-1])
     assert len(np.unique(last.point_id)) > 200
-    pairs = find_duplicates(CAMERA, slam.map, last)
+    pairs = find_duplicates(slam.map, last)
     assert (~slam.map.seen_together(*pairs)).sum() <= 5
 
 
@@ -39,7 +39,7 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
     # Keyframe 0 sees points 0 to 4, the others, right beside it, only 5 to 9.
     sparse_map = row_of_views(4, [NO_POINT] * 5 + list(range(5, 10)), 0.05)
     sparse_map.unlink(sparse_map.keyframes[0], np.arange(5, 10))
-    local = LocalMap(CAMERA, sparse_map, 30)
+    local = LocalMap(sparse_map, 30)
     local.move_to(np.arange(5, 10, dtype=np.int32), np.eye(4))
     np.testing.assert_array_equal(local.point_ids, np.arange(10))
 
@@ -53,7 +53,7 @@ def test_patches_tell_the_pose_better_than_corners(seed):
     frame = room.frame(1, moved)
     features = FeatureExtractor(SETTINGS).extract(frame.left)
     ids = slam.map.points_of(np.array([0]))
-    track = Tracker(slam.rig, slam.map).track(Images.of(frame, CAMERA), features, ids, [np.eye(4)])
+    track = Tracker(slam.map).track(Images.of(frame, CAMERA), features, ids, [np.eye(4)])
     truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
     error = track.T_camera_world @ truth
     assert np.linalg.norm(error[:3, 3]) < 0.0015

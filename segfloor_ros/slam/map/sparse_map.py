@@ -21,18 +21,11 @@ from segfloor_ros.slam.map.records import (
     PointRows,
     Retirement,
 )
-from segfloor_ros.slam.results import NO_POINT
-
-GONE_AFTER = 3  # keyframes that have seen through a point since it was last found
+from segfloor_ros.slam.results import NO_POINT, PROOF
+from segfloor_ros.slam.rig import Rig
 
 OF_POSITION = ('xyz_world', 'patch', 'patch_distance_m')
-OF_LOOK = (
-    'descriptor',
-    'viewing_distance_m',
-    'viewing_octave',
-    'viewing_direction',
-    'seen_last',
-)
+OF_LOOK = ('descriptor', 'viewing_distance_m', 'viewing_octave', 'viewing_direction', 'seen_last')
 """Columns that go together when two points are merged."""
 
 MAX_PATCH_ZOOM = 1.3
@@ -53,7 +46,7 @@ class SparseMap:
     axes, at the pyramid level viewing_octave (P,). patch: (P, SIDE_PX, SIDE_PX) grey levels around
     it, from patch_distance_m (P,); kept as long as its size in the image stays about the same:
     every change of patch adds an error to the position. observer_count: (P,) keyframes that observe
-    it. points: all of these; edges: the observations.
+    it. points: all of these; edges: the observations. rig: the camera that sees all of this.
     """
 
     xyz_world: Array = _column('xyz_world')
@@ -67,7 +60,8 @@ class SparseMap:
     viewing_direction: Array = _column('viewing_direction')
     observer_count: NDArray[np.int32] = _column('observer_count')
 
-    def __init__(self) -> None:
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
         self.reset()
 
     def reset(self, num_ever: int = 0) -> None:
@@ -237,7 +231,7 @@ class SparseMap:
         """
         found = self.points['found_count']
         seldom = found < min_found_ratio * self.points['visible_count']
-        seldom |= self.points['seen_through_count'] >= GONE_AFTER
+        seldom |= self.points['seen_through_count'] >= PROOF
         lonely = (self.points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
@@ -270,8 +264,4 @@ class SparseMap:
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
         edges = wanted[self.edges.point]
-        return (
-            self.edges.point[edges],
-            self.edges.keyframe[edges],
-            self.edges.row[edges],
-        )
+        return (self.edges.point[edges], self.edges.keyframe[edges], self.edges.row[edges])

@@ -30,7 +30,7 @@ from segfloor_ros.slam.places.loop_closing import (
 )
 from segfloor_ros.slam.places.loops import LoopDetector
 from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import Features
@@ -66,7 +66,6 @@ class BackEnd:
 
     def __init__(
         self,
-        rig: Rig,
         settings: StereoSlamSettings,
         sparse_map: SparseMap,
         front_end: FrontEnd,
@@ -74,14 +73,14 @@ class BackEnd:
     ) -> None:
         self._front_end = front_end
         self._longest_frames = settings.keyframe_max_frames
-        self.mapper = LocalMapper(rig, sparse_map)
+        self.mapper = LocalMapper(sparse_map)
         self.places = front_end.places
         self.loop_count = 0
         self.submap = Submap.KNOWN
         self._known: KnownMap | None = None
-        self._rig = rig
         self._map = sparse_map
-        self.loops = LoopDetector(rig, sparse_map, self.places)
+        self._rig = sparse_map.rig
+        self.loops = LoopDetector(sparse_map, self.places)
         self._local = AdjustmentRunner(background)
         self._global = AdjustmentRunner(background)
         self._background = background
@@ -129,7 +128,7 @@ class BackEnd:
         """
         of_drive = self.submap is Submap.KNOWN
         known = map_to_arrays(self._map) | self.places.to_arrays()
-        self._known = KnownMap(self._rig, self._map, known, of_drive)
+        self._known = KnownMap(self._map, known, of_drive)
         self.reset()
         self.submap = Submap.LOST if of_drive else Submap.OUTSIDE
 
@@ -209,8 +208,7 @@ class BackEnd:
         if adjustment is None:
             return
         self._local.submit(
-            partial(self.mapper.solve, adjustment),
-            partial(self.mapper.apply, adjustment),
+            partial(self.mapper.solve, adjustment), partial(self.mapper.apply, adjustment)
         )
 
     def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
@@ -227,7 +225,7 @@ class BackEnd:
 
     def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
         self._is_closing = False
-        if not apply_closing(self._rig.camera, self._map, closing, result):
+        if not apply_closing(self._map, closing, result):
             return
         self.loop_count += 1
         copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)

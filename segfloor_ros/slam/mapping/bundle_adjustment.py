@@ -232,11 +232,7 @@ class GlobalResult:
     stable_ids: NDArray[np.int32]
 
 
-def copy_map(
-    sparse_map: SparseMap,
-    offset: OffsetEstimate,
-    up_world: Up | None,
-) -> MapCopy:
+def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
     edges = sparse_map.edges
@@ -288,9 +284,7 @@ def solve_global(
     return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])
 
 
-def _known_best(
-    copied: MapCopy,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+def _known_best(copied: MapCopy) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Return the observations, keyframe by keyframe, of points that are among those of some
     keyframe that most others see.
     """

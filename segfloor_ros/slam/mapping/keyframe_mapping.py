@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
 from segfloor_ros.slam.mapping.normal_equations import factors_of
-from segfloor_ros.slam.results import MIN_SHARED, NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, Rig
+from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MIN_SHARED, NO_POINT, PROOF
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import predict_points
@@ -40,15 +40,9 @@ CONTRADICTED_SHARE = 0.1
 with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
 """
 
-MIN_LINK_SHARE = 0.1
-"""Share of a keyframe's points that it must share with a neighbour; fewer may be chance."""
-
 SETTLING_KEYFRAMES = 2
 
 MIN_FOUND_RATIO = 0.25
-
-MIN_KEPT_RATIO = 0.5
-"""Share of the newest keyframe's observations that an adjustment must fit: more than a minority."""
 
 BUNDLE_STEPS = 5
 """Steps of a local adjustment; it mostly converges in three."""
@@ -75,12 +69,7 @@ CANDIDATES = 4
 
 Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
 
-OTHERS = 3
-
 REDUNDANT_SHARE = 0.9
-
-LATEST_KEPT = 3
-"""The latest keyframes are what tracking and the policy lean on."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +95,10 @@ class Adjustment:
 class LocalMapper:
     """Adds keyframes and their points to the map and adjusts the neighbourhood."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
-        self._rig = rig
-        self._camera = rig.camera
+    def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
+        self._rig = sparse_map.rig
+        self._camera = sparse_map.rig.camera
 
     def measure_stereo(
         self, frame: StereoFrame, images: Images, observations: Observations
@@ -123,13 +112,7 @@ class LocalMapper:
         if not images.depth_scale:
             guess = guess_disparity(frame.left, frame.right, uv_px)
         found = np.isfinite(guess)
-        measure_disparity(
-            images,
-            observations,
-            missing[found],
-            guess[found],
-            DISPARITY_REACH_PX,
-        )
+        measure_disparity(images, observations, missing[found], guess[found], DISPARITY_REACH_PX)
 
     def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
         """Add a keyframe and new points from its stereo features; points that turn out to be known
@@ -138,7 +121,7 @@ class LocalMapper:
         keyframe.point_id[self._contradicted(keyframe)] = NO_POINT
         rows, points = self._new_points(keyframe)
         self._map.add_keyframe(keyframe, patches, rows, points)
-        fuse_duplicates(self._camera, self._map, keyframe)
+        fuse_duplicates(self._map, keyframe)
         keyframe.links = self._links(keyframe)
 
     def _links(self, keyframe: KeyframeRecord) -> tuple[int, ...]:
@@ -147,7 +130,7 @@ class LocalMapper:
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)
-        enough = max(MIN_SHARED, MIN_LINK_SHARE * len(own))
+        enough = max(MIN_SHARED, CHANCE_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
         before = [keyframe.index - 1] if keyframe.index > 0 else []
         return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
@@ -219,7 +202,7 @@ class LocalMapper:
         wrong match, and is left out.
         """
         kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
-        if len(kept) and kept.mean() < MIN_KEPT_RATIO:
+        if len(kept) and kept.mean() < MAJORITY:
             return
         self._rig.offset.learn(result.offset)
         self._write_back(adjustment, result)
@@ -312,13 +295,9 @@ def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Ar
     return np.where(at > 0, at * (factor / STEP), np.nan)
 
 
-def fuse_duplicates(
-    camera: StereoCamera,
-    sparse_map: SparseMap,
-    keyframe: KeyframeRecord,
-) -> int:
+def fuse_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> int:
     """Merge points of a new keyframe with those of its neighbours; return how many merged."""
-    a, b = find_duplicates(camera, sparse_map, keyframe)
+    a, b = find_duplicates(sparse_map, keyframe)
     separate = ~sparse_map.seen_together(a, b)
     a, b = a[separate], b[separate]
     older = sparse_map.stable_id[a] < sparse_map.stable_id[b]
@@ -326,11 +305,7 @@ def fuse_duplicates(
     return len(a)
 
 
-def find_duplicates(
-    camera: StereoCamera,
-    sparse_map: SparseMap,
-    keyframe: KeyframeRecord,
-) -> Pairs:
+def find_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Pairs:
     """Return pairs of point rows (N,), (N,): of the keyframe, and of its neighbours alone. Each
     point occurs at most once.
     """
@@ -339,8 +314,8 @@ def find_duplicates(
     around = sparse_map.points_of(order[:NEIGHBOURS])
     others = around[~np.isin(around, own)]
     pose = keyframe.T_camera_world
-    here = predict_points(camera, sparse_map, own, pose)
-    there = predict_points(camera, sparse_map, others, pose)
+    here = predict_points(sparse_map, own, pose)
+    there = predict_points(sparse_map, others, pose)
     if len(here.ids) == 0 or len(there.ids) == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     neighbours = [k + 1 for k in range(min(CANDIDATES, len(here.ids)))]
@@ -361,7 +336,7 @@ def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> 
     """Retire candidates (K,) most of whose points others have seen as well, oldest first; never
     the first keyframe nor the latest.
     """
-    last = len(sparse_map.keyframes) - LATEST_KEPT
+    last = len(sparse_map.keyframes) - PROOF
     for index in sorted(int(k) for k in candidates if 0 < k < last):
         keyframe = sparse_map.keyframes[index]
         if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= REDUNDANT_SHARE:
@@ -371,11 +346,11 @@ def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> 
 
 
 def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
-    """Return the share of a keyframe's points that at least `OTHERS` other keyframes see at the
+    """Return the share of a keyframe's points that at least `PROOF` other keyframes see at the
     same pyramid level or a finer one.
     """
     rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-    enough = sparse_map.observer_count[keyframe.point_id[rows]] > OTHERS
+    enough = sparse_map.observer_count[keyframe.point_id[rows]] > PROOF
     if not len(rows) or enough.mean() < REDUNDANT_SHARE:
         return float(enough.mean()) if len(rows) else 0.0
     rows = rows[np.argsort(keyframe.point_id[rows])]
@@ -389,4 +364,4 @@ def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
     own_octave = keyframe.features.octave[rows].astype(np.float64)
     # A level further counts as the same: corners jump between neighbouring levels.
     as_fine = (edge_keyframe != keyframe.index) & (octave <= own_octave[slot] + 1)
-    return float((np.bincount(slot[as_fine], minlength=len(ids)) >= OTHERS).mean())
+    return float((np.bincount(slot[as_fine], minlength=len(ids)) >= PROOF).mean())

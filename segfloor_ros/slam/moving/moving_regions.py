@@ -130,11 +130,7 @@ class MovingRegions:
         self._found: NDArray[np.uint8] | None = None
 
     def search(
-        self,
-        frame: StereoFrame,
-        T_camera_world: Array,
-        T_odom_camera: Array,
-        mount: Mount | None,
+        self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
     ) -> Scene:
         """Find what moves in a frame whose pose is known."""
         disparity = self.measure(frame.left, frame.right)
@@ -412,11 +408,7 @@ class MotionSearch:
         return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
 
     def search(
-        self,
-        frame: StereoFrame,
-        T_camera_world: Array,
-        T_odom_camera: Array,
-        mount: Mount | None,
+        self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
     ) -> Searched:
         """Find what moves in a frame whose pose is known."""
         self._frames_since = 0

@@ -86,11 +86,7 @@ def views_near(
 
 
 def view_novelty(
-    camera: StereoCamera,
-    sparse_map: SparseMap,
-    ids: NDArray[np.int32],
-    T_camera_world: Array,
-    depth_m: float,
+    sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array, depth_m: float
 ) -> float:
     """Return how new the view of a camera is that tracks points `ids` (N,) at about `depth_m`: 1 is
     just new.
@@ -112,9 +108,8 @@ def view_novelty(
         return nearest
     known = np.isin(ids, sparse_map.points_of(earlier)).mean()
     views = [sparse_map.keyframes[k].T_camera_world for k in earlier]
-    if known < KNOWN_SHARE or (
-        covered_share(camera, views, T_camera_world, depth_m) < COVERED_SHARE
-    ):
+    covered = covered_share(sparse_map.rig.camera, views, T_camera_world, depth_m)
+    if known < KNOWN_SHARE or covered < COVERED_SHARE:
         return nearest
     # The keyframes of one visit follow each other, also those that are retired by now.
     visits = 1 + (np.diff(np.flatnonzero(new < SECOND_VISIT)) > 1).sum()

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
 from segfloor_ros.map_file import Arrays
 from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
@@ -38,7 +37,7 @@ from segfloor_ros.slam.places.loops import (
 )
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import CHI2_95, LOCAL_KEYFRAMES, NEIGHBOURS, Rig
+from segfloor_ros.slam.rig import CHI2_95, LOCAL_KEYFRAMES, NEIGHBOURS
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
@@ -85,10 +84,7 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     loops = [*sparse_map.loops, *new]
     T_loops = np.stack([loop.T_i_j for loop in loops])
     sigma = np.concatenate(
-        [
-            np.tile(LINK_SIGMA, (len(i), 1)),
-            np.tile(LOOP_FACTOR * LINK_SIGMA, (len(loops), 1)),
-        ]
+        [np.tile(LINK_SIGMA, (len(i), 1)), np.tile(LOOP_FACTOR * LINK_SIGMA, (len(loops), 1))]
     )
     fixed = np.zeros(len(keyframes), bool)
     fixed[0] = True
@@ -115,12 +111,7 @@ def solve_closing(closing: Closing) -> tuple[Array, Array]:
     return optimise(closing.graph)
 
 
-def apply_closing(
-    camera: StereoCamera,
-    sparse_map: SparseMap,
-    closing: Closing,
-    result: tuple[Array, Array],
-) -> bool:
+def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, Array]) -> bool:
     """Bring a closed loop into the map, which has had no new keyframe since. False, and nothing
     moves, where the loop contradicts the rest of the map.
     """
@@ -131,15 +122,15 @@ def apply_closing(
     sparse_map.loops += closing.edges
     for match in closing.matches:
         _merge(sparse_map, match)
-    fuse_latest(camera, sparse_map, closing.matches[-1].keyframe)
+    fuse_latest(sparse_map, closing.matches[-1].keyframe)
     return True
 
 
-def fuse_latest(camera: StereoCamera, sparse_map: SparseMap, latest: int) -> None:
+def fuse_latest(sparse_map: SparseMap, latest: int) -> None:
     """Merge what the keyframes up to the latest know twice, now that both ends are one map."""
     for keyframe in sparse_map.keyframes[max(0, latest - LOCAL_KEYFRAMES) : latest + 1]:
         if keyframe.retired is None:
-            fuse_duplicates(camera, sparse_map, keyframe)
+            fuse_duplicates(sparse_map, keyframe)
 
 
 def _merge(sparse_map: SparseMap, match: Match) -> None:
@@ -259,22 +250,15 @@ class Sighting:
 class KnownMap:
     """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        own: SparseMap,
-        arrays: Arrays,
-        of_drive: bool,
-    ) -> None:
+    def __init__(self, own: SparseMap, arrays: Arrays, of_drive: bool) -> None:
         self._own = own
         self._of_drive = of_drive
-        self._camera = rig.camera
-        self._map = SparseMap()
+        self._map = SparseMap(own.rig)
         fill_map(self._map, arrays)
-        self._places = PlaceRecognition(rig, self._map)
+        self._places = PlaceRecognition(self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._checks = LoopChecks(rig, own, self._map)
+        self._checks = LoopChecks(own, self._map)
         self._sightings: list[Sighting] = []
         self._misses = 0
 
@@ -341,7 +325,7 @@ class KnownMap:
             T_i_j = match.T_camera_world @ place.T_world_camera
             self._own.loops.append(LoopEdge(i, match.place, T_i_j))
             merge_pairs(self._own, self._rows(sighting.own_ids), self._rows(sighting.known_ids))
-        fuse_latest(self._camera, self._own, before + latest.keyframe)
+        fuse_latest(self._own, before + latest.keyframe)
         return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
 
     def to_arrays(self) -> Arrays:

@@ -16,49 +16,36 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
+from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import RECENT, views_near
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, greatest_speed_mps
-from segfloor_ros.slam.results import MIN_SHARED, NO_POINT, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M, Rig
+from segfloor_ros.slam.results import MIN_SHARED, MOST, NO_POINT, PROOF, SAME, Track
+from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.images import Images
 
 MIN_SHARED_SHARE = 0.25
 """Keyframes that share so many points are linked already; fewer are shared by chance."""
 
 CANDIDATES = 2
-
 MAX_MISSES = 1
-
 REMEMBERED = 1000
 
-MAX_DRIFT = 0.04
-"""Drift of a path, m per m: stereo odometry drifts by one per cent or less."""
+DRIFT_PER_M = 0.04, 0.01
+"""Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
 
-MAX_TURN_DRIFT_RADPM = 0.01
+LEAST_DRIFT = 0.02, 0.005
+"""Less, in m and rad, is no drift: the local adjustments take it away."""
 
-LEAST_DRIFT_M = 0.02
-
-LEAST_DRIFT_RAD = 0.005
-"""Less is no drift: the local adjustments take it away."""
-
-FREE_DRIFT_M = 0.3
-
-FREE_DRIFT_RAD = 0.1
-
-FREE_WAY_M = 0.5
+FREE_DRIFT = 0.3, 0.1
+"""Drift, in m and rad, of the shortest of ways."""
 
 MAX_STEP_UP_M = 0.1
-
 MAX_SLOPE = 0.15
-
 MAX_TILT_RAD = 0.2
 """Where a robot stands on the same floor again, its camera is about as high and as level as before:
 floors slope, and carts shake."""
-
-MIN_BACK_SHARE = 0.6
 
 MAX_BACK_PX = 4.0
 """The points of the keyframe must be where the place's own view shows what they are."""
@@ -67,7 +54,6 @@ BESIDE_PX = 5.0
 """Points so near to each other in an image lie on about the same ray."""
 
 IN_FRONT_PX = 3.0
-
 IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by so much, and by this
 share."""
@@ -76,21 +62,13 @@ MAX_SEEN_THROUGH = 0.2
 """Share of points that the other side may see through: edges hide what is behind by a few pixels.
 """
 
-CONFIRMATIONS = 3
-"""Keyframes in a row that must see the place."""
+MIN_MOTION = 0.2, 0.2
+"""So far, in m or rad, the camera must have moved while it saw the place: what is alike from one
+place differs from the next."""
 
-MIN_MOVED_M = 0.2
-
-MIN_TURNED_RAD = 0.2
-"""So far the camera must have moved while it saw the place, or turned: what is alike from one place
-differs from the next."""
-
-AGREE_M = 0.05
-
-AGREE_RAD = 0.02
-"""Keyframes in a row must show the same drift up to this and a share of the depth of the view."""
-
-AGREE_DEPTH_SHARE = 0.02
+AGREE = 0.05, 0.02
+"""Keyframes in a row must show the same drift up to this, in m and rad, at the depth of the view.
+"""
 
 NEAREST_M = 0.5
 
@@ -111,11 +89,11 @@ class Candidate:
 class LoopDetector:
     """Looks for loops, keyframe by keyframe."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap, places: PlaceRecognition) -> None:
+    def __init__(self, sparse_map: SparseMap, places: PlaceRecognition) -> None:
         self.candidates: deque[Candidate] = deque(maxlen=REMEMBERED)
         self._map = sparse_map
         self._places = places
-        self._checks = LoopChecks(rig, sparse_map)
+        self._checks = LoopChecks(sparse_map)
         self.reset()
 
     def reset(self) -> None:
@@ -182,7 +160,7 @@ class LoopDetector:
         poses = invert(np.stack([k.T_camera_world for k in self._map.keyframes]))
         distance = np.linalg.norm(poses[:, :3, 3] - keyframe.T_world_camera[:3, 3], axis=1)
         cosine = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2]
-        reach = FREE_DRIFT_M + MAX_DRIFT * lengths
+        reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths
         # A view shows a place also from some way before and behind it.
         return (distance < reach + 1.0) & (cosine > 0.7)
 
@@ -250,10 +228,9 @@ def path_lengths(sparse_map: SparseMap, index: int) -> Array:
 class LoopChecks:
     """Judges whether a keyframe can see a place: of its own map again, or of another, known one."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap, known: SparseMap | None = None) -> None:
-        self._rig = rig
-        self._camera = rig.camera
+    def __init__(self, sparse_map: SparseMap, known: SparseMap | None = None) -> None:
         self._map = sparse_map
+        self._camera = sparse_map.rig.camera
         self._known = known or sparse_map
 
     def objection_to_drift(self, keyframe: KeyframeRecord, match: Match, length_m: float) -> str:
@@ -261,15 +238,11 @@ class LoopChecks:
         so far, or has not drifted; '' for nothing.
         """
         moved = match.T_camera_world @ keyframe.T_world_camera
-        moved_m, turned = float(np.linalg.norm(moved[:3, 3])), rotation_angle(moved[:3, :3])
-        if moved_m <= LEAST_DRIFT_M and turned <= LEAST_DRIFT_RAD:
+        if is_within(moved, LEAST_DRIFT):
             return 'no drift'
-        if (
-            moved_m > FREE_DRIFT_M + MAX_DRIFT * length_m
-            or turned > FREE_DRIFT_RAD + MAX_TURN_DRIFT_RADPM * length_m
-        ):
-            return 'more than drift'
-        return ''
+        (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
+        reach = free_m + per_m * length_m, free_rad + rad_per_m * length_m
+        return '' if is_within(moved, reach) else 'more than drift'
 
     def is_within_reach(self, match: Match) -> bool:
         """Whether the robot can have come there while it was lost: from the last keyframe of the
@@ -279,7 +252,7 @@ class LoopChecks:
         T_own_known = drift(self._map, match)
         way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
         lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
-        return bool(np.linalg.norm(way[:3, 3]) <= FREE_WAY_M + greatest_speed_mps(known) * lost_s)
+        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
 
     def objection(self, keyframe: KeyframeRecord, match: Match) -> str:
         """Return what else speaks against a match, '' for nothing."""
@@ -293,7 +266,7 @@ class LoopChecks:
 
     def is_level(self, match: Match) -> bool:
         """Whether the robot stands on the floor of the place, as far as the mount is known."""
-        mount = self._rig.mount
+        mount = self._map.rig.mount
         if mount is None:
             return True
         place = self._known.keyframes[match.place]
@@ -320,7 +293,7 @@ class LoopChecks:
         local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
         uv, _ = self._project(transform_points(T_place_world, local))
         gap = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
-        return float((gap < MAX_BACK_PX).mean()) >= MIN_BACK_SHARE
+        return float((gap < MAX_BACK_PX).mean()) >= MOST
 
     def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
         """Return the larger share of the points of one side that the other sees through, were both
@@ -377,19 +350,18 @@ def are_certain(sparse_map: SparseMap, matches: list[Match], times: int = 1) -> 
     """Whether enough keyframes agree, over enough of a motion. times: as many and as much as for a
     loop.
     """
-    if len(matches) < times * CONFIRMATIONS:
+    if len(matches) < times * PROOF:
         return False
     latest = matches[-1]
     motion = latest.T_camera_world @ invert(matches[0].T_camera_world)
-    moved = float(np.linalg.norm(motion[:3, 3])) >= times * MIN_MOVED_M
-    if not (moved or rotation_angle(motion[:3, :3]) >= times * MIN_TURNED_RAD):
+    if is_within(motion, (times * MIN_MOTION[0], times * MIN_MOTION[1])):
         return False
     keyframe = sparse_map.keyframes[latest.keyframe]
-    limit_m = AGREE_M + AGREE_DEPTH_SHARE * median_depth_m(sparse_map, keyframe)
+    reach = AGREE[0] + AGREE[1] * median_depth_m(sparse_map, keyframe), AGREE[1]
     for match in matches[:-1]:
         # Both drifts, at the latest keyframe.
         gap = keyframe.T_camera_world @ drift(sparse_map, match) @ invert(latest.T_camera_world)
-        if np.linalg.norm(gap[:3, 3]) > limit_m or rotation_angle(gap[:3, :3]) > AGREE_RAD:
+        if not is_within(gap, reach):
             return False
     return True
 

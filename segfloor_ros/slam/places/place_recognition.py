@@ -26,39 +26,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
+from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
+from segfloor_ros.slam.results import CHANCE_SHARE, MOST, SAME, Track
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker
 
 MIN_FOUND = 25
-
-MIN_FOUND_SHARE = 0.10
-"""Share of the points expected in view that must be found: far points alone fit many places."""
-
 COLUMNS, ROWS = 4, 3
-
 MIN_EXPECTED = 8
 
-MIN_CELLS_SHARE = 0.6
-"""Share of the parts of the image that must show what is expected there: a poster or a shelf that
-stands elsewhere too fills only some."""
-
 FILE = 'vocabulary.npy'
-
 BRANCHES = 30
-
 LEVELS = 3
-
 NUM_WORDS = BRANCHES**LEVELS
 
 SPEED_FACTOR = 2.0
-
 LEAST_SPEED_MPS = 0.75
 """A robot that is lost moves at most so many times as fast as it ever did, this at least: it may be
 carried at a walking pace.
@@ -67,15 +54,7 @@ carried at a walking pace.
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone are not sure."""
 
-SAME_M = 0.5
-
-SAME_RAD = 0.3
-"""Two finds further apart than this are two places that look alike."""
-
 FRAMES_IN_A_ROW = 2
-
-STEP_RAD = 2 * SAME_RAD
-
 MIN_AGREEMENT = 0.7
 """Away from where it was lost, so many frames must find the camera, each as far from where the one
 before did as it can have moved since, and show what is expected in so many parts of the image: a
@@ -93,9 +72,9 @@ MAX_VIEW_TURN_RAD = 1.0
 class PlaceRecognition:
     """The places of a map by their look."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
-        self._camera = rig.camera
-        self._tracker = Tracker(rig, sparse_map)
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._camera = sparse_map.rig.camera
+        self._tracker = Tracker(sparse_map)
         self._map = sparse_map
         self._vocabulary = Vocabulary.load()
         self._index = PlaceIndex()
@@ -169,11 +148,7 @@ class PlaceRecognition:
         return self.confirm(images, features, ids, estimate.T_camera_world)
 
     def confirm(
-        self,
-        images: Images,
-        features: Features,
-        ids: NDArray[np.int32],
-        T_camera_world: Array,
+        self, images: Images, features: Features, ids: NDArray[np.int32], T_camera_world: Array
     ) -> Track | None:
         """Find a camera that should be at a pose from which points `ids` (N,) are seen; None
         unless it sees them.
@@ -184,9 +159,9 @@ class PlaceRecognition:
     def is_same_place(self, track: Track) -> bool:
         """Whether a frame shows enough of what it should, all over the image."""
         found, expected = len(track.point_ids), len(track.visible_ids)
-        if found < MIN_FOUND or found < MIN_FOUND_SHARE * expected:
+        if found < MIN_FOUND or found < CHANCE_SHARE * expected:
             return False
-        return self.agreement(track) >= MIN_CELLS_SHARE
+        return self.agreement(track) >= MOST
 
     def agreement(self, track: Track) -> float:
         """Return the share of the parts of the image that show what is expected there, by more than
@@ -197,7 +172,7 @@ class PlaceRecognition:
             for ids in (track.point_ids, track.visible_ids)
         )
         full = there >= MIN_EXPECTED
-        agree = seen - np.sqrt(seen) >= 0.5 * MIN_FOUND_SHARE * there
+        agree = seen - np.sqrt(seen) >= 0.5 * CHANCE_SHARE * there
         return float(agree[full].mean()) if full.any() else 0.0
 
     def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
@@ -301,14 +276,14 @@ class Relocaliser:
 
     def reset(self) -> None:
         """Search the whole map, and forget what was found in it."""
-        self._near: tuple[Array, float, float] | None = None
+        self._near: tuple[Array, tuple[float, float]] | None = None
         self._searches_left = 0
         self._last_found: tuple[int, Array] | None = None
         self._in_a_row = 0
 
-    def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
+    def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look around a pose (4, 4) alone, for some time or until the camera is found."""
-        self._near = T_world_camera, reach_m, reach_rad
+        self._near = T_world_camera, reach
         self._searches_left = NARROW_SEARCHES
 
     @property
@@ -329,13 +304,13 @@ class Relocaliser:
         """
         given = self.is_narrow
         found = self.find(images, features, is_possible)
-        expected = found is not None and (given or _follows(found, lost_at, SAME_M))
+        expected = found is not None and (given or _follows(found, lost_at, SAME[0]))
         if found is None or not (expected or self._places.agreement(found) >= MIN_AGREEMENT):
             self._last_found, self._in_a_row = None, 0
             return None
         before_ns, last = self._last_found or (stamp_ns, None)
         way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - before_ns)
-        self._in_a_row = self._in_a_row + 1 if _follows(found, last, SAME_M + way_m) else 1
+        self._in_a_row = self._in_a_row + 1 if _follows(found, last, SAME[0] + way_m) else 1
         self._last_found = stamp_ns, found.T_camera_world
         if self._in_a_row < FRAMES_IN_A_ROW and not expected:
             return None
@@ -343,10 +318,7 @@ class Relocaliser:
         return found
 
     def find(
-        self,
-        images: Images,
-        features: Features,
-        is_possible: Callable[[Array], bool] | None = None,
+        self, images: Images, features: Features, is_possible: Callable[[Array], bool] | None = None
     ) -> Track | None:
         """Return a frame with its pose; None where no place of the map is seen, or two that look
         alike. is_possible: whether the camera can be at a pose T_camera_world (4, 4).
@@ -375,7 +347,7 @@ class Relocaliser:
         if self._near is None or self._searches_left == 0:
             return np.ones(len(keyframes), bool)
         self._searches_left -= 1
-        T_world_camera, reach_m, reach_rad = self._near
+        T_world_camera, (reach_m, reach_rad) = self._near
         poses = np.stack([k.T_world_camera for k in keyframes])
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
@@ -384,22 +356,16 @@ class Relocaliser:
     def _is_near(self, track: Track) -> bool:
         if self._near is None or self._searches_left == 0:
             return True
-        T_world_camera, reach_m, reach_rad = self._near
-        return is_within(track.T_camera_world @ T_world_camera, reach_m, reach_rad)
-
-
-def is_within(motion: Array, reach_m: float, reach_rad: float) -> bool:
-    """Whether a motion (4, 4) is at most so far and so much of a turn."""
-    moved_m = float(np.linalg.norm(motion[:3, 3]))
-    return moved_m <= reach_m and rotation_angle(motion[:3, :3]) <= reach_rad
+        T_world_camera, reach = self._near
+        return is_within(track.T_camera_world @ T_world_camera, reach)
 
 
 def _follows(found: Track, T_camera_world: Array | None, reach_m: float) -> bool:
     """Whether a frame is within reach of where a camera was before (4, 4), if that is known."""
     if T_camera_world is None:
         return False
-    return is_within(found.T_camera_world @ invert(T_camera_world), reach_m, STEP_RAD)
+    return is_within(found.T_camera_world @ invert(T_camera_world), (reach_m, 2 * SAME[1]))
 
 
 def _differ(a: Track, b: Track) -> bool:
-    return not is_within(a.T_camera_world @ invert(b.T_camera_world), SAME_M, SAME_RAD)
+    return not is_within(a.T_camera_world @ invert(b.T_camera_world), SAME)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import MIN_TRACKED, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations, Rig
+from segfloor_ros.slam.results import MAJORITY, MIN_TRACKED, Track
+from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import Images, Region, follow_pixels, is_inside
 from segfloor_ros.slam.tracking.map_tracking import (
@@ -24,7 +24,7 @@ from segfloor_ros.slam.tracking.map_tracking import (
     predict_points,
 )
 from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
-from segfloor_ros.slam.tracking.pose import MIN_AGREEMENT, Agreement, Consensus
+from segfloor_ros.slam.tracking.pose import Agreement, Consensus
 
 MAX_FOLLOWED = 250
 SIGMA_FLOW_PX = 1.0
@@ -35,11 +35,10 @@ MIN_FOUND = 0.15
 class Follower:
     """Finds the pose of a frame from the one before."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
-        self._rig = rig
-        self._camera = rig.camera
+    def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
-        self._consensus = Consensus(rig, sparse_map)
+        self._camera = sparse_map.rig.camera
+        self._consensus = Consensus(sparse_map)
         self.reset()
 
     def reset(self) -> None:
@@ -68,13 +67,10 @@ class Follower:
         self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
 
     def follow(
-        self,
-        images: Images,
-        local_ids: NDArray[np.int32],
-        T_predicted: Array,
+        self, images: Images, local_ids: NDArray[np.int32], T_predicted: Array
     ) -> Track | None:
         """Find the pose of a frame; None where too little of the last one is found again."""
-        offset_px = self._rig.offset.value_px
+        offset_px = self._map.rig.offset.value_px
         roughly = self._by_flow(images, T_predicted)
         if roughly is None:
             return None
@@ -92,18 +88,9 @@ class Follower:
         if not self._believable(found, len(seen.ids)):
             return None
         estimate = found.estimate
-        return Track(
-            estimate,
-            ids[estimate.inliers],
-            measured.take(estimate.inliers),
-            seen.ids,
-        )
+        return Track(estimate, ids[estimate.inliers], measured.take(estimate.inliers), seen.ids)
 
-    def _by_flow(
-        self,
-        images: Images,
-        T_predicted: Array,
-    ) -> Agreement | None:
+    def _by_flow(self, images: Images, T_predicted: Array) -> Agreement | None:
         """Find the pose to about a pixel from where the last frame's points went."""
         if self._small is None or len(self._ids) < MIN_TRACKED:
             return None
@@ -126,13 +113,10 @@ class Follower:
         return agreement if self._believable(agreement, len(ids)) else None
 
     def _select(
-        self,
-        local_ids: NDArray[np.int32],
-        T_camera_world: Array,
-        excluded: Region | None,
+        self, local_ids: NDArray[np.int32], T_camera_world: Array, excluded: Region | None
     ) -> Prediction:
         """Return points that should be seen, spread over the image, the often found first."""
-        seen = predict_points(self._camera, self._map, local_ids, T_camera_world, excluded)
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         if len(seen.ids) <= TRACKED_POINTS:
             return seen
         area = self._camera.width * self._camera.height
@@ -143,4 +127,4 @@ class Follower:
     def _believable(self, found: Agreement, looked_for: int) -> bool:
         """Whether enough points agree: a wrong pose has followers too, but not most."""
         enough = max(MIN_TRACKED, MIN_FOUND * looked_for)
-        return found.agreeing >= enough and found.share >= MIN_AGREEMENT
+        return found.agreeing >= enough and found.share >= MAJORITY

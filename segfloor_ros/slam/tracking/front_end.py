@@ -18,8 +18,7 @@ from segfloor_ros.slam.places.place_recognition import (
     greatest_speed_mps,
     is_within,
 )
-from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, LastPose, ObservedFeatures, Track
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.results import MIN_TRACKED, MOST, NO_POINT, LastPose, ObservedFeatures, Track
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
@@ -52,9 +51,6 @@ CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 """Points, and their share of those expected, that must be found where the sensors have the camera
 somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
-CARRY_ON = 0.6
-"""A poor pose gives way to the motion so far, where that explains this share of its points."""
-
 FEW_POINTS, RESUMING_POINTS = 50, 60
 """Wheels measure the pose better than fewer points, spread over the image, that do not slide along
 edges, and an IMU alone better than half as many. A few more end a blind stretch."""
@@ -70,26 +66,21 @@ class FrontEnd:
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        settings: StereoSlamSettings,
-        sparse_map: SparseMap,
-        body: BodyMotion,
+        self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodyMotion
     ) -> None:
         self.motion = CameraMotion(settings.max_speed_mps, body)
-        self.local = LocalMap(rig.camera, sparse_map, settings.keyframe_max_frames)
-        self.follower = Follower(rig, sparse_map)
-        self.tracker = Tracker(rig, sparse_map)
+        self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
+        self.follower = Follower(sparse_map)
+        self.tracker = Tracker(sparse_map)
         self.extractor = FeatureExtractor(settings)
-        self.places = PlaceRecognition(rig, sparse_map)
+        self.places = PlaceRecognition(sparse_map)
         self.is_fixed = False
         self.frames_since_keyframe = 0
-        self._rig = rig
-        self._camera = rig.camera
+        self._camera = sparse_map.rig.camera
         self._map = sparse_map
         self._relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
-        self._rotation = ImageRotation(rig.camera)
+        self._rotation = ImageRotation(self._camera)
 
     @property
     def is_searching(self) -> bool:
@@ -112,13 +103,13 @@ class FrontEnd:
         seen = self._map.keyframes[-1].point_id
         self.local.move_to(seen[seen != NO_POINT], last.T_camera_world)
 
-    def search_near(self, T_world_camera: Array, reach_m: float, reach_rad: float) -> None:
+    def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
-        here = is_within(self.motion.T_camera_world @ T_world_camera, reach_m, reach_rad)
+        here = is_within(self.motion.T_camera_world @ T_world_camera, reach)
         if here and not self.motion.state.is_lost:
             return
         self.reset()
-        self._relocaliser.search_near(T_world_camera, reach_m, reach_rad)
+        self._relocaliser.search_near(T_world_camera, reach)
 
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
@@ -193,7 +184,7 @@ class FrontEnd:
             self._camera,
             images.left,
             self._map.xyz_world[track.point_ids],
-            track.observations.without_offset(self._rig.offset.value_px),
+            track.observations.without_offset(self._map.rig.offset.value_px),
             track.estimate.noise_factor,
         )
 
@@ -247,12 +238,7 @@ class FrontEnd:
         is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
         steady = self.motion.expected(stamp_ns)
         close = self.tracker.track_at(
-            images,
-            features,
-            self.local.point_ids,
-            steady.T_camera_world,
-            steady,
-            is_given=True,
+            images, features, self.local.point_ids, steady.T_camera_world, steady, is_given=True
         )
         found = None if track is None else replace(track, is_poor=is_poor)
         if close is None or len(close.point_ids) < MIN_TRACKED:
@@ -262,7 +248,7 @@ class FrontEnd:
                 self.tracker.consensus.proven(t.point_ids, t.T_camera_world).sum()
                 for t in (found, close)
             )
-            if explained <= (CARRY_ON if is_poor else 1.0) * by_images:
+            if explained <= (MOST if is_poor else 1.0) * by_images:
                 return found
         return replace(close, is_poor=True)
 

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import (
@@ -26,7 +25,7 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, Rig
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations
 from segfloor_ros.slam.tracking.features import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
@@ -43,7 +42,7 @@ from segfloor_ros.slam.tracking.patch_alignment import (
 )
 from segfloor_ros.slam.tracking.pose import (
     KNOWN_NOISE,
-    MIN_AGREEMENT,
+    MAJORITY,
     Agreement,
     Consensus,
     PoseEstimate,
@@ -77,10 +76,8 @@ TRACKED_POINTS = 400
 class Tracker:
     """Finds the pose of frames against the local map."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
-        self.consensus = Consensus(rig, sparse_map)
-        self._rig = rig
-        self._camera = rig.camera
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self.consensus = Consensus(sparse_map)
         self._map = sparse_map
 
     def pixel_observations(self, features: Features) -> Observations:
@@ -127,8 +124,8 @@ class Tracker:
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        observations, offset_px = self.pixel_observations(features), self._rig.offset.value_px
-        seen = predict_points(self._camera, self._map, local_ids, T_camera_world, images.excluded)
+        observations, offset_px = self.pixel_observations(features), self._map.rig.offset.value_px
+        seen = predict_points(self._map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, seen, NARROW_SEARCH)
         if len(rows) < (MIN_TRACKED if known is None else 1):
@@ -170,7 +167,7 @@ class Tracker:
         """Search around the predictions, then wider around the first, then without any."""
         attempts = [(T, 1.0) for T in predictions] + [(T, WIDE_SEARCH) for T in predictions[:1]]
         for T_predicted, factor in attempts:
-            seen = predict_points(self._camera, self._map, local_ids, T_predicted)
+            seen = predict_points(self._map, local_ids, T_predicted)
             points, rows = self._search(features, tree, seen, factor)
             estimate = self._believable(observations, seen.ids[points], rows, T_predicted)
             if estimate is not None:
@@ -178,20 +175,18 @@ class Tracker:
         return self.locate(features, tree, observations, local_ids)
 
     def locate(
-        self,
-        features: Features,
-        tree: cKDTree,
-        observations: Observations,
-        ids: NDArray[np.int32],
+        self, features: Features, tree: cKDTree, observations: Observations, ids: NDArray[np.int32]
     ) -> PoseEstimate | None:
         """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
         a first guess, which then has to find more points where they should be.
         """
         points, rows = match_unguided(self._map.descriptor[ids], features.descriptor)
-        found = solve_pnp(self._camera, self._map.xyz_world[ids[points]], features.uv_px[rows])
+        found = solve_pnp(
+            self._map.rig.camera, self._map.xyz_world[ids[points]], features.uv_px[rows]
+        )
         if found is None or found[1].sum() < MIN_PNP_INLIERS:
             return None
-        seen = predict_points(self._camera, self._map, ids, found[0])
+        seen = predict_points(self._map, ids, found[0])
         points, rows = self._search(features, tree, seen, 1.0)
         return self._believable(observations, seen.ids[points], rows, found[0])
 
@@ -209,14 +204,10 @@ class Tracker:
         return found.estimate if self._agree(found) else None
 
     def _agree(self, found: Agreement) -> bool:
-        return found.agreeing >= MIN_TRACKED and found.share >= MIN_AGREEMENT
+        return found.agreeing >= MIN_TRACKED and found.share >= MAJORITY
 
     def _search(
-        self,
-        features: Features,
-        tree: cKDTree,
-        seen: Prediction,
-        radius_factor: float,
+        self, features: Features, tree: cKDTree, seen: Prediction, radius_factor: float
     ) -> Matches:
         scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
         return match_predicted(
@@ -245,7 +236,6 @@ class Prediction:
 
 
 def predict_points(
-    camera: StereoCamera,
     sparse_map: SparseMap,
     ids: NDArray[np.int32],
     T_camera_world: Array,
@@ -255,6 +245,7 @@ def predict_points(
     inside the image, from about the known direction, at a size the pyramid has, and not in a region
     that is excluded.
     """
+    camera = sparse_map.rig.camera
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
     front = points[:, 2] > MIN_DEPTH_M
     ids, points = ids[front], points[front]
@@ -283,9 +274,8 @@ class LocalMap:
     after which a keyframe is due.
     """
 
-    def __init__(self, camera: StereoCamera, sparse_map: SparseMap, max_frames: int) -> None:
+    def __init__(self, sparse_map: SparseMap, max_frames: int) -> None:
         self.point_ids: NDArray[np.int32] = np.zeros(0, np.int32)
-        self._camera = camera
         self._max_frames = max_frames
         self._map = sparse_map
         self._depth_m = MIN_DEPTH_M
@@ -316,9 +306,7 @@ class LocalMap:
         known = reference.point_id[reference.point_id != NO_POINT]
         reliable = known[self._map.observer_count[known] >= SEEN_BY_SEVERAL]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
-        novelty = view_novelty(
-            self._camera, self._map, track.point_ids, track.T_camera_world, depth_m
-        )
+        novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m)
         num_reliable = min(len(reliable), TRACKED_POINTS)
         found = len(track.point_ids)
         share = found / max(1, len(track.visible_ids))

@@ -11,14 +11,16 @@ from segfloor_ros.geometry import (
     Array,
     adjoint,
     invert,
+    is_within,
     make_transform,
     rotation_angle,
     se3_exp,
     se3_log,
 )
-from segfloor_ros.slam.results import LastPose
+from segfloor_ros.slam.results import SAME, LastPose
 from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
+from segfloor_ros.slam.sensors.inertial_odometry import FIRST_SPEED_SIGMA_M_S
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 MAX_TURN_RADPS = 6.0
@@ -32,12 +34,6 @@ ACCELERATION = 2.0
 MAX_BLIND_SIGMA_M = 0.5
 """Uncertainty of the place up to which an IMU alone measures it, and up to which keyframes are made
 of a pose that no image shows."""
-
-MAX_LOST_TURN_RAD = 0.3
-"""A camera that was lost is found only where a gyroscope that went on has it look, by so much."""
-
-SIGMA_INERTIAL_M_S = 0.3
-"""A speed that is only integrated contradicts images that show another by much more."""
 
 
 class TrackingState(Enum):
@@ -139,9 +135,7 @@ class CameraMotion:
         """Whether a robot can have come to a pose since the last frame."""
         motion = T_camera_world @ invert(self.T_camera_world)
         step_s = _step_s(self._last_stamp_ns, stamp_ns)
-        speed = float(np.linalg.norm(motion[:3, 3])) / step_s
-        turn = rotation_angle(motion[:3, :3]) / step_s
-        return speed <= self._max_speed_mps and turn <= MAX_TURN_RADPS
+        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
 
     def is_consistent(self, T_camera_world: Array, covariance: Array, stamp_ns: int) -> bool:
         """Whether a pose that the images show, with its covariance (6, 6), fits what the sensors
@@ -154,7 +148,7 @@ class CameraMotion:
         error, P = se3_log(T_camera_world @ invert(prior[0])), prior[1] + covariance
         if not measured.by_wheels:
             P[:3, :3] += (
-                SIGMA_INERTIAL_M_S * _step_s(self._last_stamp_ns, stamp_ns)
+                FIRST_SPEED_SIGMA_M_S * _step_s(self._last_stamp_ns, stamp_ns)
             ) ** 2 * np.eye(3)
         return is_gated(error, P)
 
@@ -164,7 +158,7 @@ class CameraMotion:
         if turned is None or self._heading_sigma_rad is None:
             return True
         off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
-        return off_rad < MAX_LOST_TURN_RAD + 3 * (self._heading_sigma_rad + turned[1])
+        return off_rad < SAME[1] + 3 * (self._heading_sigma_rad + turned[1])
 
     def last_pose(self) -> LastPose:
         """Return what a drive that is broken off here goes on from."""
@@ -191,11 +185,7 @@ class CameraMotion:
             self._body.add(pose)
 
     def take(
-        self,
-        T_camera_world: Array,
-        covariance: Array,
-        stamp_ns: int,
-        T_seen: Array | None = None,
+        self, T_camera_world: Array, covariance: Array, stamp_ns: int, T_seen: Array | None = None
     ) -> None:
         """Go on from the pose of a frame, found in its images. T_seen: (4, 4), as the images alone
         have it: the sensors learn from that. After a blind stretch `odom` goes on where the sensors

@@ -48,7 +48,6 @@ MAX_LAST_STEP_PX = 0.1
 
 MAX_SHIFT_STEP_PX = 1.0
 
-MAX_SLOPE_STEP = 0.3
 
 Patches = NDArray[np.float32]
 
@@ -57,8 +56,6 @@ MIN_SIGMA_PIXEL = 0.15
 MIN_SIGMA_DISPARITY = 0.1
 
 MIN_CORRELATION = 0.7
-
-REACH_PX = 5
 
 MIN_RATIO = 0.15
 """Smaller over larger eigenvalue of the structure tensor (Harris and Stephens 1988); of corners and
@@ -112,7 +109,7 @@ def align_patches(
     A = zoom[:, None, None] * np.eye(2)
     offset = np.zeros((len(template), 2))
     prior = np.where(np.arange(J.shape[1]) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
-    max_step = np.where(prior > 0, MAX_SLOPE_STEP, MAX_SHIFT_STEP_PX)
+    max_step = np.where(prior > 0, AFFINE_SIGMA, MAX_SHIFT_STEP_PX)
     step = np.zeros((len(template), 2, 3))
     deviation = np.zeros((len(template), J.shape[1] // 3, 3))
     for iteration in range(STEPS):
@@ -310,7 +307,7 @@ def _is_firm(image: NDArray[Any], uv_px: Array) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     height, width = image.shape
     columns, rows = np.rint(uv_px).astype(np.intp).T
-    steps = np.arange(-REACH_PX, REACH_PX + 1)
+    steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1)
     patches = smooth[
         np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
         np.clip(columns[:, None, None] + steps, 0, width - 1),

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, make_transform, se3_exp, se3_log, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.results import MAJORITY, PROOF
 from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
     Observations,
-    Rig,
     huber_cost,
     huber_weights,
     is_gated,
@@ -50,20 +50,11 @@ RANSAC_ITERATIONS = 1000
 
 RANSAC_REPROJECTION_PX = 4.0
 
-FUSING_STEPS = 3
-"""Gauss-Newton steps to the likeliest pose; the images have it almost there."""
-
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 """Of a pose before any point is seen, in metres and radians: where no point determines it."""
 
-RECORD_KEYFRAMES = 3
-"""Keyframes that a point must fit to be taken for standing still: what moves fits hardly two."""
-
 FLOOR_M = 0.03
 """What is no higher belongs to the floor, which stands still whenever it was first seen."""
-
-MIN_AGREEMENT = 0.5
-"""Share of the matches that must agree on a pose: a wrong one has followers too, but not most."""
 
 MIN_PROVEN = 12
 """Fewest points with a record that may speak against the majority."""
@@ -256,7 +247,7 @@ class PoseInformation:
         adds what edges do not determine.
         """
         pose, known = seen.T_camera_world, np.linalg.inv(prior.covariance)
-        for _ in range(FUSING_STEPS):
+        for _ in range(ROUNDS):
             information, gradient = self._normal_equations(pose)
             gradient += known @ se3_log(pose @ invert(prior.T_camera_world))
             covariance = np.linalg.inv(information + known)
@@ -301,10 +292,9 @@ class Agreement:
 class Consensus:
     """Finds poses from matched points of a map."""
 
-    def __init__(self, rig: Rig, sparse_map: SparseMap) -> None:
-        self._rig = rig
-        self._camera = rig.camera
+    def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
+        self._camera = sparse_map.rig.camera
 
     def refine(
         self,
@@ -335,10 +325,7 @@ class Consensus:
         return problem.of_everyone() if found is None else found
 
     def at(
-        self,
-        known: PoseEstimate,
-        ids: NDArray[np.int32],
-        observations: Observations,
+        self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
     ) -> Agreement:
         """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
         problem = _Problem(self._camera, self._map.xyz_world[ids], observations, known)
@@ -347,10 +334,10 @@ class Consensus:
 
     def proven(self, ids: NDArray[np.int32], T_camera_world: Array) -> NDArray[np.bool_]:
         """Return which points (N,) have a record of standing still, or belong to the floor."""
-        proven = self._map.observer_count[ids] >= RECORD_KEYFRAMES
-        if self._rig.mount is not None:
+        proven = self._map.observer_count[ids] >= PROOF
+        if self._map.rig.mount is not None:
             points = transform_points(T_camera_world, self._map.xyz_world[ids])
-            proven |= np.abs(self._rig.mount.heights_m(points)) < FLOOR_M
+            proven |= np.abs(self._map.rig.mount.heights_m(points)) < FLOOR_M
         return proven
 
 
@@ -375,9 +362,9 @@ class _Problem:
         """
         before = self.fitting(self.of_most.T_camera_world, noise_factor)
         after = self.fitting(T_other, noise_factor)
-        enough = max(MIN_PROVEN, MIN_AGREEMENT * witnesses.sum())
+        enough = max(MIN_PROVEN, MAJORITY * witnesses.sum())
         support = (after & witnesses).sum()
-        if support < enough or (before & witnesses).sum() > MIN_AGREEMENT * support:
+        if support < enough or (before & witnesses).sum() > MAJORITY * support:
             return None
         found = self.near(T_other, noise_factor)
         return replace(found, counted=found.counted | witnesses)

@@ -1,17 +1,18 @@
 """The sparse map's bookkeeping on small hand-made maps."""
 
 import numpy as np
-from hand_made_maps import add, keyframe
+from hand_made_maps import CAMERA, add, keyframe
 
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import Rig
 
 
 def two_keyframes():
     """Points 0, 1, 2 at z = 2, made by keyframe 0; keyframe 1, a metre to the right, sees 1
     and 2.
     """
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     first = keyframe(0, [NO_POINT] * 4)
     add(sparse_map, first, [0, 1, 3], [[0, 0, 2], [1, 0, 2], [2, 0, 2]])
     second = keyframe(1, [2, NO_POINT, 1], x=1.0)
@@ -89,7 +90,7 @@ def test_points_that_tracking_seldom_finds_are_poor():
 
 
 def test_grows_beyond_its_first_buffer():
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     xyz = np.random.default_rng(0).normal(size=(3000, 3))
     add(sparse_map, keyframe(0, [NO_POINT] * 3000), np.arange(3000), xyz)
     np.testing.assert_array_equal(sparse_map.xyz_world, xyz)

@@ -8,6 +8,7 @@ from segfloor_ros.geometry import transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import find_duplicates, fuse_duplicates
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import Rig
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
 
@@ -16,7 +17,7 @@ def seen_twice(second_xyz, descriptor=0):
     """Keyframes 0 and 1 made points 0, 1, 2 and 3, 4; keyframe 2 shares 1 with the first and sees
     points 5, 6 of its own. Point 5 lies at second_xyz; keyframe 0's point 0 at (0, 0, 2).
     """
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     add(sparse_map, keyframe(0, [NO_POINT] * 3), [0, 1, 2], [[0, 0, 2], [0.5, 0, 2], [-0.5, 0, 2]])
     add(sparse_map, keyframe(1, [0, NO_POINT, NO_POINT]), [1, 2], [[0, 0.5, 2], [0, -0.5, 2]])
     third = keyframe(2, [NO_POINT, NO_POINT, 1])
@@ -27,7 +28,7 @@ def seen_twice(second_xyz, descriptor=0):
 
 
 def duplicates(*arguments):
-    a, b = find_duplicates(CAMERA, *arguments)
+    a, b = find_duplicates(*arguments)
     return sorted(zip(a.tolist(), b.tolist(), strict=True))
 
 
@@ -44,7 +45,7 @@ def test_another_pixel_depth_or_look_is_not():
 
 def test_the_older_id_survives_with_all_observations():
     sparse_map, third = seen_twice([0.006, 0.0, 2.05])
-    assert fuse_duplicates(CAMERA, sparse_map, third) == 1
+    assert fuse_duplicates(sparse_map, third) == 1
     np.testing.assert_array_equal(np.flatnonzero(~sparse_map.alive), [5])
     np.testing.assert_array_equal(third.point_id, [0, 6, 1])
     assert sparse_map.observer_count[0] == 3
@@ -64,13 +65,13 @@ def test_what_one_keyframe_sees_as_two_stays_two():
     np.testing.assert_array_equal(
         sparse_map.seen_together(np.array([5, 6]), np.array([0, 2])), [True, False]
     )
-    assert fuse_duplicates(CAMERA, sparse_map, third) == 0
+    assert fuse_duplicates(sparse_map, third) == 0
     assert sparse_map.alive.all()
 
 
 def test_the_projection_of_a_merged_point_stays_where_it_was():
     sparse_map, third = seen_twice([0.006, 0.0, 2.05])
     before = CAMERA.project(transform_points(third.T_camera_world, sparse_map.xyz_world[[5]]))
-    fuse_duplicates(CAMERA, sparse_map, third)
+    fuse_duplicates(sparse_map, third)
     after = CAMERA.project(transform_points(third.T_camera_world, sparse_map.xyz_world[[0]]))
     assert np.abs(before - after).max() < 2.0

@@ -14,7 +14,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
     move_keyframes,
     solve_global,
 )
-from segfloor_ros.slam.rig import NO_OFFSET
+from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.saved_slam import fill_map
 from tools.map_costs import CAMERA, bend, made_up_map, ring
 
@@ -23,7 +23,7 @@ COUNT = 80
 
 @pytest.fixture
 def bent():
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     fill_map(sparse_map, made_up_map(COUNT, np.random.default_rng(2)))
     bend(sparse_map)
     return sparse_map

@@ -22,10 +22,10 @@ def scene(request):
 
 def mapped(points):
     """A map of points, made by keyframe 0, and a mapper without any offset."""
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     rows = np.arange(len(points))
     add(sparse_map, seen(points, 0, [NO_POINT] * len(points)), rows, points)
-    return sparse_map, LocalMapper(Rig(CAMERA), sparse_map)
+    return sparse_map, LocalMapper(sparse_map)
 
 
 def patches(points):

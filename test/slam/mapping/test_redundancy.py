@@ -10,13 +10,14 @@ from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import redundant_share, retire_redundant
 from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 
 def views(*point_ids):
     """A map of ten points at z = 2 and a view of some of them per argument, 10 cm apart."""
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA))
     xyz = np.stack([np.arange(10.0), np.zeros(10), np.full(10, 2.0)], axis=1)
     first = keyframe(0, [NO_POINT] * 10)
     add(sparse_map, first, np.arange(10), xyz)

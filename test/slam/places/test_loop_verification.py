@@ -25,7 +25,7 @@ def objection(centre, drift, own=ROWS, apart=0.0):
     keyframe 0's points again. own: which of its own points each feature shows; apart: how much
     further away than these the place's points are.
     """
-    sparse_map = SparseMap()
+    sparse_map = SparseMap(Rig(CAMERA, MOUNT))
     add(sparse_map, seen(POINTS, 0, [NO_POINT] * len(POINTS)), ROWS, POINTS)
     centre, drift = np.array(centre), np.array(drift)
     now = keyframe(1, [NO_POINT] * len(POINTS))
@@ -37,7 +37,7 @@ def objection(centre, drift, own=ROWS, apart=0.0):
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
     sparse_map.xyz_world[ROWS] *= 1.0 - apart
-    checks = LoopChecks(Rig(CAMERA, MOUNT), sparse_map)
+    checks = LoopChecks(sparse_map)
     return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match)
 
 

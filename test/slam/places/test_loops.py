@@ -90,4 +90,4 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     none = np.zeros(0, np.int32)
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
-    assert LoopChecks(slam.rig, slam.map).is_level(match) is expected
+    assert LoopChecks(slam.map).is_level(match) is expected

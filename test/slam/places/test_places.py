@@ -58,13 +58,13 @@ def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
     sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.01 * depth_m, xyz)
     # 0.12 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
     beside = camera_at(-0.06 * depth_m)
-    new = view_novelty(CAMERA, sparse_map, ids, beside, depth_m)
+    new = view_novelty(sparse_map, ids, beside, depth_m)
     assert new == pytest.approx(0.5)
     # Points that the earlier views did not see, or a view that looks past them, are new.
     unknown = sparse_map_without(sparse_map, range(5))
-    assert view_novelty(CAMERA, unknown, ids, beside, depth_m) > 1.5
+    assert view_novelty(unknown, ids, beside, depth_m) > 1.5
     aside = turned(0.17) @ camera_at(-0.01 * depth_m)
-    assert view_novelty(CAMERA, sparse_map, ids, aside, depth_m) > 1.5
+    assert view_novelty(sparse_map, ids, aside, depth_m) > 1.5
 
 
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
@@ -72,7 +72,7 @@ def test_a_known_place_is_looked_at_again_now_and_then(depth_m, xyz):
     ids = np.arange(10, dtype=np.int32)
     sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.1 * depth_m, xyz)
     # The nearest of the latest keyframes stands at half the depth, 12.5 times as far as a new view.
-    new = view_novelty(CAMERA, sparse_map, ids, camera_at(0.0), depth_m)
+    new = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
     assert new == pytest.approx(12.5 / LOOK_AGAIN)
 
 
