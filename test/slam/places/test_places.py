@@ -81,14 +81,14 @@ def test_every_visit_that_made_a_keyframe_doubles_the_way_to_the_next(is_retired
     depth_m, ids = 2.0, np.arange(10, dtype=np.int32)
     sparse_map = row_of_views(RECENT + 15, list(range(10)), 0.1 * depth_m)
     nearest = 15 * 0.1 / 0.04
-    first = view_novelty(CAMERA, sparse_map, ids, camera_at(0.0), depth_m)
+    first = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
     assert first == pytest.approx(nearest / LOOK_AGAIN)
     for visits, index in ((2, 6), (3, 9)):
         again = sparse_map.keyframes[index]
         again.T_camera_world = camera_at(0.01 * depth_m)
         if is_retired:
             sparse_map.retire(again, sparse_map.keyframes[0])
-        new = view_novelty(CAMERA, sparse_map, ids, camera_at(0.0), depth_m)
+        new = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
         assert new == pytest.approx(nearest / (LOOK_AGAIN * 2 ** (visits - 1)))
 
 
