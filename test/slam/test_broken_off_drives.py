@@ -30,7 +30,7 @@ def base_at(k):
 
 
 def wheels(count):
-    """Return what wheels tell every 20 ms, in a frame of their own."""
+    """Return what wheels measure every 20 ms, in a frame of their own."""
     start = planar_pose(7.0, -3.0, 1.0)
     return [WheelPose(round(2e7 * k), start @ base_at(k / 5)) for k in range(5 * count + 2)]
 
@@ -40,12 +40,12 @@ def frames():
     return [ROOM.frame(k, base_at(k)) for k in range(FRAMES + GAP + 10)]
 
 
-def broken_off(frames, told=()):
+def broken_off(frames, measured=()):
     """Return what goes on after the last of the frames."""
-    slam, told = StereoSlam(CAMERA, SETTINGS, MOUNT), list(told)
+    slam, measured = StereoSlam(CAMERA, SETTINGS, MOUNT), list(measured)
     for frame in frames:
-        while told and told[0].stamp_ns <= frame.stamp_ns + 20_000_000:
-            slam.add(told.pop(0))
+        while measured and measured[0].stamp_ns <= frame.stamp_ns + 20_000_000:
+            slam.add(measured.pop(0))
         slam.process(frame)
     last = last_pose_of(json.loads(json.dumps(last_pose_values(slam.last_pose))))
     again = StereoSlam(CAMERA, SETTINGS)
@@ -103,7 +103,7 @@ def test_wheels_tell_the_way_that_nobody_saw(frames):
             slam.add(pose)
     for k in (FRAMES + GAP, FRAMES + GAP + 1):
         (result,) = slam.process(OTHER.frame(k, base_at(0)))
-        # On the second frame a keyframe tells, which was made where the wheels had the robot.
+        # On the second frame a keyframe is made, which was made where the wheels had the robot.
         assert k > FRAMES + GAP or result.state.startswith('on wheels')
         assert error_m(result.T_map_odom @ result.T_odom_base, k) < 0.05
         assert sigma_m(result) < 0.1

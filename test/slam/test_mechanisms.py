@@ -45,7 +45,7 @@ def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])
-def test_patches_tell_the_pose_better_than_corners(seed):
+def test_patches_give_the_pose_better_than_corners(seed):
     room = StereoRoom(seed)
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     slam.process(room.frame(0, planar_pose(0, 0, 0)))

@@ -312,8 +312,8 @@ class MovingRegions:
         near = []
         for view in self._views:
             T = view.keyframe.T_camera_world @ T_world_camera
-            apart, turned = float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])
-            if turned < MAX_PARALLAX_RAD and apart < np.tan(MAX_PARALLAX_RAD) * depth_m:
+            moved_m, turned = float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])
+            if turned < MAX_PARALLAX_RAD and moved_m < np.tan(MAX_PARALLAX_RAD) * depth_m:
                 near.append(view)
         spread = np.linspace(0, len(near) - 1, min(len(near), COMPARED_VIEWS))
         return [near[i] for i in np.unique(spread.round().astype(int))]

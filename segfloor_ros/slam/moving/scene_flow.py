@@ -30,7 +30,7 @@ moved by a hand, in the second someone who walks just ahead of the camera stands
 
 CORNERS, CELL_PX = 300, 10
 """Corners are spread over the image by cells: cloth in front has the strongest, and a plain wall or
-floor, which tells that it stands still, needs its own."""
+floor, which shows that it stands still, needs its own."""
 
 APART_PX = 3
 

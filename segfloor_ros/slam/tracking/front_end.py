@@ -31,7 +31,7 @@ from segfloor_ros.slam.tracking.images import (
     expected_shift,
     image_fault,
     is_inside,
-    join,
+    union,
 )
 from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import (
@@ -279,7 +279,7 @@ class FrontEnd:
         if region is None:
             return images
         self.follower.drop_inside(region)
-        return replace(images, excluded=join(images.excluded, region))
+        return replace(images, excluded=union(images.excluded, region))
 
     def observe(
         self, frame: StereoFrame, images: Images, track: Track | None

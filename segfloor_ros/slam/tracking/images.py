@@ -69,7 +69,7 @@ class Images:
         left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
         excluded = blank_border(frame.left)
         if frame.excluded is not None:
-            excluded = join(excluded, dilate(frame.excluded, mask_dilation_px))
+            excluded = union(excluded, dilate(frame.excluded, mask_dilation_px))
         return Images(left, right, shrink(frame.left), excluded, depth_scale)
 
 
@@ -114,7 +114,7 @@ def follow_pixels(
     return uv, np.asarray(status).ravel() > 0
 
 
-def join(a: Region | None, b: Region | None) -> Region | None:
+def union(a: Region | None, b: Region | None) -> Region | None:
     """Return the region that is in either; None for none at all."""
     if a is None or b is None:
         return b if a is None else a

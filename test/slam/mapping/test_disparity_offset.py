@@ -66,7 +66,7 @@ def test_the_information_is_that_of_the_eliminated_system():
     assert result.offset.information == pytest.approx(1 / np.linalg.inv(damped)[24, 24], rel=1e-3)
 
 
-def test_the_filter_weighs_what_it_is_told():
+def test_the_filter_weighs_what_it_is_given():
     offset = DisparityOffset(expected_sigma_px=0.1, share=1.0)
     # 100 /px² around 0 before; an adjustment that adds much more, around 0.2, counts as 0.03 px.
     offset.learn(OffsetEstimate(0.2, 1e9))
@@ -101,7 +101,7 @@ def frames(step_m, step_rad, offset_px, seed, contrast):
 
 
 def room_drive(offset_px=0.0, step_m=0.05, step_rad=0.0, seed=0, contrast=60.0, is_known=False):
-    """Drive through the room, straight ahead if not told otherwise."""
+    """Drive through the room, straight ahead unless other poses are given."""
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     if is_known:
         slam.rig.offset = DisparityOffset(0.0, 1.0)
@@ -131,7 +131,7 @@ def test_an_exact_rig_stays_exact():
     assert length(results) == pytest.approx(1.95, abs=0.01)
 
 
-def test_a_turn_on_the_spot_tells_little_and_changes_little():
+def test_a_turn_on_the_spot_shows_little_and_changes_little():
     offsets = []
     for step in np.radians([1.5, 2.0, 2.5]):
         slam, results = room_drive(step_m=0.0, step_rad=float(step))

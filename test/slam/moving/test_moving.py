@@ -11,7 +11,7 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking.images import dilate, is_inside, join
+from segfloor_ros.slam.tracking.images import dilate, is_inside, union
 
 FRAMES = 36
 
@@ -51,11 +51,11 @@ def keyframes(results):
     return [result.keyframe for result in results if result.keyframe is not None]
 
 
-def test_regions_join_and_grow():
+def test_regions_unite_and_grow():
     a, b = (np.zeros((5, 8), np.uint8) for _ in range(2))
     a[2, 2], b[2, 5] = 255, 255
-    both = join(a, b)
-    assert (both > 0).sum() == 2 and join(None, None) is None and join(a, None) is a
+    both = union(a, b)
+    assert (both > 0).sum() == 2 and union(None, None) is None and union(a, None) is a
     grown = dilate(both, 1)
     assert grown[2, 1] == grown[1, 2] == 255 and grown[0, 2] == grown[1, 1] == 0
     inside = is_inside(both, np.array([[2.4, 1.6], [3.6, 2.0], [-3.0, 2.0]]))

@@ -20,9 +20,9 @@ ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
 
 
-def objection(centre, drift, own=ROWS, apart=0.0):
+def objection(centre, drift, own=ROWS, farther=0.0):
     """Return what speaks against a camera at `centre`, that the map has at centre + drift, seeing
-    keyframe 0's points again. own: which of its own points each feature shows; apart: how much
+    keyframe 0's points again. own: which of its own points each feature shows; farther: how much
     further away than these the place's points are.
     """
     sparse_map = SparseMap(Rig(CAMERA, MOUNT))
@@ -36,7 +36,7 @@ def objection(centre, drift, own=ROWS, apart=0.0):
     add(sparse_map, now, ROWS, POINTS[own] + drift)
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
-    sparse_map.xyz_world[ROWS] *= 1.0 - apart
+    sparse_map.xyz_world[ROWS] *= 1.0 - farther
     checks = LoopChecks(sparse_map)
     return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match)
 
@@ -65,7 +65,7 @@ def test_own_points_must_lie_where_the_place_shows_what_they_match():
 
 def test_free_space_does_not_run_through_what_stands_there():
     # Every pixel fits, but the place's points stand half way to what the keyframe sees.
-    found = objection((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), apart=0.5)
+    found = objection((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), farther=0.5)
     assert found == 'free space through obstacles'
 
 
@@ -74,11 +74,11 @@ def test_free_space_does_not_run_through_what_stands_there():
     [
         ([21, 23, 25], [0.2, 0.2, 0.2], True),
         ([21, 25], [0.2, 0.2], False),  # two keyframes alone
-        ([21, 23, 25], [0.5, 0.2, 0.2], False),  # they tell different drifts
+        ([21, 23, 25], [0.5, 0.2, 0.2], False),  # they show different drifts
         ([24, 24, 25], [0.2, 0.2, 0.2], False),  # the camera has hardly moved
     ],
 )
-def test_three_keyframes_on_the_move_must_tell_the_same_drift(views, drifts_m, expected):
+def test_three_keyframes_on_the_move_must_show_the_same_drift(views, drifts_m, expected):
     sparse_map = row_of_views(26, list(range(10)), 0.1)
     matches = []
     for index, drift_m in zip(views, drifts_m, strict=True):

@@ -63,7 +63,7 @@ def test_the_view_itself_comes_first_and_a_disturbed_one_still_does(vocabulary):
     assert noisy[5] > 2 * np.sort(noisy)[-2]
 
 
-def test_a_word_that_all_views_hold_tells_nothing():
+def test_a_word_that_all_views_hold_weighs_nothing():
     index = PlaceIndex()
     index.add(0, np.array([1, 2, 3]))
     index.add(1, np.array([1, 4, 5]))

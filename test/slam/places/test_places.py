@@ -63,8 +63,8 @@ def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
     # Points that the earlier views did not see, or a view that looks past them, are new.
     unknown = sparse_map_without(sparse_map, range(5))
     assert view_novelty(unknown, ids, beside, depth_m) > 1.5
-    aside = turned(0.17) @ camera_at(-0.01 * depth_m)
-    assert view_novelty(sparse_map, ids, aside, depth_m) > 1.5
+    turned_off = turned(0.17) @ camera_at(-0.01 * depth_m)
+    assert view_novelty(sparse_map, ids, turned_off, depth_m) > 1.5
 
 
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)

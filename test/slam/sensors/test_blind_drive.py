@@ -45,14 +45,14 @@ def frames():
     ]
 
 
-def told_poses(scale=1.0, slip=()):
+def wheel_poses(scale=1.0, slip=()):
     """Return poses 20 ms apart, of `scale` metres for each metre, and twice that in `slip`."""
-    told = [START]
+    measured = [START]
     for k in range(1, 5 * FRAMES + 2):
         step = invert(base_at((k - 1) / 5)) @ base_at(k / 5)
         step[:2, 3] *= scale * (2 if k // 5 in slip else 1)
-        told.append(told[-1] @ step)
-    return [WheelPose(round(k * 2e7), pose) for k, pose in enumerate(told)]
+        measured.append(measured[-1] @ step)
+    return [WheelPose(round(k * 2e7), pose) for k, pose in enumerate(measured)]
 
 
 def imu_samples():
@@ -62,7 +62,7 @@ def imu_samples():
 
 def drive(frames, *measurements):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    waiting = sorted((m for told in measurements for m in told), key=lambda m: m.stamp_ns)
+    waiting = sorted((m for one in measurements for m in one), key=lambda m: m.stamp_ns)
     results = []
     for frame in frames:
         while waiting and waiting[0].stamp_ns <= frame.stamp_ns:
@@ -78,7 +78,7 @@ def errors_m(results):
 
 @pytest.fixture(scope='module')
 def on_wheels(frames):
-    return drive(frames, told_poses(), imu_samples())
+    return drive(frames, wheel_poses(), imu_samples())
 
 
 def test_without_sensors_the_camera_is_lost(frames):
@@ -115,7 +115,7 @@ def test_the_gyroscope_bias_was_learnt_before_it_was_needed(on_wheels):
 
 
 def test_wheels_alone_bridge_as_well(frames):
-    _, results = drive(frames, told_poses())
+    _, results = drive(frames, wheel_poses())
     assert all(result.tracked for result in results)
     assert errors_m(results).max() < 0.03
 
@@ -130,7 +130,7 @@ def test_a_gyroscope_alone_bridges_a_second(frames):
 def test_wheels_that_slip_while_the_camera_sees_are_found_out_and_cost_nothing(frames):
     room = StereoRoom()
     seen = [room.frame(k, base_at(k)) for k in range(FRAMES)]
-    slam, results = drive(seen, told_poses(slip=range(12, 22)), imu_samples())
+    slam, results = drive(seen, wheel_poses(slip=range(12, 22)), imu_samples())
     assert all(result.state == 'tracking' for result in results)
     assert errors_m(results).max() < 0.01
     assert slam.sensors.slips >= 2
@@ -142,23 +142,23 @@ def test_a_wrong_scale_is_said_and_taken_into_account():
     for k in range(450):
         step = planar_pose(0.008, 0, np.radians(0.4) * np.cos(k / 40))
         path.append(path[-1] @ step)
-    room, told = StereoRoom(), [START]
+    room, measured = StereoRoom(), [START]
     seen = [room.frame(k, path[5 * k]) for k in range(90)]
     for before, now in pairwise(path):
         step = invert(before) @ now
         step[:2, 3] *= 1.08
-        told.append(told[-1] @ step)
-    slam, _ = drive(seen, [WheelPose(round(k * 2e7), pose) for k, pose in enumerate(told)])
+        measured.append(measured[-1] @ step)
+    slam, _ = drive(seen, [WheelPose(round(k * 2e7), pose) for k, pose in enumerate(measured)])
     assert '1.08' in slam.sensors.remarks['scale'] or '1.07' in slam.sensors.remarks['scale']
     motion = slam.sensors.between(round(4e9), round(5e9))
     expected = invert(path[250] @ MOUNT.T_base_left) @ path[200] @ MOUNT.T_base_left
     np.testing.assert_allclose(motion.T_now_before, expected, atol=0.005)
 
 
-def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_wheels):
+def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(on_wheels):
     slam, _ = on_wheels
-    for told in told_poses()[5 * FRAMES - 4 :]:
-        slam.add(told)
+    for measured in wheel_poses()[5 * FRAMES - 4 :]:
+        slam.add(measured)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rng, edge_px = np.random.default_rng(1), 0.5 * CAMERA.width + 0.3 * (v[:, 0] - 50)
     rows = rng.integers(20, CAMERA.height - 20, 150)
@@ -168,8 +168,8 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
     anywhere = rng.uniform(10, [CAMERA.width - 10, CAMERA.height - 10], (150, 2))
     for uv_px, texture, expected in ((on_edge, 0.0, False), (anywhere, 30.0, True)):
         ids = np.arange(150, dtype=np.int32)
-        told = Observations(np.column_stack([uv_px, np.full(150, np.nan)]), np.ones((150, 3)))
-        track = Track(estimate, ids, told, ids)
+        measured = Observations(np.column_stack([uv_px, np.full(150, np.nan)]), np.ones((150, 3)))
+        track = Track(estimate, ids, measured, ids)
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
@@ -177,7 +177,7 @@ def test_points_that_slide_along_an_edge_do_not_tell_the_pose_against_wheels(on_
         assert slam.front_end.is_believable(track, images, frame.stamp_ns) == expected
 
 
-def test_a_turn_without_a_picture_is_as_the_gyroscope_tells_it(frames):
+def test_a_turn_without_a_picture_is_as_the_gyroscope_measures_it(frames):
     _, results = drive(frames, imu_samples())
     turned = invert(results[9].T_odom_base) @ results[19].T_odom_base
     yaw = Rotation.from_matrix(turned[:3, :3]).as_rotvec()[2]

@@ -1,4 +1,4 @@
-"""What wheels and gyroscope tell of the motion between frames, in cases worked out by hand."""
+"""What wheels and gyroscope measure of the motion between frames, in cases worked out by hand."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ def test_the_bias_is_learnt_from_the_images_and_one_wrong_turn_is_not():
     )
 
 
-def window(way, turn, told_way, told_turn, speeding_up=(0.0, 0.0), turning_up=0.0):
-    told = Stretch(base_pose(*told_way, told_turn), np.array(speeding_up), turning_up)
-    return Window(np.array(way), turn, 0.0, told)
+def window(way, turn, measured_way, measured_turn, speeding_up=(0.0, 0.0), turning_up=0.0):
+    by_wheels = Stretch(base_pose(*measured_way, measured_turn), np.array(speeding_up), turning_up)
+    return Window(np.array(way), turn, 0.0, by_wheels)
 
 
 def driven(calibration, motions):
@@ -95,8 +95,8 @@ def driven(calibration, motions):
     T_wheels_base = base_pose(*offset, yaw)
     for way, turn in motions:
         seen = base_pose(*way, turn)
-        told = T_wheels_base @ seen @ invert(T_wheels_base)
-        yield window(way, turn, scale * told[:2, 3], turn_scale * turn)
+        by_wheels = T_wheels_base @ seen @ invert(T_wheels_base)
+        yield window(way, turn, scale * by_wheels[:2, 3], turn_scale * turn)
 
 
 def some_motions(count):
@@ -153,10 +153,10 @@ def test_stamps_of_wheels_that_are_late_are_found_out():
         wheels.add(WheelPose(t * MS, base(t / 1000 - lag_s)))
     for k in range(2, 145):
         seen = invert(base(0.2 * k)) @ base(0.2 * (k + 1))
-        told = wheels.stretch(k * 200 * MS, (k + 1) * 200 * MS)
+        by_wheels = wheels.stretch(k * 200 * MS, (k + 1) * 200 * MS)
         turning_up = 0.5 * 1.3 * (np.cos(1.3 * 0.2 * (k + 1)) - np.cos(1.3 * 0.2 * k))
         turn = np.arctan2(seen[1, 0], seen[0, 0])
-        calibrator.add(Window(seen[:2, 3], turn, turning_up, told))
+        calibrator.add(Window(seen[:2, 3], turn, turning_up, by_wheels))
     assert calibrator.current.lag_s == pytest.approx(lag_s, abs=4e-3)
     assert list(calibrator.current.remarks()) == ['lag']
 
@@ -164,10 +164,10 @@ def test_stamps_of_wheels_that_are_late_are_found_out():
 def test_what_was_found_turns_what_wheels_tell_into_the_motion_of_the_base():
     found = WheelCalibration(1.05, 0.04, (0.15, -0.05), 0.96)
     (one,) = driven((1.05, 0.04, (0.15, -0.05), 0.96), [((0.2, 0.03), 0.3)])
-    told = base_pose(*one.measured_m, one.measured_rad)
-    way_m, turn_rad = found.base_motion(told, None)
+    by_wheels = base_pose(*one.measured_m, one.measured_rad)
+    way_m, turn_rad = found.base_motion(by_wheels, None)
     assert turn_rad == pytest.approx(0.3)
-    # The chord is that of the arc as told, turned by what the turn was wrong.
+    # The chord is that of the arc as measured, turned by what the turn was wrong.
     np.testing.assert_allclose(way_m, [0.2, 0.03], atol=2e-3)
 
 
@@ -184,7 +184,7 @@ def test_wheels_that_are_right_are_not_remarked_upon_and_slip_is_noticed():
 def test_wheels_that_slipped_are_less_sure_for_a_second():
     body = BodyMotion()
     body.T_base_left = Mount(0.3, 0.2).T_base_left
-    for k in range(80):  # 5 cm each 100 ms; the wheels tell twice as much from 4 s on
+    for k in range(80):  # 5 cm each 100 ms; the wheels measure twice as much from 4 s on
         body.add(WheelPose(100 * k * MS, base_pose(0.05 * (k + max(k - 40, 0)), 0, 0)))
     sigmas_m = []
     for k in range(60):

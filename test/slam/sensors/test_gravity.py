@@ -1,4 +1,4 @@
-"""Where up is, from what an accelerometer feels on a drive that speeds up, brakes and turns."""
+"""Where up is, from what an accelerometer measures on a drive that speeds up, brakes and turns."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def pose(t, turns):
     return make_transform(R, 0.3 * (1 - np.cos(1.5 * t)) * forward)
 
 
-def felt(t, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
-    """Return what an IMU at a place on the camera feels."""
+def imu_sample(t, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
+    """Return what an IMU at a place on the camera measures."""
     h, beside = 1e-3, make_transform(np.eye(3), np.array(place_m))
     before, now, after = (pose(t + d, turns) @ beside for d in (-h, 0.0, h))
     turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec() / (2 * h)
@@ -41,7 +41,7 @@ def driven(seconds, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
     gyroscope = Gyroscope()
     gravity = Gravity(gyroscope)
     for k in range(round(seconds * RATE_HZ) + 1):
-        gyroscope.add(felt(k / RATE_HZ, turns, bias, place_m))
+        gyroscope.add(imu_sample(k / RATE_HZ, turns, bias, place_m))
         if k % 20 == 0:
             gravity.see(round(k / RATE_HZ * 1e9), pose(k / RATE_HZ, turns), np.eye(3))
     return gravity
@@ -53,7 +53,7 @@ def degrees_between(a, b):
 
 def test_speeding_up_is_not_taken_for_gravity():
     up = driven(6.0, turns=False, bias=np.zeros(3)).up_world
-    # At 0.3 m * 1.5² / s² = 0.7 m/s² what is felt leans by up to 4 degrees.
+    # At 0.3 m * 1.5² / s² = 0.7 m/s² what is measured leans by up to 4 degrees.
     assert degrees_between(up.direction, UP) < 0.1
 
 

@@ -1,11 +1,11 @@
-"""A camera that sees nothing is carried on by what an accelerometer feels."""
+"""A camera that sees nothing is carried on by what an accelerometer measures."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_gravity import BESIDE, RATE_HZ, felt, pose
+from test_gravity import BESIDE, RATE_HZ, imu_sample, pose
 
 from segfloor_ros.geometry import invert, make_transform
 from segfloor_ros.measurements import ImuSample
@@ -18,22 +18,22 @@ from segfloor_ros.slam.tracking.motion import (
 )
 
 SEEN_S = 8.0
-"""So long the images tell the pose; then they fail."""
+"""So long the images show the pose; then they fail."""
 
 
-def blind_drive(until_s, feels, place_m=(0.0, 0.0, 0.0), told_m=None):
-    """Return the motion after a drive that turns and speeds up, and the errors while blind. told_m:
-    where the IMU is said to be, other than at place_m.
+def blind_drive(until_s, has_accel, place_m=(0.0, 0.0, 0.0), given_m=None):
+    """Return the motion after a drive that turns and speeds up, and the errors while blind.
+    given_m: where the IMU is said to be, other than at place_m.
     """
     body = BodyMotion()
     motion = CameraMotion(40.0, body)
     rng = np.random.default_rng(3)
     errors_m = []
     for k in range(1, round(until_s * RATE_HZ) + 1):
-        sample = felt(k / RATE_HZ, turns=True, place_m=place_m)
-        told = sample.place_m if told_m is None else np.array(told_m)
-        accel = sample.accel_m_s2 + rng.normal(0, 0.03, 3) if feels else np.zeros(3)
-        body.add(ImuSample(sample.stamp_ns, sample.gyro_rad_s, accel, told))
+        sample = imu_sample(k / RATE_HZ, turns=True, place_m=place_m)
+        place = sample.place_m if given_m is None else np.array(given_m)
+        accel = sample.accel_m_s2 + rng.normal(0, 0.03, 3) if has_accel else np.zeros(3)
+        body.add(ImuSample(sample.stamp_ns, sample.gyro_rad_s, accel, place))
         if k % 20:
             continue
         true = invert(pose(0, True)) @ pose(k / RATE_HZ, True)
@@ -47,30 +47,30 @@ def blind_drive(until_s, feels, place_m=(0.0, 0.0, 0.0), told_m=None):
     return motion, np.array(errors_m)
 
 
-def test_what_is_felt_carries_the_camera_through_seconds_without_images():
+def test_an_imu_carries_the_camera_through_seconds_without_images():
     # It drives to and fro by 0.6 m, speeds up by 0.7 m/s², and turns by 45 degrees to either side.
-    motion, errors_m = blind_drive(SEEN_S + 3.0, feels=True)
+    motion, errors_m = blind_drive(SEEN_S + 3.0, has_accel=True)
     assert len(errors_m) == 30 and motion.state is TrackingState.ON_IMU
     assert errors_m.max() < 0.1
     assert errors_m[-1] < 3 * sigma_m(motion.covariance) < 3 * MAX_BLIND_SIGMA_M
 
 
 def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():
-    _, errors_m = blind_drive(SEEN_S + 3.0, feels=True, place_m=BESIDE)
+    _, errors_m = blind_drive(SEEN_S + 3.0, has_accel=True, place_m=BESIDE)
     assert len(errors_m) == 30
     assert errors_m.max() < 0.1
-    _, wrong_m = blind_drive(SEEN_S + 3.0, feels=True, place_m=BESIDE, told_m=(0.0, 0.0, 0.0))
+    _, wrong_m = blind_drive(SEEN_S + 3.0, has_accel=True, place_m=BESIDE, given_m=(0.0, 0.0, 0.0))
     assert wrong_m.max() > 2 * errors_m.max()
 
 
 def test_without_an_accelerometer_the_speed_is_constant_for_a_second():
-    _, errors_m = blind_drive(SEEN_S + 3.0, feels=False)
+    _, errors_m = blind_drive(SEEN_S + 3.0, has_accel=False)
     assert 10 <= len(errors_m) < 20
     assert errors_m[9] > 0.1
 
 
 def test_a_camera_that_was_lost_is_found_where_it_may_look_only():
-    motion, _ = blind_drive(SEEN_S + 9.0, feels=False)
+    motion, _ = blind_drive(SEEN_S + 9.0, has_accel=False)
     assert motion.state.is_lost
     until_ns = round((SEEN_S + 9.0) * 1e9)
     true = invert(pose(0, True)) @ pose(SEEN_S + 9.0, True)
@@ -85,7 +85,7 @@ def test_a_camera_that_was_lost_is_found_where_it_may_look_only():
 
 
 def test_a_prediction_for_a_camera_that_was_lost_has_turned_on():
-    motion, _ = blind_drive(SEEN_S + 9.0, feels=False)
+    motion, _ = blind_drive(SEEN_S + 9.0, has_accel=False)
     true = invert(pose(0, True)) @ pose(SEEN_S + 9.0, True)
     predicted = motion.predict(round((SEEN_S + 9.0) * 1e9))
     off = Rotation.from_matrix((predicted @ true)[:3, :3]).magnitude()

@@ -67,7 +67,7 @@ def test_predicted_matches_need_nearness_and_a_clear_winner():
     points, rows = match_predicted(seen, tree, near, np.zeros(2), wanted, np.full(2, 15.0))
     np.testing.assert_array_equal(points, [0])
     np.testing.assert_array_equal(rows, [0])
-    # Two features alike but for a few bits, both at a small distance: no telling which it is.
+    # Two features alike but for a few bits, both at a small distance: nothing shows which it is.
     twin = seen.descriptor.copy()
     twin[1] = twin[0]
     twin[0, 0] ^= 0xFF

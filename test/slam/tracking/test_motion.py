@@ -15,7 +15,7 @@ def test_without_wheels_nothing_holds_the_pose_also_right_after_a_keyframe():
     assert motion.prior(100_000_000) is None
 
 
-def test_what_is_told_before_an_image_is_looked_at_counts_from_the_last_keyframe():
+def test_the_prior_of_a_frame_counts_from_the_last_keyframe():
     body = BodyMotion()
     body.T_base_left = MOUNT.T_base_left
     motion = CameraMotion(2.0, body)

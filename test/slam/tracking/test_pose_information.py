@@ -1,4 +1,4 @@
-"""How well points tell the pose, in images drawn for it."""
+"""How well points determine the pose, in images drawn for it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def noisy(image):
 
 
 def information(image, uv_px, depth_m=2.0):
-    """Return what points in one plane tell, seen where they are from the origin."""
+    """Return what points in one plane measure, seen where they are from the origin."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
     sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
@@ -49,7 +49,7 @@ def anywhere(count):
 
 @pytest.mark.parametrize('contrast', [12, 30, 80])
 @pytest.mark.parametrize('slope', [0.0, 0.6, -1.3])
-def test_points_on_an_edge_tell_nothing_along_it(contrast, slope):
+def test_points_on_an_edge_determine_nothing_along_it(contrast, slope):
     image = noisy(np.where(U - MIDDLE[0] > slope * (V - MIDDLE[1]), 100 + contrast, 100.0))
     rows = np.arange(30, CAMERA.height - 30, 2)
     on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
@@ -58,11 +58,11 @@ def test_points_on_an_edge_tell_nothing_along_it(contrast, slope):
     assert np.sqrt(along @ covariance @ along) > 0.03
 
 
-def test_a_plain_face_tells_nothing():
+def test_a_plain_face_determines_nothing():
     assert sigmas_m(noisy(np.full(U.shape, 90.0)), anywhere(200)).min() > 0.1
 
 
-def test_corners_and_weak_textures_tell_the_place_to_millimetres():
+def test_corners_and_weak_textures_determine_the_place_to_millimetres():
     corners = noisy(100 + 40.0 * ((U // 40 + V // 40) % 2))
     columns, rows = (np.arange(40, n - 20, 40) - 0.5 for n in (CAMERA.width, CAMERA.height))
     at = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -79,27 +79,27 @@ def test_points_whose_patches_overlap_count_as_one():
     np.testing.assert_allclose(often, once, rtol=0.3)
 
 
-def test_no_point_tells_nothing():
+def test_no_point_determines_nothing():
     assert sigmas_m(noisy(np.full(U.shape, 90.0)), np.zeros((0, 2))).min() == pytest.approx(1.0)
 
 
-def test_what_edges_do_not_tell_the_prior_does():
+def test_what_edges_do_not_determine_the_prior_does():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
     rows = np.arange(30.0, CAMERA.height - 30, 12)
     on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
-    told = information(image, on_edge)
+    measured = information(image, on_edge)
     off = np.eye(4)
     off[:3, 3] = 0.01, 0.01, 0.0
     prior = PoseEstimate(off, np.zeros(0, bool), np.diag([0.005] * 3 + [1e-4] * 3) ** 2, 1.0)
     seen = PoseEstimate(np.eye(4), np.ones(len(rows), bool), 1e-8 * np.eye(6), 1.0)
-    fused = told.fused(seen, prior)
+    fused = measured.fused(seen, prior)
     across_m, along_m = fused.T_camera_world[:2, 3]
     assert abs(across_m) < 0.001 and along_m == pytest.approx(0.01, abs=0.002)
     sigma_m = np.sqrt(np.diag(fused.covariance))
     assert sigma_m[0] < 0.001 and sigma_m[1] > 0.004
 
 
-def test_a_prior_is_outdone_where_points_tell_every_direction_better():
+def test_a_prior_is_outdone_where_points_know_every_direction_better():
     rows = np.arange(30.0, CAMERA.height - 30, 12)
     on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
     edge = information(noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge)
@@ -112,18 +112,18 @@ def test_a_prior_is_outdone_where_points_tell_every_direction_better():
     assert texture.is_prior_better(np.eye(4), of_gyroscope)
 
 
-def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_tell_more():
+def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
     room = StereoRoom()
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(8)]
 
-    def median_sigma_px(told):
+    def median_sigma_px(measured):
         slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
-        for pose in told:
+        for pose in measured:
             slam.add(pose)
         for frame in frames:
             slam.process(frame)
         assert len(slam.map.keyframes) > 1
-        assert (slam.map.keyframes[-1].motion is not None) is bool(told)
+        assert (slam.map.keyframes[-1].motion is not None) is bool(measured)
         return np.median(slam.map.keyframes[-1].observations.sigma_px[:, :2])
 
     period_ns = frames[1].stamp_ns // 2
@@ -138,7 +138,7 @@ def test_a_pixel_on_an_edge_is_sure_across_it_alone():
     assert sigma_px[0] == 0.5 and sigma_px[1] > 3.0
 
 
-def test_a_pose_that_the_images_hardly_tell_is_said_to_be_uncertain(monkeypatch):
+def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeypatch):
     room = StereoRoom()
     slam = StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
     frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]

@@ -93,7 +93,7 @@ def test_covariance_predicts_the_spread_of_estimates():
     assert (ratio > 0.6).all() and (ratio < 1.5).all()
 
 
-def test_noise_factor_tells_that_errors_are_larger_than_announced():
+def test_noise_factor_shows_that_errors_are_larger_than_announced():
     points_world = cloud(300)
     seen = measure(points_world, sigma=0.3)
     optimistic = Observations(seen.uvd_px, np.full(seen.uvd_px.shape, 0.1))

@@ -28,18 +28,18 @@ def drive(slam, poses, first=0, room=ROOM):
 
 def errors(results, poses):
     """Return the errors in metres of results, by the true poses of all frames."""
-    apart = [invert(poses[r.index]) @ r.T_map_odom @ r.T_odom_base for r in results]
-    return np.linalg.norm(np.array(apart)[:, :3, 3], axis=1)
+    off = [invert(poses[r.index]) @ r.T_map_odom @ r.T_odom_base for r in results]
+    return np.linalg.norm(np.array(off)[:, :3, 3], axis=1)
 
 
 @pytest.fixture(scope='module')
-def joined():
+def merged():
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     return slam, drive(slam, KNOWN + BEHIND + TURN + ON), KNOWN + BEHIND + TURN + ON
 
 
-def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(joined):
-    slam, batches, poses = joined
+def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(merged):
+    slam, batches, poses = merged
     sizes = [len(batch) for batch in batches]
     held = sizes.index(0)
     at = held + np.argmax(np.array(sizes[held:]) > 0)
@@ -54,8 +54,8 @@ def test_what_was_mapped_while_lost_comes_at_once_when_the_map_is_recognised(joi
     assert slam.back_end.submap is Submap.KNOWN
 
 
-def test_keyframes_that_were_mapped_apart_are_told_in_the_map(joined):
-    _, batches, poses = joined
+def test_keyframes_of_a_submap_are_published_in_the_map(merged):
+    _, batches, poses = merged
     batch = max(batches, key=len)
     keyframes = [r.keyframe for r in batch if r.keyframe]
     assert len(keyframes) > 4
@@ -71,14 +71,14 @@ def test_keyframes_that_were_mapped_apart_are_told_in_the_map(joined):
         np.testing.assert_array_equal(keyframe.cloud.xyz_map[row], xyz)
 
 
-def test_the_odometry_goes_on_where_the_camera_got_lost(joined):
-    _, batches, _ = joined
+def test_the_odometry_goes_on_where_the_camera_got_lost(merged):
+    _, batches, _ = merged
     odom = np.array([r.T_odom_base for batch in batches for r in batch if r.tracked])
     assert np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1).max() < 0.1
 
 
 @pytest.mark.parametrize('waited_s, is_there', [(0, False), (10, True)])
-def test_a_part_joins_only_where_the_robot_can_have_driven(waited_s, is_there):
+def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_there):
     """What it sees 1.6 s after it got lost looks like a place 4 m away."""
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     way = [planar_pose(-2.0 + 0.05 * k, 0.0, 0.0) for k in range(81)]
@@ -89,7 +89,7 @@ def test_a_part_joins_only_where_the_robot_can_have_driven(waited_s, is_there):
     assert (slam.back_end.submap is Submap.LOST) is not is_there
 
 
-def test_a_part_that_is_never_recognised_is_no_part_of_the_map():
+def test_a_submap_that_is_never_recognised_is_not_in_the_map():
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     drive(slam, KNOWN)
     before = slam.to_arrays()
@@ -120,8 +120,8 @@ def test_a_map_that_had_hardly_begun_is_given_up():
     assert path.stamp_ns[0] == rest[0].stamp_ns
     # It goes on where it got lost; the way since is not known.
     T_true = invert(poses[again]) @ poses[-1]
-    T_told = invert(rest[0].T_odom_base) @ rest[-1].T_odom_base
-    np.testing.assert_allclose(T_told, T_true, atol=0.04)
+    T_measured = invert(rest[0].T_odom_base) @ rest[-1].T_odom_base
+    np.testing.assert_allclose(T_measured, T_true, atol=0.04)
     given_up = [r.keyframe.cloud.point_id.max() for r in results[:first] if r.keyframe]
     assert rest[0].keyframe.cloud.point_id.min() > max(given_up)
 
@@ -134,6 +134,6 @@ def test_a_camera_that_is_lost_again_is_looked_for_in_the_map():
     results = [r for batch in batches for r in batch]
     assert results[-1].tracked and slam.back_end.submap is Submap.KNOWN
     assert errors(results[-1:], [KNOWN[10]] * 60).max() < 0.02
-    # It is not looked for in the part alone.
+    # It is not looked for in the submap alone.
     found = next(r.index for r in results if r.tracked)
     assert found <= 40 + 5
