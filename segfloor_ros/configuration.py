@@ -8,6 +8,7 @@ nodes are the settings of their stages, and what only nodes have: frames, rates,
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,9 @@ from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.settings import GONE, RobotSettings, StageSettings, setting, suggestion
 from segfloor_ros.slam.settings import StereoSlamSettings
+
+MAX_KEYFRAMES_UNDER_WAY = 4
+"""Keyframes that may be between SLAM and the grid while the next frame is taken."""
 
 # Parameters of every ROS node: allowed in a parameter file, no concern of the stages.
 ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
@@ -190,8 +194,7 @@ class NodeSettings(StageSettings):
     """What every node has."""
 
     autostart: bool = setting(
-        True,
-        'Configure and activate at the start; off: wait for a lifecycle manager.',
+        True, 'Configure and activate at the start; off: wait for a lifecycle manager.'
     )
     resume_within_s: float = setting(
         30.0,
@@ -272,9 +275,12 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
         live=True,
     )
     localize: bool = setting(
+        False, 'Poses in the map of load_map only: nothing is added to it.', live=True
+    )
+    path_only: bool = setting(
         False,
-        'Poses in the map of load_map only: nothing is added to it.',
-        live=True,
+        'Poses alone: no floor is looked for; where the mount of the camera is not known, the base '
+        'is taken to be where the camera is.',
     )
     save_map: str = setting('', 'File that ~/save_map writes the whole map to.', live=True)
     background: bool = setting(
@@ -329,6 +335,12 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
         unit='bits',
         within=(0, 16),
     )
+
+    @property
+    def gives_mount(self) -> bool:
+        """Whether any of height, pitch and roll of the camera is given; then tf is not asked."""
+        given = (self.camera_height_m, self.camera_pitch_rad, self.camera_roll_rad)
+        return not all(math.isnan(value) for value in given)
 
 
 @dataclass(frozen=True)

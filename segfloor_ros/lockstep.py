@@ -17,16 +17,15 @@ from typing import TypeVar
 import numpy as np
 
 from segfloor_ros import results_folder
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.model import MeasurementLog, Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.rig_check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.files.results import check_writable
+from segfloor_ros.files.saved_map import MapFile, is_map_file, read_map_file, write_map_file
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
-from segfloor_ros.map_file import MapFile, is_map_file, read_map_file, write_map_file
-from segfloor_ros.measurements import MeasurementLog
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
@@ -76,10 +75,13 @@ class MapOptions:
         check_camera(saved, camera, str(self.load))
         return saved
 
-    def write(self, write: Callable[[Path], object], interrupted: bool) -> str:
+    def write(
+        self, write: Callable[[Path], object], interrupted: bool, or_elsewhere: bool = True
+    ) -> str:
         """Have the map saved; returns where it is, in words, where that is elsewhere: what is
-        interrupted does not replace an older map. Raises MapError where the map cannot be written;
-        it is then in the folder for temporary files, if it can be written there.
+        interrupted does not replace an older map. Where it cannot be written, the words are why;
+        with `or_elsewhere` MapError is raised and the map is in the folder for temporary files, if
+        it can be written there.
         """
         assert self.save is not None
         path = self.save
@@ -88,6 +90,8 @@ class MapOptions:
         try:
             write(path)
         except SegfloorError as error:
+            if not or_elsewhere:
+                return str(error)
             elsewhere = Path(tempfile.mkdtemp(prefix='segfloor-map-'))
             try:
                 write(elsewhere / path.name)
@@ -331,40 +335,22 @@ class LockstepRun:
         }
 
     def _summary(self, wall_s: float, has_map: bool) -> results_folder.RunSummary:
-        tracked = np.array([result.tracked for result in self._results], bool)
-        return results_folder.RunSummary(
-            map=results_folder.MAP if has_map else None,
-            frames=self._frames,
-            tracked_frames=int(tracked.sum()),
+        slam, pipeline = self._pipeline.slam, self._pipeline
+        return results_folder.summarise(
+            [results_folder.DriveFrame.of(result) for result in self._results],
+            wall_s,
+            self._known_mount,
+            has_map,
             skipped_frames=self._source.skipped_frames,
-            lost_intervals=results_folder.lost_intervals([r.index for r in self._results], tracked),
-            keyframes=len(self._pipeline.slam.map.keyframes),
-            loops=self._pipeline.slam.back_end.loop_count,
-            relocalisations=results_folder.relocalisations(
-                [r.stamp_ns for r in self._results], tracked
-            ),
-            submaps=results_folder.submap_intervals(
-                [r.index for r in self._results],
-                np.array([r.in_submap for r in self._results], bool),
-                tracked,
-            ),
-            map_updates=self._pipeline.keyframe_stages.map_updates,
-            wall_s=round(wall_s, 3),
-            frames_per_s=round(self._frames / wall_s, 2),
-            **results_folder.mount_figures(self._known_mount),
+            keyframes=len(slam.map.keyframes),
+            loops=slam.back_end.loop_count,
+            map_updates=pipeline.keyframe_stages.map_updates,
             sensors=self._sensors_used(),
-            repeated_frames=sum(r.repeated and r.tracked for r in self._results),
-            blind_frames=sum(result.blind for result in self._results),
-            moving_frames=sum(_shows_motion(result) for result in self._results),
-            sensor_remarks=[*self._pipeline.slam.sensors.remarks.values()],
-            input_faults=self._pipeline.slam.rig_check.as_dicts(),
+            sensor_remarks=[*slam.sensors.remarks.values()],
+            input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
-            failed_keyframes=self._pipeline.failed_keyframes,
+            failed_keyframes=pipeline.failed_keyframes,
             interrupted=self._is_cut_short,
-            stages=self._pipeline.times.summary(),
+            stages=pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )
-
-
-def _shows_motion(result: FrameResult) -> bool:
-    return result.moving is not None and len(result.moving.xyz_map) > 0

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
-from segfloor_ros.configuration import Configuration
+from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.saved_map import Arrays, MapFile
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.map_file import Arrays, MapFile
 from segfloor_ros.slam.results import (
     FrameResult,
     Keyframe,
@@ -36,8 +36,6 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes
 
 logger = logging.getLogger(__name__)
-
-MAX_PENDING_KEYFRAMES = 4
 
 CAMERA_AS_BASE = Mount(0.0, 0.0, 0.0)
 """Where nothing is known of the mount: the camera in the axes of a base."""
@@ -201,7 +199,7 @@ class Pipeline:
         self._worker.shutdown(cancel_futures=True)
 
     def _submit(self, keyframe: Keyframe) -> None:
-        while len(self._pending) >= MAX_PENDING_KEYFRAMES:
+        while len(self._pending) >= MAX_KEYFRAMES_UNDER_WAY:
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._process_keyframe, keyframe))
 

@@ -33,6 +33,7 @@ from segfloor_ros.files.results import (
 )
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
+from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.trajectory import Trajectory, write_tum
 
 MAP = 'map.yaml'
@@ -119,15 +120,58 @@ class RunResult:
     configuration: Configuration
 
 
-def mount_figures(mount: Mount | None) -> dict[str, float | None]:
-    """Return the mount's part of a summary."""
-    if mount is None:
-        return dict.fromkeys(('camera_height_m', 'camera_pitch_rad', 'camera_roll_rad'))
-    return {
-        'camera_height_m': round(mount.height_m, 4),
-        'camera_pitch_rad': round(mount.pitch_rad, 5),
-        'camera_roll_rad': round(mount.roll_rad, 5),
-    }
+@dataclasses.dataclass(frozen=True)
+class DriveFrame:
+    """What became of a frame, as `RunSummary` counts it."""
+
+    stamp_ns: int
+    index: int
+    tracked: bool
+    in_submap: bool
+    repeated: bool
+    blind: bool
+    shows_motion: bool
+
+    @staticmethod
+    def of(result: FrameResult) -> DriveFrame:
+        """Return what became of a frame that SLAM has answered."""
+        return DriveFrame(
+            result.stamp_ns,
+            result.index,
+            result.tracked,
+            result.in_submap,
+            result.repeated and result.tracked,
+            result.blind,
+            result.moving is not None and len(result.moving.xyz_map) > 0,
+        )
+
+
+def summarise(
+    frames: Sequence[DriveFrame], wall_s: float, mount: Mount | None, has_map: bool, **others: Any
+) -> RunSummary:
+    """Return the summary of a drive, whoever drove it. frames: in order of their stamps. others:
+    what does not follow from them.
+    """
+    tracked = np.array([frame.tracked for frame in frames], bool)
+    in_submap = np.array([frame.in_submap for frame in frames], bool)
+    indices, stamps = [f.index for f in frames], [f.stamp_ns for f in frames]
+    return RunSummary(
+        map=MAP if has_map else None,
+        frames=len(frames),
+        tracked_frames=int(tracked.sum()),
+        lost_intervals=lost_intervals(indices, tracked),
+        relocalisations=relocalisations(stamps, tracked),
+        submaps=submap_intervals(indices, in_submap, tracked),
+        wall_s=round(wall_s, 3),
+        frames_per_s=round(len(frames) / wall_s, 2),
+        camera_height_m=round(mount.height_m, 4) if mount else None,
+        camera_pitch_rad=round(mount.pitch_rad, 5) if mount else None,
+        camera_roll_rad=round(mount.roll_rad, 5) if mount else None,
+        repeated_frames=sum(frame.repeated for frame in frames),
+        blind_frames=sum(frame.blind for frame in frames),
+        moving_frames=sum(frame.shows_motion for frame in frames),
+        **others,
+    )
 
 
 def lost_intervals(

@@ -20,8 +20,7 @@ from segfloor_ros.files.whole import read_table
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.slam.results import KeyframePath
 
-TUM_COLUMNS = 8
-KITTI_COLUMNS = 12
+TUM_COLUMNS, KITTI_COLUMNS = 8, 12
 FARTHEST = 1e10
 """Times in seconds and positions in metres are not beyond this."""
 

@@ -13,14 +13,15 @@ from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.cli.replay_nodes import NodeGraph
 from segfloor_ros.cli.replay_recorder import ReplayRecorder
+from segfloor_ros.messages.topics import NODES
 
 
 def main() -> None:
     """Print how long it took."""
     context = rclpy.Context()
     rclpy.init(context=context)
-    recorder = ReplayRecorder(context, lambda: 0.0, None)
-    graph = NodeGraph(recorder, SimpleNamespace(check=lambda: None), Path())
+    recorder = ReplayRecorder(context)
+    graph = NodeGraph(recorder, SimpleNamespace(check=lambda: None, process_ids=NODES), Path())
     waited_s = graph.connect()
     start_s = time.monotonic()
     graph.call(SetBool, 'stereo_camera/pause', SetBool.Request(data=False))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -26,7 +28,7 @@ class Graph:
     def __init__(self) -> None:
         self.tester = Node('tester')
         self.statuses: list[Status] = []
-        self._nodes: list[Node] = [self.tester]
+        self.nodes: list[Node] = [self.tester]
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.tester)
         self.tester.create_subscription(
@@ -38,13 +40,13 @@ class Graph:
 
     def add(self, node: Node) -> Any:
         """Run a node in this graph."""
-        self._nodes.append(node)
+        self.nodes.append(node)
         self._executor.add_node(node)
         return node
 
     def remove(self, node: Node) -> None:
         """End a node."""
-        self._nodes.remove(node)
+        self.nodes.remove(node)
         self._executor.remove_node(node)
         node.destroy_node()
 
@@ -104,15 +106,23 @@ class Graph:
     def close(self) -> None:
         """Take the graph down."""
         self._executor.shutdown()
-        for node in self._nodes:
+        for node in self.nodes:
             node.destroy_node()
         rclpy.try_shutdown()
 
 
 @contextlib.contextmanager
 def fresh_graph(*arguments: str) -> Iterator[Graph]:
-    """A graph whose nodes get the given ROS arguments, in a domain that nobody else uses."""
-    os.environ['ROS_DOMAIN_ID'] = str(free_domain())
+    """A graph whose nodes get the given ROS arguments, in a domain that nobody else uses, with a
+    folder of their own for what outlives them.
+    """
+    with tempfile.TemporaryDirectory(prefix='graph-') as folder:
+        changed = {'ROS_DOMAIN_ID': str(free_domain()), 'XDG_RUNTIME_DIR': folder}
+        with mock.patch.dict(os.environ, changed):
+            yield from _graph(*arguments)
+
+
+def _graph(*arguments: str) -> Iterator[Graph]:
     # The middleware of an earlier graph ends with the last reference to it, and is seen until then.
     gc.collect()
     rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
@@ -121,4 +131,3 @@ def fresh_graph(*arguments: str) -> Iterator[Graph]:
         yield graph
     finally:
         graph.close()
-        os.environ.pop('ROS_DOMAIN_ID', None)

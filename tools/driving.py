@@ -11,11 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import MeasurementLog, RecordedSensor, StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.measurements import MeasurementLog, RecordedSensor
 from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.slam.results import FrameResult

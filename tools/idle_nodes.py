@@ -6,7 +6,8 @@ import time
 
 from std_srvs.srv import SetBool
 
-from segfloor_ros.cli.replay_measured import FigureGraph, connected_nodes, cpu_s
+from segfloor_ros.cli.replay_nodes import NodeGraph
+from segfloor_ros.cli.replay_session import connected_nodes, cpu_s
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.messages.diagnostics import NEED_LASTS_S
 from segfloor_ros.messages.topics import CAMERA, GRID
@@ -44,7 +45,7 @@ def longest_s(duration_s: float) -> float:
     return 2 * duration_s + ALL_IDLE_S + 5 * SETTLE_S
 
 
-def _shares(graph: FigureGraph, duration_s: float, spin: bool) -> dict[str, float]:
+def _shares(graph: NodeGraph, duration_s: float, spin: bool) -> dict[str, float]:
     start_s, before_s = time.monotonic(), cpu_s(graph.processes)
     if spin:
         graph.spin(duration_s)

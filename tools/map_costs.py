@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.files.saved_map import Arrays
 from segfloor_ros.geometry import Array, invert, se3_exp
-from segfloor_ros.map_file import Arrays
 from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import (

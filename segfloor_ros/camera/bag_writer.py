@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import NOT_MEASURED
+from segfloor_ros.camera.model import ImuSample, Measurement, MeasurementLog, WheelPose
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, os_errors
 from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.geometry import Array, make_transform, quaternion_xyzw
-from segfloor_ros.measurements import ImuSample, Measurement, MeasurementLog, WheelPose
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')

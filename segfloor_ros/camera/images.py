@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from segfloor_ros import MAX_PIXELS
 from segfloor_ros.camera.calibration.parameters import EyeCalibration
+from segfloor_ros.camera.model import ImuSample, WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
 from segfloor_ros.geometry import Array, transform_from_quaternion
-from segfloor_ros.measurements import ImuSample, WheelPose
 
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 

@@ -25,11 +25,12 @@ from segfloor_ros.benchmark.stages import (
 from segfloor_ros.camera.bag_writer import ImageCoding
 from segfloor_ros.camera.bag_writer import convert as write_bag
 from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
+from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
 from segfloor_ros.cli.replay import replay
-from segfloor_ros.cli.terminal import console, figure_table, within
+from segfloor_ros.cli.terminal import console, figure_table, value_table, within
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import MapError, SettingsError, about
 from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
@@ -37,7 +38,6 @@ from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.files.results import add_files, check_writable, write_file
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
-from segfloor_ros.measurements import DEPTH
 from segfloor_ros.processes import first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
 
@@ -304,13 +304,13 @@ def print_node_figures(configuration: Configuration, rate: float, lossless: bool
     lose no frame, as opposed to keeping to the clock.
     """
     try:
-        from segfloor_ros.cli.replay_measured import figures_table, measure_nodes
+        from segfloor_ros.cli.replay_session import figure_rows, measure_nodes
     except ImportError as error:
         raise SettingsError(f'to measure the nodes needs ROS 2 ({error})') from None
     frames = open_source(configuration.stereo_camera).frame_count
     with terminal.progress_bar('playing', frames) as progress:
         figures = measure_nodes(configuration, rate, lossless, progress)
-    console.print(figures_table(figures))
+    console.print(value_table('figure', figure_rows(figures)))
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:

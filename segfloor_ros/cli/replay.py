@@ -38,6 +38,7 @@ def replay(
     load_map: terminal.LoadMap = None,
     localize: terminal.Localize = False,
     report: terminal.Report = False,
+    no_map: terminal.NoMap = False,
 ) -> None:
     """Map a recording with the five ROS 2 nodes over DDS."""
     try:
@@ -67,7 +68,7 @@ def replay(
         on_mask = keep if save_masks is SaveMasks.keyframes else None
         with terminal.progress_bar('replaying', source.frame_count) as progress:
             session = ReplaySession(
-                configuration, params, rate, on_mask, progress, interrupt, maps, loaded
+                configuration, params, rate, on_mask, progress, interrupt, maps, loaded, no_map
             )
             try:
                 result, found = session.execute()

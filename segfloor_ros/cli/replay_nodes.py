@@ -1,50 +1,160 @@
-"""The five node processes in a graph of their own, and what listens to them."""
+"""The node processes of a replay in a graph of their own: started, watched and stopped together,
+also when interrupted.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import rclpy
 import yaml
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from segfloor_ros.cli.replay_processes import NodeProcesses, ReplayError
-from segfloor_ros.cli.replay_recorder import ReplayRecorder
-from segfloor_ros.errors import SegfloorError
+from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
+from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.lockstep import ProgressListener
-from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, PACED_BY, TOPICS
+from segfloor_ros.messages.topics import DIAGNOSTICS, GRID, NODES, PACED_BY, PATIENCE_S, TOPICS
+from segfloor_ros.processes import end_with_parent, interrupts_deferred
+from segfloor_ros.timing import rss_mb
 
 # DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
 # into the ports that Linux hands out to clients.
-FIRST_PORT, PORTS_PER_DOMAIN, DOMAINS = 7400, 250, 101
-PARTICIPANT_OFFSET = 10
+FIRST_PORT, PORTS_PER_DOMAIN, DOMAINS, PARTICIPANT_OFFSET = 7400, 250, 101, 10
 PARTICIPANTS_TRIED = 8
 
 _reservation: socket.socket | None = None
 """Holds the last port of the domain that this process was told."""
 
-DISCOVERY_S = 30.0
-
 STALL_S = 60.0
-
-DRAIN_S = 10.0
-
-SERVICE_S = 10.0
+"""So long nodes may take to connect, to go on, or to save a map."""
 
 SPIN_S = 0.1
 
-Recorder = TypeVar('Recorder', bound=ReplayRecorder)
+STOP_S = 1.2
+"""So long processes have to end at a signal before the next, harder one."""
+
+NOTICES = ('[WARN]', '[ERROR]', '[FATAL]', 'segfloor: ')
+
+
+class ReplayError(MapError):
+    """The replay broke off: a node died or the nodes do not find each other."""
+
+
+class NodeProcesses:
+    """One process per node. As a context manager it leaves none of them behind."""
+
+    def __init__(
+        self,
+        nodes: Iterable[str],
+        arguments: Sequence[str],
+        environment: Mapping[str, str],
+        log_folder: Path,
+    ) -> None:
+        self._environment = dict(environment)
+        self._logs = {node: log_folder / f'{node}.log' for node in nodes}
+        self._arguments = list(arguments)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> NodeProcesses:
+        try:
+            with interrupts_deferred():
+                self._start()
+        except BaseException:
+            # `__exit__` is not called for what happens in here.
+            self.stop()
+            raise
+        return self
+
+    def _start(self) -> None:
+        for node, log in self._logs.items():
+            command = [sys.executable, '-m', f'segfloor_ros.nodes.{node}', *self._arguments]
+            with log.open('wb') as output:
+                self._processes[node] = subprocess.Popen(
+                    command,
+                    env=self._environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    # An interrupt from the terminal ends the replay, which then stops its nodes.
+                    start_new_session=True,
+                    preexec_fn=partial(end_with_parent, os.getpid()),
+                )
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
+
+    def check(self) -> None:
+        """Raise ReplayError naming the node whose process has ended."""
+        for node, process in self._processes.items():
+            status = process.poll()
+            if status is not None:
+                raise ReplayError(f'node {node} died ({_cause(status)}){self._last_words(node)}')
+
+    @property
+    def process_ids(self) -> dict[str, int]:
+        """The process of every node."""
+        return {node: process.pid for node, process in self._processes.items()}
+
+    def rss_mb(self) -> float:
+        """Return the resident memory of all processes together in MB."""
+        return sum(rss_mb(process.pid) for process in self._processes.values())
+
+    def stop(self) -> None:
+        """Interrupt all processes; terminate, then kill those that stay."""
+        for stop_signal in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            running = [p for p in self._processes.values() if p.poll() is None]
+            for process in running:
+                process.send_signal(stop_signal)
+            deadline_s = time.monotonic() + STOP_S
+            for process in running:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(deadline_s - time.monotonic(), 0.0))
+
+    def notices(self) -> list[str]:
+        """Return the warnings and errors the nodes have logged, each line once."""
+        lines = (
+            f'{node}: {_without_clock(line)}'
+            for node in self._logs
+            for line in self._lines(node)
+            if any(mark in line for mark in NOTICES)
+        )
+        return list(dict.fromkeys(lines))
+
+    def _lines(self, node: str) -> list[str]:
+        text = self._logs[node].read_text(errors='replace') if self._logs[node].exists() else ''
+        return [line.strip() for line in text.splitlines() if line.strip()]
+
+    def _last_words(self, node: str) -> str:
+        lines = self._lines(node)
+        return f': {_without_clock(lines[-1])}' if lines else ''
+
+
+def _cause(status: int) -> str:
+    if status < 0:
+        return f'signal {signal.Signals(-status).name}'
+    return f'status {status}'
+
+
+def _without_clock(line: str) -> str:
+    """Strip `[WARN] [1700000000.123456789] [node]: ` from a line of the ROS log."""
+    for mark in NOTICES:
+        if line.startswith(mark):
+            return line.partition(']: ')[2] or line.removeprefix(mark)
+    return line
 
 
 def isolated_environment() -> dict[str, str]:
@@ -81,19 +191,20 @@ def unconnected(
     counts: Mapping[str, Mapping[str, int]],
     recorded: Collection[str] = (),
     is_paced: bool = True,
+    nodes: Collection[str] = NODES,
 ) -> list[str]:
     """Return what is missing before the first frame can be sent without loss, in words.
 
     counts: subscribers by node and topic, as each publisher sees them. recorded: topics that the
-    replay itself listens to. is_paced: the camera listens
-    to how far the frames are.
+    replay itself listens to. is_paced: the camera listens to how far the frames are. nodes: those
+    that run.
     """
     missing = []
-    for node in NODES:
+    for node in nodes:
         if node not in counts:
             missing.append(f'{node} (no sign of life)')
             continue
-        needed = {topic: _listeners_of(topic, recorded, is_paced) for topic in counts[node]}
+        needed = {topic: _listeners_of(topic, recorded, is_paced, nodes) for topic in counts[node]}
         missing += [
             f'{topic} ({counts[node][topic]} of {number} subscribers)'
             for topic, number in needed.items()
@@ -102,10 +213,12 @@ def unconnected(
     return missing
 
 
-def _listeners_of(topic: str, recorded: Collection[str], is_paced: bool) -> int:
+def _listeners_of(
+    topic: str, recorded: Collection[str], is_paced: bool, nodes: Collection[str]
+) -> int:
     if topic == DIAGNOSTICS.name:
         return 1  # the replay itself
-    listeners = len(TOPICS[topic].subscribers) + (topic in recorded)
+    listeners = len(set(TOPICS[topic].subscribers) & set(nodes)) + (topic in recorded)
     return listeners + (is_paced and topic in PACED_BY)
 
 
@@ -129,11 +242,12 @@ def _bind(port: int, kind: socket.SocketKind) -> socket.socket | None:
 @contextlib.contextmanager
 def running_nodes(
     make_parameters: Callable[[Path], dict[str, Any]],
-    make_recorder: Callable[[Context, NodeProcesses], Recorder],
     params_file: Path | None = None,
-) -> Iterator[NodeGraph[Recorder]]:
-    """Run the five nodes, not connected yet, until the block ends. make_parameters: gets a folder
-    for files of this graph alone; its values win over those of params_file.
+    on_mask: MaskListener | None = None,
+    nodes: Sequence[str] = NODES,
+) -> Iterator[NodeGraph]:
+    """Run nodes, not connected yet, until the block ends. make_parameters: gets a folder for files
+    of this graph alone; its values win over those of params_file.
     """
     environment = isolated_environment()
     # This process takes part in the same graph.
@@ -147,16 +261,18 @@ def running_nodes(
             files = [str(file) for file in (params_file, resolved) if file is not None]
             options = [word for file in files for word in ('--params-file', file)]
             arguments = ['--ros-args', '--disable-external-lib-logs', *options]
-            with NodeProcesses(NODES, arguments, environment, folder) as processes:
-                yield NodeGraph(make_recorder(context, processes), processes, folder)
+            with NodeProcesses(nodes, arguments, environment, folder) as processes:
+                path_only = GRID not in nodes
+                recorder = ReplayRecorder(context, processes.rss_mb, on_mask, path_only)
+                yield NodeGraph(recorder, processes, folder)
     finally:
         rclpy.try_shutdown(context=context)
 
 
-class NodeGraph(Generic[Recorder]):
+class NodeGraph:
     """The running nodes and the one that listens to them. folder: for files of the graph alone."""
 
-    def __init__(self, recorder: Recorder, processes: NodeProcesses, folder: Path) -> None:
+    def __init__(self, recorder: ReplayRecorder, processes: NodeProcesses, folder: Path) -> None:
         self.recorder = recorder
         self.processes = processes
         self.folder = folder
@@ -166,10 +282,11 @@ class NodeGraph(Generic[Recorder]):
     def connect(self, is_paced: bool = True, interrupted: threading.Event | None = None) -> float:
         """Wait until every topic has its subscribers; returns the seconds it took."""
         start_s, recorder = time.monotonic(), self.recorder
-        while missing := unconnected(recorder.connections, recorder.recorded, is_paced):
-            if time.monotonic() - start_s > DISCOVERY_S:
+        counts, nodes = recorder.notes.connections, self.processes.process_ids
+        while missing := unconnected(counts, recorder.recorded, is_paced, nodes):
+            if time.monotonic() - start_s > STALL_S:
                 raise ReplayError(
-                    f'after {DISCOVERY_S:g} s these are not connected: {", ".join(missing)}; is '
+                    f'after {STALL_S:g} s these are not connected: {", ".join(missing)}; is '
                     'the loopback interface up, and does a firewall block UDP?'
                 )
             if interrupted is not None and interrupted.is_set():
@@ -179,17 +296,17 @@ class NodeGraph(Generic[Recorder]):
 
     def wait_for_map(self) -> None:
         """Wait until there is a map: one that is loaded takes its time."""
-        deadline_s = time.monotonic() + DRAIN_S
-        while self.recorder.grid is None and time.monotonic() < deadline_s:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while 'map' not in self.recorder.latest and time.monotonic() < deadline_s:
             self.spin()
 
-    def call(self, kind: Any, name: str, request: Any, patience_s: float = SERVICE_S) -> None:
+    def call(self, kind: Any, name: str, request: Any, patience_s: float = PATIENCE_S) -> None:
         """Call a service. Raises ReplayError with its answer when it fails."""
         response = self.ask(kind, name, request, patience_s)
         if not response.success:
             raise ReplayError(f'{name}: {response.message}')
 
-    def ask(self, kind: Any, name: str, request: Any, patience_s: float = SERVICE_S) -> Any:
+    def ask(self, kind: Any, name: str, request: Any, patience_s: float = PATIENCE_S) -> Any:
         """Return the answer of a service. Raises ReplayError where there is none."""
         client = self.recorder.create_client(kind, name)
         deadline_s = time.monotonic() + patience_s
@@ -206,29 +323,29 @@ class NodeGraph(Generic[Recorder]):
         """Follow the nodes until the recording has ended and everything sent has arrived; False
         when an interrupt came before.
         """
-        recorder = self.recorder
-        recorder.last_sign_s = time.monotonic()
-        while not recorder.is_drained():
+        notes = self.recorder.notes
+        notes.last_sign_s = time.monotonic()
+        while not self.recorder.is_drained():
             if interrupted.is_set():
                 return False
             self.spin()
-            last = recorder.answers.get(max(recorder.answers, default=0))
-            on_progress(len(recorder.answers), last.message if last else '')
-            quiet_s = time.monotonic() - recorder.last_sign_s
-            if quiet_s > (DRAIN_S if recorder.finished is not None else STALL_S):
+            last = notes.answers.get(max(notes.answers, default=0))
+            on_progress(len(notes.answers), last.message if last else '')
+            quiet_s = time.monotonic() - notes.last_sign_s
+            if quiet_s > (PATIENCE_S if notes.finished is not None else STALL_S):
                 raise ReplayError(
-                    f'nothing has happened for {quiet_s:.0f} s; {len(recorder.unanswered())} '
-                    f'frames are not tracked and {len(recorder.unmapped())} keyframes not mapped'
+                    f'nothing has happened for {quiet_s:.0f} s; {len(notes.unanswered())} '
+                    f'frames are not tracked and {len(notes.unmapped())} keyframes not mapped'
                 )
         return True
 
     def catch_up(self) -> None:
         """Wait until what was sent has arrived, or nothing more comes."""
-        recorder = self.recorder
-        recorder.last_sign_s = time.monotonic()
-        while not recorder.has_caught_up():
+        notes = self.recorder.notes
+        notes.last_sign_s = time.monotonic()
+        while not self.recorder.has_caught_up():
             self.spin()
-            if time.monotonic() - recorder.last_sign_s > DRAIN_S:
+            if time.monotonic() - notes.last_sign_s > PATIENCE_S:
                 return
 
     def spin(self, duration_s: float = SPIN_S) -> None:

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
-from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
-from sensor_msgs.msg import Image, PointCloud2
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import diagnostics
+from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.images import grey8_image
-from segfloor_ros.messages.maps import labelled_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.messages.topics import (
     CAMERA,
@@ -30,10 +27,13 @@ from segfloor_ros.messages.topics import (
     DIAGNOSTICS,
     FLOOR,
     GRID,
+    KEYFRAME_DONE,
+    NODES,
     SLAM,
     TOPICS,
     to_ns,
 )
+from segfloor_ros.results_folder import DriveFrame
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import MemoryLog, StageTimes
 from segfloor_ros.trajectory import TrackedPose
@@ -41,55 +41,90 @@ from segfloor_ros.trajectory import TrackedPose
 MaskListener = Callable[[str, NDArray[np.uint8]], None]
 """Gets the number of a frame, as in the names of masks, and its floor mask."""
 
+POSES = ('odometry', 'pose')
+MASK, POINTS, KEYFRAME = 'keyframe/floor_mask', 'map_points', 'keyframe/odometry'
+OF_PATH = (*POSES, 'camera_mount', 'keyframe/path')
+OF_MAP = (*OF_PATH, MASK, 'labelled_points', 'map')
+"""What a replay records: of a path alone, and of a map."""
 
-class ReplayRecorder(Node):
-    """Subscribes to the results of the chain; everything is filed under its stamp."""
 
-    def __init__(
-        self, context: Context, measure_mb: Callable[[], float], on_mask: MaskListener | None
-    ) -> None:
-        super().__init__('replay_recorder', context=context)
+class DriveNotes:
+    """What the statuses of the nodes say about a drive; everything is filed under its stamp."""
+
+    def __init__(self, measure_mb: Callable[[], float]) -> None:
         self.times = StageTimes()
         self.memory = MemoryLog(measure_mb)
         self.connections: dict[str, dict[str, int]] = {}
         self.frame_index: dict[int, int] = {}
-        self.answers: dict[int, diagnostics.Status] = {}
-        self.finished: diagnostics.Status | None = None
+        self.answers: dict[int, Status] = {}
+        self.finished: Status | None = None
         self.updated: set[int] = set()
-        self.failed: dict[int, diagnostics.Status] = {}
-        self.path: KeyframePath | None = None
-        self.labelled: LabelledPoints | None = None
-        self.mount: Mount | None = None
+        self.failed: dict[int, Status] = {}
+        self.health: dict[str, Status] = {}
+        self.done_s: dict[str, dict[int, float]] = {node: {} for node in NODES}
+        """When a node said first that it was done with a stamp."""
         self.last_sign_s = time.monotonic()
-        self.grid: OccupancyGridMessage | None = None
-        self._T_odom_base: dict[int, Array] = {}
-        self._T_map_base: dict[int, Array] = {}
-        self._on_mask = on_mask
-        self._masks: dict[int, NDArray[np.uint8]] = {}
-        self._subscribe()
 
-    @property
-    def tracked(self) -> list[TrackedPose]:
-        """The tracked frames in order of their stamps."""
-        return [
-            TrackedPose(
-                stamp_ns,
-                self._T_odom_base[stamp_ns],
-                int(self.answers[stamp_ns].values['reference_keyframe_ns']),
-                self._T_map_base.get(stamp_ns),
+    def take(self, message: DiagnosticArray) -> None:
+        """Take in what a node says."""
+        for status in diagnostics.statuses(message):
+            if status.kind == diagnostics.CONNECTIONS:
+                counts = {topic: int(count) for topic, count in status.values.items()}
+                self.connections[status.node] = counts
+            elif status.kind == diagnostics.RECORDING:
+                self.finished = status
+            elif status.kind == diagnostics.HEALTH:
+                self.health[status.node] = status
+            elif not status.kind:
+                self._take_status(status)
+
+    def _take_status(self, status: Status) -> None:
+        self.last_sign_s = time.monotonic()
+        if 'processing_ms' in status.values:
+            self.times.add(status.node, 1e-3 * float(status.values['processing_ms']))
+        if status.level is Level.OK and status.node in NODES:
+            self.done_s[status.node].setdefault(status.stamp_ns, self.last_sign_s)
+        if status.node == CAMERA:
+            self.frame_index[status.stamp_ns] = int(status.values['frame_index'])
+        elif status.node == SLAM:
+            self.answers[status.stamp_ns] = status
+        elif status.node == GRID and status.level is Level.OK:
+            self.updated.add(status.stamp_ns)
+            self.memory.sample()
+        elif status.node in (FLOOR, CLOUD, GRID) and status.level is Level.ERROR:
+            self.failed[status.stamp_ns] = status
+
+    def frames(self) -> list[DriveFrame]:
+        """Return what became of the frames that were sent, in order."""
+        frames = []
+        for stamp_ns, index in sorted(self.frame_index.items()):
+            values = self.answers[stamp_ns].values if stamp_ns in self.answers else {}
+            tracked, submap, repeated, blind = (
+                values.get(name) == '1' for name in ('tracked', 'submap', 'repeated', 'blind')
             )
-            for stamp_ns in sorted(self._T_odom_base.keys() & self._told)
-        ]
+            shows_motion = int(values.get('moving', 0)) > 0
+            frames.append(
+                DriveFrame(stamp_ns, index, tracked, submap, repeated, blind, shows_motion)
+            )
+        return frames
+
+    def count(self, node: str, what: str) -> int:
+        """Return how much a node says to have `processed` or `skipped`: it knows best, also where
+        this process was too slow to hear it all.
+        """
+        return int(self.health[node].values[what]) if node in self.health else 0
 
     @property
-    def _told(self) -> set[int]:
-        """Stamps of the frames that SLAM says it has tracked."""
-        return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get('tracked') == '1'}
+    def failed_frames(self) -> int:
+        """At how many frames SLAM failed, which is more than not to track them."""
+        errors = (s for s in self.answers.values() if s.level is Level.ERROR)
+        return sum('tracked' not in status.values for status in errors)
 
-    @property
-    def keyframes(self) -> set[int]:
-        """Stamps of the keyframes that SLAM has published."""
-        return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get('keyframe') == '1'}
+    def flagged(self, name: str) -> set[int]:
+        """Return the stamps of the frames of which SLAM says that they are `tracked`, or of a
+        `keyframe`.
+        """
+        return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get(name) == '1'}
 
     @property
     def loops(self) -> int:
@@ -117,90 +152,102 @@ class ReplayRecorder(Node):
 
     def unmapped(self) -> set[int]:
         """Return the stamps of keyframes that have not reached the map, nor failed on the way."""
-        return self.keyframes - self.updated - self.failed.keys()
+        return self.flagged('keyframe') - self.updated - self.failed.keys()
+
+
+class ReplayRecorder(Node):
+    """Subscribes to the results of the chain.
+
+    path_only: no node makes a map, and this one answers the keyframes in their place.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        measure_mb: Callable[[], float] = lambda: 0.0,
+        on_mask: MaskListener | None = None,
+        path_only: bool = False,
+    ) -> None:
+        super().__init__('replay_recorder', context=context)
+        self.notes = DriveNotes(measure_mb)
+        self.recorded: Sequence[str] = (*OF_PATH, POINTS, KEYFRAME) if path_only else OF_MAP
+        self.latest: dict[str, Any] = {}
+        self.arrived_s: dict[str, dict[int, float]] = defaultdict(dict)
+        """When the first message of a topic and stamp came."""
+        self._path_only = path_only
+        self._poses: dict[str, dict[int, Array]] = {name: {} for name in POSES}
+        self._on_mask = on_mask
+        self._masks: dict[int, NDArray[np.uint8]] = {}
+        for name in self.recorded:
+            topic = TOPICS[name]
+            self.create_subscription(topic.type, name, partial(self._take, name), topic.profile)
+        done = TOPICS[KEYFRAME_DONE]
+        self._done = self.create_publisher(done.type, done.name, done.profile)
+        self.create_subscription(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_statuses, DIAGNOSTICS.profile
+        )
+
+    @property
+    def tracked(self) -> list[TrackedPose]:
+        """The tracked frames in order of their stamps."""
+        T_odom_base, T_map_base = (self._poses[name] for name in POSES)
+        return [
+            TrackedPose(
+                stamp_ns,
+                T_odom_base[stamp_ns],
+                int(self.notes.answers[stamp_ns].values['reference_keyframe_ns']),
+                T_map_base.get(stamp_ns),
+            )
+            for stamp_ns in sorted(T_odom_base.keys() & self.notes.flagged('tracked'))
+        ]
+
+    @property
+    def path(self) -> KeyframePath | None:
+        """The keyframes as they are now, None before the first one."""
+        message = self.latest.get('keyframe/path')
+        return None if message is None else path_arrays(message)
+
+    @property
+    def mount(self) -> Mount | None:
+        """Where the camera sits on the base, None while it is not known."""
+        message = self.latest.get('camera_mount')
+        return None if message is None else Mount.from_transform(transform_array(message))
 
     def is_drained(self) -> bool:
         """Whether the recording has ended and all that was sent has come to its end."""
-        if self.finished is None or len(self.frame_index) < int(self.finished.values['frames']):
+        notes = self.notes
+        if notes.finished is None or len(notes.frame_index) < int(notes.finished.values['frames']):
             return False
         return self.has_caught_up()
 
     def has_caught_up(self) -> bool:
         """Whether all that was sent so far has come to its end."""
-        if self.unanswered() or self.unmapped() or self._masks:
+        notes = self.notes
+        if notes.unanswered() or self._masks or (notes.unmapped() and not self._path_only):
             return False
-        newest = max(self.keyframes, default=0)
-        path_ns = int(self.path.stamp_ns[-1]) if self.path is not None else 0
-        has_poses = self._told <= self._T_odom_base.keys() & self._T_map_base.keys()
-        return has_poses and path_ns >= newest
+        path = self.latest.get('keyframe/path')
+        path_ns = to_ns(path.poses[-1].header.stamp) if path is not None else 0
+        has_poses = all(notes.flagged('tracked') <= self._poses[name].keys() for name in POSES)
+        return has_poses and path_ns >= max(notes.flagged('keyframe'), default=0)
 
-    def _subscribe(self) -> None:
-        self.recorded: dict[str, Callable[[Any], None]] = {
-            'odometry': self._take_odometry,
-            'pose': self._take_pose,
-            'camera_mount': self._take_mount,
-            'keyframe/path': self._take_path,
-            'keyframe/floor_mask': self._take_mask,
-            'labelled_points': self._take_labelled,
-            'map': self._take_map,
-        }
-        for name, callback in self.recorded.items():
-            self.create_subscription(TOPICS[name].type, name, callback, TOPICS[name].profile)
-        self.create_subscription(
-            DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_statuses, DIAGNOSTICS.profile
-        )
-
-    def _take_odometry(self, message: Odometry) -> None:
-        self._T_odom_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
-
-    def _take_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._T_map_base[to_ns(message.header.stamp)] = pose_array(message.pose.pose)
-
-    def _take_map(self, message: OccupancyGridMessage) -> None:
-        self.grid = message
-
-    def _take_mount(self, message: TransformStamped) -> None:
-        self.mount = Mount.from_transform(transform_array(message))
-
-    def _take_path(self, message: Path) -> None:
-        self.path = path_arrays(message)
-
-    def _take_labelled(self, message: PointCloud2) -> None:
-        self.labelled = labelled_arrays(message, 'labelled_points')
-
-    def _take_mask(self, message: Image) -> None:
-        if self._on_mask is not None:
-            mask = grey8_image(message, 'keyframe/floor_mask')
-            self._masks[to_ns(message.header.stamp)] = mask
+    def _take(self, name: str, message: Any) -> None:
+        stamp_ns = to_ns(message.header.stamp)
+        self.latest[name] = message
+        self.arrived_s[name].setdefault(stamp_ns, time.monotonic())
+        if name in POSES:
+            self._poses[name][stamp_ns] = pose_array(message.pose.pose)
+        elif name == MASK and self._on_mask is not None:
+            self._masks[stamp_ns] = grey8_image(message, MASK)
             self._hand_on_masks()
+        elif name == KEYFRAME:
+            self._done.publish(message.header)
+
+    def _take_statuses(self, message: DiagnosticArray) -> None:
+        self.notes.take(message)
+        self._hand_on_masks()
 
     def _hand_on_masks(self) -> None:
         """Masks are filed by frame number, which the camera's status tells."""
-        for stamp_ns in sorted(self._masks.keys() & self.frame_index.keys()):
+        for stamp_ns in sorted(self._masks.keys() & self.notes.frame_index.keys()):
             assert self._on_mask is not None
-            self._on_mask(f'{self.frame_index[stamp_ns]:06d}', self._masks.pop(stamp_ns))
-
-    def _take_statuses(self, message: DiagnosticArray) -> None:
-        for status in diagnostics.statuses(message):
-            if status.kind == diagnostics.CONNECTIONS:
-                counts = {topic: int(count) for topic, count in status.values.items()}
-                self.connections[status.node] = counts
-            elif status.kind == diagnostics.RECORDING:
-                self.finished = status
-            elif not status.kind:
-                self._take_status(status)
-
-    def _take_status(self, status: diagnostics.Status) -> None:
-        self.last_sign_s = time.monotonic()
-        if 'processing_ms' in status.values:
-            self.times.add(status.node, 1e-3 * float(status.values['processing_ms']))
-        if status.node == CAMERA:
-            self.frame_index[status.stamp_ns] = int(status.values['frame_index'])
-            self._hand_on_masks()
-        elif status.node == SLAM:
-            self.answers[status.stamp_ns] = status
-        elif status.node == GRID and status.level is diagnostics.Level.OK:
-            self.updated.add(status.stamp_ns)
-            self.memory.sample()
-        elif status.node in (FLOOR, CLOUD, GRID) and status.level is diagnostics.Level.ERROR:
-            self.failed[status.stamp_ns] = status
+            self._on_mask(f'{self.notes.frame_index[stamp_ns]:06d}', self._masks.pop(stamp_ns))

@@ -21,9 +21,9 @@ from rich.progress import (
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
+from segfloor_ros.camera.model import RecordedSensor
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError, printable
-from segfloor_ros.measurements import RecordedSensor
 from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
 

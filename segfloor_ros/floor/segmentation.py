@@ -69,7 +69,7 @@ from segfloor_ros.floor.observation import (
 from segfloor_ros.floor.plane.frame_plane import expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.tracking.images import join
+from segfloor_ros.slam.tracking.images import union
 from segfloor_ros.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
@@ -127,7 +127,7 @@ class FloorSegmentation:
         first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
-            moving = join(moving, blank_border(left))
+            moving = union(moving, blank_border(left))
             right_border = None if is_disparity(right) else blank_border(right)
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]

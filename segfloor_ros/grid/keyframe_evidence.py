@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.files.saved_map import Arrays, joined, split
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
 from segfloor_ros.grid.map_file import OccupancyGridSettings
-from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.results import KeyframeFeatures
 
 _LEAST_DEEP_M = 0.03

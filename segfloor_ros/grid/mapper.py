@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.cloud.labelled_cloud import LabelledPoints
 from segfloor_ros.errors import MapError
+from segfloor_ros.files.saved_map import Arrays, check_lengths
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.fold import EvidenceFolder, Pose2d
@@ -23,7 +24,6 @@ from segfloor_ros.grid.keyframe_evidence import (
 )
 from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings
 from segfloor_ros.grid.raster import LogOddsRaster, render
-from segfloor_ros.map_file import Arrays, check_lengths
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5

@@ -33,9 +33,11 @@ NEED_LASTS_S = 5.0
 RECORDING = 'recording'
 """Kind of the status of the camera that says that its recording has ended."""
 
-RECENT = 50
-STALE_DELAY_S = 3600.0
-"""A stamp this old is that of a recording; its age tells nothing."""
+RECENT = 10
+"""So many of the last messages of a topic are looked at together."""
+
+LIVE_S = 60.0
+"""A stamp older than this is that of a recording; its age tells nothing."""
 
 
 class Level(enum.Enum):
@@ -123,7 +125,8 @@ class Health:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._inputs: dict[str, InputMeter] = {}
-        self._problems: dict[str, Problem] = {}
+        self.problems: dict[str, Problem] = {}
+        """Those that are present, by what they are about."""
         self._counts = {'processed': 0, 'failed': 0, 'dropped': 0, 'skipped': 0}
         self._milliseconds: deque[float] = deque(maxlen=RECENT)
         self._state = ''
@@ -136,7 +139,7 @@ class Health:
         meter = self._inputs.setdefault(topic, InputMeter())
         meter.count += 1
         meter.longest_wait_s = max(meter.longest_wait_s, waited_s)
-        if delay_s is not None and abs(delay_s) < STALE_DELAY_S:
+        if delay_s is not None and abs(delay_s) < LIVE_S:
             meter.delays_s.append(delay_s)
 
     def lost(self, topic: str, count: int) -> None:
@@ -169,19 +172,19 @@ class Health:
 
     def found(self, about: str, level: Level, text: str, lasts_s: float) -> None:
         """Note a problem; it is over when it is not found again for a while."""
-        self._problems[about] = Problem(level, text, self._clock_s() + lasts_s)
+        self.problems[about] = Problem(level, text, self._clock_s() + lasts_s)
 
     def over(self, about: str) -> None:
         """Note that a problem is over."""
-        self._problems.pop(about, None)
+        self.problems.pop(about, None)
 
     def summary(self, state: str) -> tuple[Level, str, dict[str, str]]:
         """Return level, words and values for the time since the last summary. state: of the node,
         in words.
         """
         now_s = self._clock_s()
-        self._problems = {k: p for k, p in self._problems.items() if p.until_s > now_s}
-        problems = sorted(self._problems.values(), key=lambda p: -ORDER.index(p.level))
+        self.problems = {k: p for k, p in self.problems.items() if p.until_s > now_s}
+        problems = sorted(self.problems.values(), key=lambda p: -ORDER.index(p.level))
         level = problems[0].level if problems else Level.OK
         words = '; '.join(p.text for p in problems) or self._state or 'waiting for messages'
         values = {'state': state, **{name: str(count) for name, count in self._counts.items()}}

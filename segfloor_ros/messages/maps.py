@@ -14,8 +14,8 @@ from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.saved_map import FORMAT, MapFile, from_bytes, to_bytes
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.map_file import FORMAT, MapFile, from_bytes, to_bytes
 from segfloor_ros.messages.topics import make_header, to_ns, to_time
 from segfloor_ros.slam.results import KeyframeFeatures, MovingPoints, SparseCloud
 

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Imu
 
 from segfloor_ros.camera.images import NOT_MEASURED
+from segfloor_ros.camera.model import ImuSample, WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, invert, make_transform, se3_log
-from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.topics import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
 

@@ -47,6 +47,10 @@ PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 
 NS_PER_S = 1_000_000_000
 
+PATIENCE_S = 10.0
+"""What is under way between nodes and has not come for so long, is lost: a frame, a keyframe, the
+part of a map, the answer of a service."""
+
 
 def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)

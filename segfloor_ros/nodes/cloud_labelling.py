@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
-from segfloor_ros.map_file import MapFile
+from segfloor_ros.files.saved_map import MapFile
 from segfloor_ros.messages import maps as clouds
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
@@ -38,7 +38,7 @@ class RobotCheck:
         self._node, self._other = node, other
         client = node.create_client(GetParameters, f'{other}/get_parameters')
         self._client = client
-        node.at_clean_up(lambda: node.destroy_client(client))
+        node.outputs.at_clean_up(lambda: node.destroy_client(client))
         self._asked: Future | None = None
         self._theirs: dict[str, Any] = {}
 
@@ -71,15 +71,14 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     def set_up(self) -> None:
         """Make the topics."""
         self._robot_check = RobotCheck(self, 'floor_segmentation')
-        self._labelled = self.output('labelled_points')
+        self._labelled = self.outputs.publisher('labelled_points')
         self._by_label = {
-            FLOOR: self.output('floor_points'),
-            OBSTACLE: self.output('obstacle_points'),
+            FLOOR: self.outputs.publisher('floor_points'),
+            OBSTACLE: self.outputs.publisher('obstacle_points'),
         }
         keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
         self._part = MapPart(self, keyframes, 'cloud', lambda: self._stage.to_arrays())
         self.inputs.subscribe('odometry', self._keep_alive, is_wanted=self._obstacles_are_wanted)
-        self.inputs.every(KEEP_ALIVE_S, self.inputs.update)
 
     def reset_stage(self) -> None:
         """Begin without points."""

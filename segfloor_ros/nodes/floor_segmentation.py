@@ -28,10 +28,6 @@ from segfloor_ros.messages.topics import FRAME_PARTS, KEYFRAME_PARTS, MOVING_MAS
 from segfloor_ros.nodes.shared.maps import KeyframeJoin
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
-from segfloor_ros.nodes.shared.when_idle import WhenIdle
-
-LOOK_FOR_LISTENERS_S = 0.5
-CAPACITY = 10
 
 POSE = 'keyframe/odometry'
 
@@ -46,11 +42,10 @@ class FreeScan:
     def __init__(self, node: AnyStageNode, mount: Callable[[], tuple[str, Mount] | None]) -> None:
         self._node = node
         self._mount = mount
-        self._output = node.output('scan')
-        self._work = WhenIdle(node, self._process)
+        self._output = node.outputs.publisher('scan')
+        self._work = node.inputs.later(self._process)
         self.reset()
-        node.inputs.join(FRAME_PARTS, self._take, is_wanted=self._is_wanted, capacity=CAPACITY)
-        node.inputs.every(LOOK_FOR_LISTENERS_S, node.inputs.update)
+        node.inputs.join(FRAME_PARTS, self._take, is_wanted=self._is_wanted, takes_all=True)
 
     def reset(self) -> None:
         """Begin without a camera."""
@@ -63,7 +58,7 @@ class FreeScan:
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         self._newest = stamp_ns, parts
-        self._work.request()
+        self._work()
 
     def _process(self) -> None:
         newest, self._newest = self._newest, None
@@ -93,14 +88,14 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
 
     def set_up(self) -> None:
         """Make the topics."""
-        self._mount: Mount | None = None
+        self.mount: Mount | None = None
         self._mount_stamp_ns = 0
         self._base_frame = ''
-        self._disparity = self.output('keyframe/disparity')
-        self._overlay = self.output('keyframe/floor_overlay')
-        self._v_disparity = self.output('keyframe/v_disparity')
-        self._mask = self.output('keyframe/floor_mask')
-        self._scan = self.output('keyframe/floor_scan')
+        self._disparity = self.outputs.publisher('keyframe/disparity')
+        self._overlay = self.outputs.publisher('keyframe/floor_overlay')
+        self._v_disparity = self.outputs.publisher('keyframe/v_disparity')
+        self._mask = self.outputs.publisher('keyframe/floor_mask')
+        self._scan = self.outputs.publisher('keyframe/floor_scan')
         self._free_scan = FreeScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (*KEYFRAME_PARTS, POSE)
@@ -122,31 +117,31 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
             self._stage.change_settings(self.settings)
 
     def _take_mount(self, message: TransformStamped) -> None:
-        self._mount = Mount.from_transform(transform_array(message))
+        self.mount = Mount.from_transform(transform_array(message))
         self._mount_stamp_ns = to_ns(message.header.stamp)
         self._base_frame = message.header.frame_id
         self._keyframes.process_waiting()
 
     def _known_mount(self) -> tuple[str, Mount] | None:
-        if self._mount is None or not self._has_mount():
+        if self.mount is None or not self._has_mount():
             return None
-        return self._base_frame, self._mount
+        return self._base_frame, self.mount
 
     def _has_mount(self) -> bool:
         """Whether the mount is known, of the map that the keyframes belong to: it travels on a
         topic of its own and may come a moment later.
         """
         map_start_ns = self._keyframes.map_start_ns
-        return self._mount is not None and map_start_ns in (None, self._mount_stamp_ns)
+        return self.mount is not None and map_start_ns in (None, self._mount_stamp_ns)
 
     def _segment(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
-        assert self._mount is not None
+        assert self.mount is not None
         camera, left, right = _stereo(parts, KEYFRAME_PARTS)
         stage = self._stage_for(camera)
         frame_id = parts[KEYFRAME_PARTS[0]].header.frame_id
         T_map_base = pose_array(parts[POSE].pose.pose)
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
-        floor = stage.process(left, right, self._mount, T_map_base, moving)
+        floor = stage.process(left, right, self.mount, T_map_base, moving)
         self._mask.publish(image_message(stamp_ns, frame_id, floor.mask))
         self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
         if self._disparity.get_subscription_count():
@@ -180,8 +175,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         if self._stage is None or camera != self._camera:
             self._camera = camera
             self._stage = FloorSegmentation(camera, self.settings)
-            assert self._mount is not None
-            self._mount_check = self._mount_check or MountCheck(camera, self._mount)
+            assert self.mount is not None
+            self._mount_check = self._mount_check or MountCheck(camera, self.mount)
         return self._stage
 
 

@@ -11,9 +11,9 @@ from rclpy.timer import Timer
 
 from segfloor_ros.configuration import OccupancyGridNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
+from segfloor_ros.files.saved_map import MapFile
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.images import scan_arrays
 from segfloor_ros.messages.maps import features_arrays, grid_message, labelled_arrays
 from segfloor_ros.messages.poses import path_arrays
@@ -34,11 +34,11 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
     def set_up(self) -> None:
         """Make the topics and the service."""
         self._later: Timer | None = None
-        self._map = self.output('map')
+        self._map = self.outputs.publisher('map')
         parts = (POINTS, FEATURES, PATH, POSE, SCAN)
         self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
         self._part = MapPart(self, self._keyframes, 'grid', lambda: self._stage.to_arrays())
-        self.offer_trigger('save_map', self._save)
+        self.outputs.trigger('save_map', self._save)
 
     def reset_stage(self) -> None:
         """Begin with an empty map."""

@@ -26,26 +26,19 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.rig_check import InputFault
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
-from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.diagnostics import LIVE_S, RECENT, Level
 from segfloor_ros.messages.images import same_calibration
-from segfloor_ros.messages.topics import IMAGES, NS_PER_S, best_effort
-from segfloor_ros.nodes.shared.reporter import offered_best_effort
+from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, best_effort
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
+from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S, offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
-
-MAX_KEPT = 100
-"""Pairs that are kept while calibration or mount are not known."""
 
 CATCH_UP = 0.2
 """Of so many of the pairs kept one is skipped per pair processed, where there is no other way."""
 
 INFOS = ('left/camera_info', 'right/camera_info')
 
-MAX_UNPAIRED = 30
-
 DEPTH = 'depth/image_raw'
-
-DISCOVERY_S = 4.0
-"""Publishers of one driver are seen one after the other, the last ones after so long."""
 
 
 Pair = dict[str, Any]
@@ -53,12 +46,9 @@ Pair = dict[str, Any]
 
 StampedPair = tuple[int, Pair]
 
-RECENT = 10
 SILENT_S = 3.0
-LIVE_NS = 60 * NS_PER_S
-FAULT_LASTS_S = 30.0
-PLAUSIBLE_ROLL_DEG = 20.0
-PLAUSIBLE_PITCH_DEG = 60.0
+PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
+"""Beyond these a mount that was measured is hard to believe."""
 
 
 class PairQueue(deque[StampedPair]):
@@ -68,7 +58,7 @@ class PairQueue(deque[StampedPair]):
 
     def __init__(self) -> None:
         super().__init__()
-        self._allowed: float = MAX_KEPT
+        self._allowed: float = KEYFRAMES.depth
 
     def skip_overdue(self, is_ready: bool, least: int) -> list[StampedPair]:
         """Take out the oldest pairs that are too many and return them. is_ready: processing has
@@ -83,7 +73,7 @@ class PairQueue(deque[StampedPair]):
 
     def reset(self) -> None:
         """Keep many pairs again, as at the start."""
-        self._allowed = MAX_KEPT
+        self._allowed = KEYFRAMES.depth
 
 
 @dataclass(frozen=True)
@@ -114,21 +104,16 @@ def _kinds(use_depth: bool) -> list[Kind]:
 
 
 class StereoInput:
-    """Receives images and calibrations, pairs them by stamp and rectifies them.
-
-    on_pair: gets every pair. on_calibration: called when a calibration has come.
+    """Receives images and calibrations, pairs them by stamp, keeps the pairs until they are
+    processed, and rectifies them. on_news: called when a pair or a calibration has come.
     """
 
-    def __init__(
-        self,
-        node: AnyStageNode,
-        own: StereoSlamNodeSettings,
-        on_pair: Callable[[int, Pair], None],
-        on_calibration: Callable[[], None],
-    ) -> None:
+    def __init__(self, node: AnyStageNode, on_news: Callable[[], None]) -> None:
+        own: StereoSlamNodeSettings = node.settings
         self._node = node
         self._own = own
-        self._on_calibration = on_calibration
+        self._on_news = on_news
+        self.pairs = PairQueue()
         self._infos: dict[str, CameraInfo] = {}
         self._eyes: dict[str, EyeCalibration] = {}
         self._takes_best_effort = own.image_reliability == 'best_effort'
@@ -138,28 +123,32 @@ class StereoInput:
             if own.image_kind in ('auto', kind.image)
             and own.image_transport in ('auto', kind.transport)
         ]
-        self.watch = CameraWatch(node, own)
+        self.watch = CameraWatch(node)
         self.reset()
         self._choose(self._kinds[0])
         for info in INFOS:
-            node.inputs.subscribe(info, partial(self._take_info, info), self._choose_profile)
+            take = partial(self._take_info, info)
+            node.inputs.subscribe(info, take, self._choose_profile, takes_all=True)
+        # What waits for a partner, and a whole queue that is taken at once, find room.
         for kind in self._kinds:
-            self._join_images(kind, on_pair)
+            node.inputs.join(
+                (kind.left, kind.right),
+                self._take_pair,
+                on_message=self.watch.saw_image,
+                choose_profile=self._choose_profile,
+                is_wanted=partial(self._is_chosen, kind),
+                takes_all=True,
+                capacity=2 * IMAGES.depth,
+                tolerance_ns=round(own.sync_tolerance_s * 1e9),
+            )
 
-    def _join_images(self, kind: Kind, on_pair: Callable[[int, Pair], None]) -> None:
-        def take(stamp_ns: int, pair: Pair) -> None:
-            self._is_settled = True
-            on_pair(stamp_ns, pair)
+    def _is_chosen(self, kind: Kind) -> bool:
+        return self._kind == kind
 
-        self._node.inputs.join(
-            (kind.left, kind.right),
-            take,
-            on_message=self.watch.saw_image,
-            choose_profile=self._choose_profile,
-            is_wanted=lambda: self._kind == kind,
-            capacity=MAX_UNPAIRED,
-            tolerance_ns=round(self._own.sync_tolerance_s * 1e9),
-        )
+    def _take_pair(self, stamp_ns: int, pair: Pair) -> None:
+        self._is_settled = True
+        self.pairs.append((stamp_ns, pair))
+        self._on_news()
 
     def _choose(self, kind: Kind) -> None:
         self._kind = kind
@@ -169,6 +158,7 @@ class StereoInput:
 
     def reset(self) -> None:
         """Take over the latest calibration with the next pair, and whatever images come."""
+        self.pairs.reset()
         self._is_settled = False
         self._depth_seen_s = 0.0
         self._rectifier: StereoRectifier | None = None
@@ -280,10 +270,9 @@ class StereoInput:
         self._eyes[topic] = eye_calibration(message, topic)
         self._infos[topic] = message
         if self._rectifier is not None:
-            self._node.reporter.warn(
-                f'{topic}: the calibration is not the one in use; ~/reset takes it over'
-            )
-        self._on_calibration()
+            text = f'{topic}: the calibration is not the one in use; ~/reset takes it over'
+            self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=EVENT_LASTS_S)
+        self._on_news()
 
 
 class CameraWatch:
@@ -291,9 +280,8 @@ class CameraWatch:
     floor, and says what is wrong in the images.
     """
 
-    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+    def __init__(self, node: AnyStageNode) -> None:
         self._node = node
-        self._own = own
 
     def expect(self, left: str, right: str) -> None:
         """Watch these two topics from now on."""
@@ -306,7 +294,7 @@ class CameraWatch:
         self._stamps[topic].append(stamp_ns)
         now_ns = self._node.get_clock().now().nanoseconds
         self._last_image_s[topic] = 1e-9 * now_ns
-        self._is_live = abs(now_ns - stamp_ns) < LIVE_NS
+        self._is_live = abs(now_ns - stamp_ns) < 1e9 * LIVE_S
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
         """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
@@ -324,6 +312,7 @@ class CameraWatch:
             f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
             'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
             'play a recording with lossless set on stereo_camera',
+            lasts_s=EVENT_LASTS_S,
         )
 
     def find_problems(self, missing_infos: list[str]) -> None:
@@ -343,7 +332,7 @@ class CameraWatch:
         """Diagnose what was found in the images."""
         for fault in faults:
             text = fault.line(' and '.join(self._stamps))
-            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, FAULT_LASTS_S)
+            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, EVENT_LASTS_S)
 
     def judge_measured(self, mount: Mount) -> None:
         """Say so where the mount that was measured from the floor is hard to believe."""
@@ -390,11 +379,12 @@ class CameraWatch:
         if not both_come or len(left) < RECENT or len(right) < RECENT:
             return
         gap_ns = median(min(abs(stamp - other) for other in right) for stamp in left)
-        if gap_ns > 1e9 * self._own.sync_tolerance_s:
+        tolerance_s = self._node.settings.sync_tolerance_s
+        if gap_ns > 1e9 * tolerance_s:
             self._node.reporter.diagnose(
                 'stamps',
                 f'the stamps of {" and ".join(self._stamps)} are {1e-6 * gap_ns:.1f} ms apart, '
-                f'more than sync_tolerance_s = {self._own.sync_tolerance_s:g} s: no pairs; trigger '
+                f'more than sync_tolerance_s = {tolerance_s:g} s: no pairs; trigger '
                 'both cameras together, or allow more',
                 Level.ERROR,
             )

@@ -11,13 +11,13 @@ from rclpy.task import Future
 from rclpy.timer import Timer
 from std_msgs.msg import UInt8MultiArray
 
-from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.map_file import MapFile, read_map_file, write_map_file
+from segfloor_ros.files.saved_map import MapFile, read_map_file, write_map_file
 from segfloor_ros.messages.maps import map_file_message, map_file_of
-from segfloor_ros.messages.topics import MAP_LOADED, MAP_PART, MAP_WANTED, make_header
+from segfloor_ros.messages.topics import MAP_LOADED, MAP_PART, MAP_WANTED, PATIENCE_S, make_header
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.nodes.slam_outputs import SlamTopics
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -25,34 +25,30 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 PARTS = {'cloud', 'grid'}
 """What the nodes behind know of a map."""
 
-PARTS_S = 10.0
-"""For how long is waited for it: the last keyframe must reach the grid."""
-
-Known = tuple[StereoSlam, StereoCamera, int]
-"""What is saved: SLAM, its camera, and when the map was begun."""
-
 
 class SlamMaps:
     """The services `~/save_map` and `~/load_map`, and what SLAM and the nodes behind it tell each
     other about maps of files.
 
-    known: returns what could be saved. on_load: begins again with the map of `load_map`.
+    slam: returns what could be saved, of the map that `topics` are about.
     """
 
     def __init__(
-        self, node: AnyStageNode, known: Callable[[], Known | None], on_load: Callable[[], None]
+        self, node: AnyStageNode, topics: SlamTopics, slam: Callable[[], StereoSlam | None]
     ) -> None:
         self._node = node
-        self._known = known
-        self._on_load = on_load
+        self._topics = topics
+        self._slam = slam
+        self.loaded: tuple[MapFile, LoadedMap] | None = None
+        """What was read of a file and is still to be announced."""
         self._kept_ns: int | None = None
         self._parts: dict[str, MapFile] = {}
         self._arrived: Future | None = None
-        self._loaded = node.output(MAP_LOADED)
-        self._wanted = node.output(MAP_WANTED)
+        self._loaded_output = node.outputs.publisher(MAP_LOADED)
+        self._wanted = node.outputs.publisher(MAP_WANTED)
         node.inputs.subscribe(MAP_PART, self._take_part)
-        node.offer_trigger('~/save_map', self._save)
-        node.offer_trigger('~/load_map', self._load)
+        node.outputs.trigger('~/save_map', self._save)
+        node.outputs.trigger('~/load_map', self._load)
 
     @property
     def _own(self) -> StereoSlamNodeSettings:
@@ -61,7 +57,7 @@ class SlamMaps:
 
     def read(self) -> MapFile | None:
         """Return the map of the parameter `load_map`, None where it is empty. Raises InputError."""
-        name = self._own.load_map
+        self.loaded, name = None, self._own.load_map
         return read_map_file(Path(name).expanduser()) if name else None
 
     def keep(self, slam: StereoSlam) -> None:
@@ -71,8 +67,12 @@ class SlamMaps:
             self._node.kept_state.save(self._slam_part)
             self._kept_ns = last_ns
 
-    def announce(self, saved: MapFile, loaded: LoadedMap, start_ns: int) -> None:
-        """Tell the nodes behind what they need of a map that was loaded. start_ns: of the map."""
+    def announce(self) -> None:
+        """Send the nodes behind what they need of a map that was loaded."""
+        if self.loaded is None:
+            return
+        (saved, loaded), self.loaded = self.loaded, None
+        start_ns = self._topics.map_start_ns
         header = {
             'start_ns': start_ns,
             'loaded_ns': start_ns,
@@ -85,21 +85,20 @@ class SlamMaps:
             'grid': grid | {'stamp_ns': grid['stamp_ns'] + loaded.shift_ns},
             'points': {'point_id': cloud.point_id, 'xyz_map': cloud.xyz_map},
         }
-        self._loaded.publish(map_file_message(MapFile(header, parts)))
+        self._loaded_output.publish(map_file_message(MapFile(header, parts)))
 
     def _slam_part(self) -> MapFile:
-        known = self._known()
-        if known is None:
+        slam = self._slam()
+        if slam is None:
             raise MapError('there is no map yet that could be saved')
-        slam, camera, start_ns = known
-        saved = save_slam(slam, camera)
-        saved.header['start_ns'] = start_ns
+        saved = save_slam(slam, slam.rig.camera)
+        saved.header['start_ns'] = self._topics.map_start_ns
         return saved
 
     def _load(self) -> str:
         if not self._own.load_map:
             raise SettingsError('load_map is empty; set it to the name of a saved map')
-        self._on_load()
+        self._node.reset('by ~/load_map')
         return self._own.load_map
 
     async def _save(self) -> str:
@@ -115,7 +114,7 @@ class SlamMaps:
         start_ns = saved.header.pop('start_ns')
         self._parts = {}
         self._arrived = Future()
-        give_up = self._node.inputs.steady_timer(PARTS_S, self._give_up)
+        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
         self._wanted.publish(make_header(last_ns, self._own.map_frame))
         try:
@@ -131,8 +130,8 @@ class SlamMaps:
 
     def _refuse_to_overwrite(self, path: Path) -> None:
         """Raise MapError where a map would be replaced that the drive has not recognised."""
-        known, load_map = self._known(), self._own.load_map
-        is_outside = known is not None and known[0].back_end.submap is Submap.OUTSIDE
+        slam, load_map = self._slam(), self._own.load_map
+        is_outside = slam is not None and slam.back_end.submap is Submap.OUTSIDE
         if is_outside and load_map and Path(load_map).expanduser().resolve() == path.resolve():
             raise MapError(
                 f'{path}: stays as it was, since no place of it was recognised; set save_map to '
@@ -148,8 +147,8 @@ class SlamMaps:
         if self._arrived is not None and not self._arrived.done():
             missing = ', '.join(sorted(PARTS - self._parts.keys()))
             text = (
-                f'the map is not saved: within {PARTS_S:g} s no answer on {MAP_PART} of the part '
-                f'{missing}; are cloud_labelling and occupancy_grid active?'
+                f'the map is not saved: within {PATIENCE_S:g} s no answer on {MAP_PART} of the '
+                f'part {missing}; are cloud_labelling and occupancy_grid active?'
             )
             self._arrived.set_exception(MapError(text))
 

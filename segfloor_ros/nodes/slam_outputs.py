@@ -1,59 +1,39 @@
-"""What the node `stereo_slam` publishes about a frame and about a keyframe, and for how long
-tracking has been lost.
-"""
+"""What the node `stereo_slam` publishes about a frame and about a keyframe, and when."""
 
 from __future__ import annotations
 
+import json
+import math
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
-from segfloor_ros.camera.model import Mount
+from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.messages import maps as clouds
 from segfloor_ros.messages import poses
+from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.maps import map_start_message
 from segfloor_ros.messages.topics import MAP_START, MOVING_MASK
+from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
+from segfloor_ros.nodes.shared.transforms import Transforms
+from segfloor_ros.nodes.slam_camera import CameraWatch
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe
+from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SIDES = ('left', 'right')
 
+MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
+
 LEAST_VARIANCE = 1e-6
 """Of a millimetre and a milliradian, in m² and rad²: the first pose is the origin by definition."""
-
-Pair = tuple[NDArray[np.uint8], NDArray[Any]]
-
-
-class LostTime:
-    """Measures by the stamps of the frames."""
-
-    def __init__(self, node: AnyStageNode) -> None:
-        self._node = node
-        self._since_ns: int | None = None
-
-    def lost_s(self, stamp_ns: int) -> float:
-        """Return for how long tracking has been lost, in s."""
-        return 0.0 if self._since_ns is None else 1e-9 * (stamp_ns - self._since_ns)
-
-    def note(self, stamp_ns: int, tracked: bool) -> dict[str, str]:
-        """Note a frame; returns values for its status: for how long tracking has been lost, or,
-        where it was found again, after how long.
-        """
-        if not tracked:
-            self._since_ns = stamp_ns if self._since_ns is None else self._since_ns
-            return {'lost_s': f'{self.lost_s(stamp_ns):.2f}'}
-        lost_s, was_lost = self.lost_s(stamp_ns), self._since_ns is not None
-        self._since_ns = None
-        if not was_lost:
-            return {}
-        self._node.get_logger().info(f'tracking again, after {lost_s:.2f} s')
-        return {'recovered_after_s': f'{lost_s:.2f}'}
 
 
 @dataclass(frozen=True)
@@ -64,25 +44,26 @@ class CameraFrames:
     right: str
 
 
-class SlamOutputs:
-    """The publishers of stereo SLAM."""
+class SlamTopics:
+    """The publishers of stereo SLAM, of the camera that it has begun with."""
 
-    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
-        self._own = own
-        self._odometry = node.output('odometry')
-        self._map_pose = node.output('pose')
-        self._mount = node.output('camera_mount')
-        self._pose = node.output('keyframe/odometry')
-        self._images = {s: node.output(f'keyframe/{s}/image_rect') for s in SIDES}
-        self._infos = {s: node.output(f'keyframe/{s}/camera_info') for s in SIDES}
-        self._frame_images = {s: node.output(f'frame/{s}/image_rect') for s in SIDES}
-        self._frame_infos = {s: node.output(f'frame/{s}/camera_info') for s in SIDES}
-        self._features = node.output('keyframe/features')
-        self._path = node.output('keyframe/path')
-        self._map_points = node.output('map_points')
-        self._moving_points = node.output('moving_points')
-        self._moving_mask = node.output(MOVING_MASK)
-        self._map_start = node.output(MAP_START)
+    def __init__(self, node: AnyStageNode) -> None:
+        self._own: StereoSlamNodeSettings = node.settings
+        publisher = node.outputs.publisher
+        self._odometry = publisher('odometry')
+        self._map_pose = publisher('pose')
+        self._mount = publisher('camera_mount')
+        self._pose = publisher('keyframe/odometry')
+        self._images = {s: publisher(f'keyframe/{s}/image_rect') for s in SIDES}
+        self._infos = {s: publisher(f'keyframe/{s}/camera_info') for s in SIDES}
+        self._frame_images = {s: publisher(f'frame/{s}/image_rect') for s in SIDES}
+        self._frame_infos = {s: publisher(f'frame/{s}/camera_info') for s in SIDES}
+        self._features = publisher('keyframe/features')
+        self._path = publisher('keyframe/path')
+        self._map_points = publisher('map_points')
+        self._moving_points = publisher('moving_points')
+        self._moving_mask = publisher(MOVING_MASK)
+        self._map_start = publisher(MAP_START)
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
         self._is_loaded = False
@@ -94,21 +75,21 @@ class SlamOutputs:
         self._is_loaded = is_loaded
         self._last: FrameResult | None = None
         self._path_messages = poses.PathMessages(self._own.map_frame)
+        self.frames = CameraFrames('', '')
 
-    def publish_mount(self, frames: CameraFrames, mount: Mount) -> None:
+    def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
+        """Publish about this camera from now on. calibration: of the rectified images."""
+        self._calibration, self.frames = calibration, frames
+
+    def publish_mount(self, mount: Mount) -> None:
         """Publish where the left camera sits on the base; the stamp tells for which map."""
-        base, T_base_left = self._own.base_frame, mount.T_base_left
+        base, left = self._own.base_frame, self.frames.left
         self._mount.publish(
-            poses.transform_message(self.map_start_ns, base, frames.left, T_base_left)
+            poses.transform_message(self.map_start_ns, base, left, mount.T_base_left)
         )
 
-    def publish(
-        self, result: FrameResult, calibration: StereoCalibration, frames: CameraFrames
-    ) -> None:
-        """Publish a frame's pose and, of a keyframe, everything; a frame without pose is silence.
-
-        calibration: of the rectified images.
-        """
+    def publish(self, result: FrameResult) -> None:
+        """Publish a frame's pose, none while there is none, and everything of a keyframe."""
         if result.tracked:
             self._publish_odometry(result)
         if result.moving is not None:
@@ -116,22 +97,21 @@ class SlamOutputs:
             message = clouds.moving_points_message(result.stamp_ns, frame_id, result.moving)
             self._moving_points.publish(message)
         if result.keyframe is not None:
-            self._publish_keyframe(result, result.keyframe, calibration, frames)
+            self._publish_keyframe(result, result.keyframe)
         self._last = result
 
-    def publish_frame(
-        self, stamp_ns: int, pair: Pair, calibration: StereoCalibration, frames: CameraFrames
-    ) -> None:
-        """Publish the rectified images (H, W) of a tracked frame, shrunk, while someone listens."""
+    def publish_frame(self, frame: StereoFrame) -> None:
+        """Publish the rectified images of a tracked frame, shrunk, while someone listens."""
         if not any(output.get_subscription_count() for output in self._frame_images.values()):
             return
-        factor = shrink_factor(calibration.camera)
-        small = rectified_calibration(shrunk_camera(calibration.camera, factor))
-        for side, image, eye in zip(SIDES, pair, (small.left, small.right), strict=True):
-            frame_id = getattr(frames, side)
-            self._frame_infos[side].publish(camera_info_message(stamp_ns, frame_id, eye))
-            message = image_message(stamp_ns, frame_id, shrunk_image(image, factor))
-            self._frame_images[side].publish(message)
+        camera = self._calibration.camera
+        factor = shrink_factor(camera)
+        small = rectified_calibration(shrunk_camera(camera, factor))
+        for side in SIDES:
+            at = frame.stamp_ns, getattr(self.frames, side)
+            image = shrunk_image(getattr(frame, side), factor)
+            self._frame_infos[side].publish(camera_info_message(*at, getattr(small, side)))
+            self._frame_images[side].publish(image_message(*at, image))
 
     def _publish_odometry(self, result: FrameResult) -> None:
         last, twist, of_twist = self._last, None, None
@@ -161,22 +141,15 @@ class SlamOutputs:
             )
         )
 
-    def _publish_keyframe(
-        self,
-        result: FrameResult,
-        keyframe: Keyframe,
-        calibration: StereoCalibration,
-        frames: CameraFrames,
-    ) -> None:
+    def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
         stamp_ns, own = keyframe.stamp_ns, self._own
-        eyes = {
-            'left': (frames.left, keyframe.left, calibration.left),
-            'right': (frames.right, keyframe.right, calibration.right),
-        }
-        for side, (frame_id, image, eye) in eyes.items():
-            self._infos[side].publish(camera_info_message(stamp_ns, frame_id, eye))
-            self._images[side].publish(image_message(stamp_ns, frame_id, image))
-        self._moving_mask.publish(image_message(stamp_ns, frames.left, _mask(keyframe)))
+        for side in SIDES:
+            at = stamp_ns, getattr(self.frames, side)
+            info = camera_info_message(*at, getattr(self._calibration, side))
+            self._infos[side].publish(info)
+            self._images[side].publish(image_message(*at, getattr(keyframe, side)))
+        moving = np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
+        self._moving_mask.publish(image_message(stamp_ns, self.frames.left, moving))
         self._pose.publish(
             poses.odometry_message(
                 stamp_ns,
@@ -197,6 +170,109 @@ class SlamOutputs:
         )
 
 
-def _mask(keyframe: Keyframe) -> NDArray[np.uint8]:
-    """Return what moves in a keyframe, (H, W), also where it is nothing."""
-    return np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
+class SlamResults:
+    """Publishes what SLAM has found out about frames, and reports how it went: one by one, since
+    others need time to take each of them.
+    """
+
+    def __init__(self, node: AnyStageNode, transforms: Transforms, watch: CameraWatch) -> None:
+        self.topics = SlamTopics(node)
+        self._node = node
+        self._transforms = transforms
+        self._watch = watch
+        self._unsent: deque[tuple[FrameResult, StereoSlam, float]] = deque()
+        node.inputs.repeat(self._send_next)
+
+    def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
+        """Publish about another map from now on, of a camera whose mount is not known."""
+        self.topics.reset(map_start_ns, is_loaded)
+        self._unsent.clear()
+        self._provisional_ns = -1
+        self._lost_since_ns: int | None = None
+        self.mount: Mount | None = None
+
+    def add(self, results: Sequence[FrameResult], slam: StereoSlam, milliseconds: float) -> None:
+        """Have results published, at once where there is one. milliseconds: that all took."""
+        self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
+        if len(self._unsent) == 1:
+            self._send_next()
+
+    def report_held(self, stamp_ns: int, slam: StereoSlam) -> None:
+        """Report why no result is ready. While the mount is being measured, and by a drive that was
+        broken off, the newest pose is published: it is corrected once, when keyframes come.
+        """
+        result, reporter = slam.provisional, self._node.reporter
+        if result is not None:
+            self._provisional_ns = stamp_ns
+            self._transforms.broadcast(result)
+            self.topics.publish(result)
+        if slam.back_end.submap is Submap.LOST:
+            lost = self._lost_time(stamp_ns, tracked=False)
+            reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
+            return
+        words = 'pose with a provisional mount: the floor is not seen well enough to measure it yet'
+        reporter.report_waiting(stamp_ns, words, input_faults=_faults_json(slam))
+
+    def _send_next(self) -> float:
+        """Publish the oldest result that is not yet; return in how many seconds the next is due."""
+        if self._unsent:
+            self._publish(*self._unsent.popleft())
+        return LEAST_PERIOD_S if self._unsent else LOOK_S
+
+    def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
+        if self.mount is None and result.tracked and slam.mount is not None:
+            self._announce_mount(result.stamp_ns, slam.mount)
+        # What a robot steers by comes first, the images of a keyframe later.
+        if result.stamp_ns > self._provisional_ns:
+            self._transforms.broadcast(result)
+        self.topics.publish(result)
+        level = Level.WARN if result.blind else Level.OK if result.tracked else Level.ERROR
+        self._node.reporter.report_processed(
+            result.stamp_ns,
+            level,
+            result.state,
+            milliseconds,
+            tracked=int(result.tracked),
+            loops=slam.back_end.loop_count,
+            keyframe=int(result.keyframe is not None),
+            matches=result.num_matches,
+            reference_keyframe_ns=result.reference_keyframe_ns,
+            **self._lost_time(result.stamp_ns, result.tracked),
+            moving=len(result.moving.xyz_map) if result.moving is not None else 0,
+            blind=int(result.blind),
+            submap=int(result.in_submap),
+            repeated=int(result.repeated and result.tracked),
+            input_faults=_faults_json(slam),
+            remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
+        )
+
+    def _lost_time(self, stamp_ns: int, tracked: bool) -> dict[str, str]:
+        """Return values for the status of a frame: for how long tracking has been lost, or, where
+        it was found again, after how long.
+        """
+        since_ns = self._lost_since_ns
+        lost_s = 0.0 if since_ns is None else 1e-9 * (stamp_ns - since_ns)
+        if not tracked:
+            self._lost_since_ns = stamp_ns if since_ns is None else since_ns
+            return {'lost_s': f'{lost_s:.2f}'}
+        self._lost_since_ns = None
+        if since_ns is None:
+            return {}
+        self._node.get_logger().info(f'tracking again, after {lost_s:.2f} s')
+        return {'recovered_after_s': f'{lost_s:.2f}'}
+
+    def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
+        self.mount = mount
+        self._node.get_logger().info(
+            f'camera {mount.height_m:.3f} m above the floor, pitch '
+            f'{math.degrees(mount.pitch_rad):.2f} deg, roll {math.degrees(mount.roll_rad):.2f} deg'
+        )
+        left = self.topics.frames.left
+        if not self._node.settings.gives_mount and self._transforms.mount(left) is None:
+            self._watch.judge_measured(mount)
+        self.topics.publish_mount(mount)
+        self._transforms.announce_mount(stamp_ns, left, mount)
+
+
+def _faults_json(slam: StereoSlam) -> str:
+    return json.dumps(slam.rig_check.as_dicts())

@@ -19,14 +19,14 @@ from sensor_msgs.msg import Image, Imu
 
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.images import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.camera.model import Measurement, WheelPose
 from segfloor_ros.camera.sources.files import is_upright
-from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.measurements import Measurement, WheelPose
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import SENSORS, best_effort, to_ns
-from segfloor_ros.nodes.shared.reporter import offered_best_effort
+from segfloor_ros.messages.topics import IMAGES, SENSORS, best_effort, to_ns
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
+from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S, offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -41,16 +41,6 @@ NEAR_NS = 5_000_000
 
 LIVE_S = 0.5
 """A sensor that has said nothing for so long is not waited for."""
-
-MAX_WAITING = 500
-TF_AFTER_S = 3.0
-"""A topic is waited for so long before tf is taken for the wheels' odometry: it takes a while to
-connect."""
-
-
-KEPT = 30
-"""Masks that are kept for frames that have not been processed yet."""
-
 
 SIGMAS = 3.0
 
@@ -75,8 +65,8 @@ class SensorInput:
         self._takes_best_effort = False
         self.reset()
         for name in (WHEELS, IMU):
-            receive = partial(self._receive, name)
-            node.inputs.subscribe(name, receive, self._choose_profile, is_rapid=True)
+            receive = partial(self.receive, name)
+            node.inputs.subscribe(name, receive, self._choose_profile, takes_all=True)
 
     def reset(self) -> None:
         """Know no camera and no measurement."""
@@ -84,7 +74,7 @@ class SensorInput:
         self._T_left_imu: Array | None = None
         self._uses_imu = True
         self._waiting: dict[str, deque[Odometry | Imu]] = {
-            name: deque(maxlen=MAX_WAITING) for name in (WHEELS, IMU)
+            name: deque(maxlen=SENSORS.depth) for name in (WHEELS, IMU)
         }
         self._latest: dict[str, tuple[int, float]] = {}
         self._asked: tuple[int, float] = (0, 0.0)
@@ -121,7 +111,7 @@ class SensorInput:
             in_order = sorted(waiting, key=_stamp_ns)
             count = bisect_left(in_order, stamp_ns, key=_stamp_ns) + 1
             yield from in_order[:count]
-            self._waiting[name] = deque(in_order[count:], MAX_WAITING)
+            self._waiting[name] = deque(in_order[count:], SENSORS.depth)
 
     def is_behind(self, stamp_ns: int, lag_ns: int = 0) -> bool:
         """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
@@ -141,7 +131,7 @@ class SensorInput:
     def _look_at_tf(self, now_s: float) -> None:
         """Note how far tf has the base, once it is clear that no topic tells it."""
         until_ns = self._transforms.fused_until_ns()
-        if WHEELS in self._latest or until_ns is None or now_s < self._began_s + TF_AFTER_S:
+        if WHEELS in self._latest or until_ns is None or now_s < self._began_s + DISCOVERY_S:
             return
         self._has_tf_wheels = True
         if until_ns != self._latest.get(TF_WHEELS, (0, 0.0))[0]:
@@ -151,7 +141,8 @@ class SensorInput:
         T_odom_base = self._transforms.fused_base(stamp_ns) if self._has_tf_wheels else None
         return [] if T_odom_base is None else [WheelPose(stamp_ns, T_odom_base)]
 
-    def _receive(self, name: str, message: Odometry | Imu) -> None:
+    def receive(self, name: str, message: Odometry | Imu) -> None:
+        """Take in a message of a topic."""
         if self._has_tf_wheels and name == WHEELS:
             return
         self._waiting[name].append(message)
@@ -212,31 +203,32 @@ class MaskInput:
 
     def reset(self) -> None:
         """Forget the masks."""
-        self._masks: dict[int, Image] = {}
+        self.images: dict[int, Image] = {}
+        """Those that are kept, by stamp."""
 
     def take(self, message: Image) -> None:
         """Keep a mask."""
-        self._masks[to_ns(message.header.stamp)] = message
-        while len(self._masks) > KEPT:
-            del self._masks[min(self._masks)]
+        self.images[to_ns(message.header.stamp)] = message
+        while len(self.images) > IMAGES.depth:
+            del self.images[min(self.images)]
 
     def mask_for(self, stamp_ns: int, rectifier: StereoRectifier) -> NDArray[np.uint8] | None:
         """Return the mask (H, W) uint8 on the rectified left image of a frame, None where there is
         none. Raises InputError for one that is no grey image, CalibrationError for a wrong size.
         """
-        fitting = [at for at in self._masks if stamp_ns - self._timeout_ns <= at <= stamp_ns]
+        fitting = [at for at in self.images if stamp_ns - self._timeout_ns <= at <= stamp_ns]
         if not fitting:
             return None
-        mask = grey8_image(self._masks[max(fitting)], MASKS)
+        mask = grey8_image(self.images[max(fitting)], MASKS)
         return rectifier.rectify_mask(mask)
 
 
 class InitialPose:
     """Narrows the search of the camera in a known map to the surroundings of a pose."""
 
-    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+    def __init__(self, node: AnyStageNode) -> None:
         self._node = node
-        self._map_frame = own.map_frame
+        self._map_frame = node.settings.map_frame
         self.reset()
         node.inputs.subscribe(INITIAL_POSE, self._take)
 
@@ -252,10 +244,9 @@ class InitialPose:
 
     def _take(self, message: PoseWithCovarianceStamped) -> None:
         if message.header.frame_id not in ('', self._map_frame):
-            self._node.reporter.warn(
-                f'{INITIAL_POSE} is in frame {message.header.frame_id}; give it in '
-                f'{self._map_frame}'
-            )
+            its, own = message.header.frame_id, self._map_frame
+            text = f'{INITIAL_POSE} is in frame {its}; give it in {own}'
+            self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=EVENT_LASTS_S)
             return
         T_map_base = pose_array(message.pose.pose)
         sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))

@@ -16,41 +16,36 @@ from rosgraph_msgs.msg import Clock
 
 from segfloor_ros.camera.bag_writer import IMU_FRAME
 from segfloor_ros.camera.images import Grey
-from segfloor_ros.camera.model import SENSORS
+from segfloor_ros.camera.model import (
+    DEPTH,
+    MAX_LAG_S,
+    SENSORS,
+    Measurement,
+    MeasurementLog,
+    WheelPose,
+)
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
-from segfloor_ros.configuration import StereoCameraNodeSettings
+from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, StereoCameraNodeSettings
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.measurements import DEPTH, MAX_LAG_S, Measurement, MeasurementLog, WheelPose
 from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
-from segfloor_ros.messages.topics import FRAMES, PACED_BY, TOPICS, stamp_of, to_time
+from segfloor_ros.messages.topics import FRAMES, PACED_BY, PATIENCE_S, TOPICS, stamp_of, to_time
+from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.reporter import SETTLED_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import TfLink
 
-LOOK_AGAIN_S = 0.05
-"""How often is looked for subscribers, and whether the chain has room: its answers say so too."""
-AFTER_THE_END_S = 1.0
 WAITING = 'waiting'
-
-AHEAD_NS = round(MAX_LAG_S * 1e9)
-"""What sensors measured is sent so far ahead of the images: their stamps may be late."""
 
 MAX_FRAMES_UNDER_WAY = 3
 """Frames that may be between the camera and SLAM: no more than SLAM lets wait before it skips any
 (`max_waiting_frames`), and enough for it to find the next one when it has done with one.
 """
-
-MAX_KEYFRAMES_UNDER_WAY = 4
-"""Keyframes that may be between SLAM and the grid while the next frame is sent."""
-
-PATIENCE_S = 10.0
-"""Seconds without any sign of progress after which what is under way is taken for lost."""
 
 
 class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
@@ -71,25 +66,25 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         kind = 'image_raw/compressed' if self._compressed else 'image_raw'
         self._has_depth = self._source.takes_depth
         sides = ('left',) if self._has_depth else ('left', 'right')
-        self._images = {side: self.output(f'{side}/{kind}') for side in sides}
-        self._infos = {side: self.output(f'{side}/camera_info') for side in sides}
+        self._images = {side: self.outputs.publisher(f'{side}/{kind}') for side in sides}
+        self._infos = {side: self.outputs.publisher(f'{side}/camera_info') for side in sides}
         if self._has_depth:
-            self._images['right'] = self.output('depth/image_raw')
-        self._mask = self.output('dynamic_mask')
+            self._images['right'] = self.outputs.publisher('depth/image_raw')
+        self._mask = self.outputs.publisher('dynamic_mask')
         self._sensors = {
-            sensor.name: self.output(sensor.name)
+            sensor.name: self.outputs.publisher(sensor.name)
             for sensor in self._source.sensors
             if sensor.used and sensor.name in SENSORS
         }
         self._clock_output: Publisher | None = None
         if own.publish_clock:
             clock = self._clock_output = self.create_publisher(Clock, '/clock', FRAMES)
-            self.at_clean_up(lambda: self.destroy_publisher(clock))
+            self.outputs.at_clean_up(lambda: self.destroy_publisher(clock))
         if own.lossless or not own.rate:
             self._follow_chain()
         self.inputs.repeat(self._advance)
-        self.pause(own.start_paused)
-        self.at_clean_up(self._stop_reading)
+        self.states.pause(own.start_paused)
+        self.outputs.at_clean_up(self._stop_reading)
 
     def reset_stage(self) -> None:
         """Begin with the first frame."""
@@ -127,7 +122,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
 
             topic = TOPICS[name]
             made = self.create_subscription(topic.type, name, take, topic.profile)
-            self.at_clean_up(lambda: self.destroy_subscription(made))
+            self.outputs.at_clean_up(lambda: self.destroy_subscription(made))
 
         notes = (ChainPace.frame_done, ChainPace.keyframe_began, ChainPace.keyframe_done)
         for name, note in zip(PACED_BY, notes, strict=True):
@@ -145,7 +140,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         except SegfloorError as error:
             self.reporter.log_fault(self._source.name, error)
             self._finish(Level.ERROR, str(error))
-        return AFTER_THE_END_S if self._finished else LOOK_AGAIN_S
+        return LOOK_S
 
     def _may_play(self) -> bool:
         """Whether somebody listens; a recording that must lose nothing waits whenever nobody
@@ -177,7 +172,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
             )
             return 0.0
         self._log_waiting_for(self._chain_pace.waits_for())
-        return LOOK_AGAIN_S
+        return LOOK_S
 
     def _fetch(self) -> bool:
         """Read the next pair if none is at hand; False at the end of the recording."""
@@ -195,7 +190,8 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         self._wait_no_more()
         if self._clock_output is not None:
             self._clock_output.publish(Clock(clock=to_time(pair.stamp_ns)))
-        for measurement in self._measurements.until(pair.stamp_ns + AHEAD_NS):
+        # What sensors measured is sent ahead of the images: their stamps may be late.
+        for measurement in self._measurements.until(pair.stamp_ns + round(1e9 * MAX_LAG_S)):
             self._send_measurement(measurement)
         mask = self._source.masks.read(pair.index) if self._source.masks is not None else None
         if mask is not None:
@@ -261,7 +257,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
 
     def _log_waiting_for(self, what: str) -> None:
         if what and time.monotonic() - self._waiting_since_s > SETTLED_S:
-            self.reporter.warn(f'waiting for {what}', WAITING, repeat_s=math.inf)
+            self.reporter.diagnose(WAITING, f'waiting for {what}')
 
 
 def main() -> None:

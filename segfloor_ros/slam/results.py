@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoFrame
+from segfloor_ros.camera.model import Mount, StereoFrame, WheelPose
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
-from segfloor_ros.measurements import WheelPose
 
 if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
     from segfloor_ros.slam.map.records import KeyframeRecord

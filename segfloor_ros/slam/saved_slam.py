@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import Mount, StereoCamera, WheelPose
 from segfloor_ros.errors import CalibrationError, InputError, MapError
+from segfloor_ros.files.saved_map import Arrays, MapFile, joined, split
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.map_file import Arrays, MapFile, joined, split
-from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Retirement
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud

@@ -13,11 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig_check import RigCheck
+from segfloor_ros.files.saved_map import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert
-from segfloor_ros.map_file import Arrays
-from segfloor_ros.measurements import Measurement, Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap

@@ -11,7 +11,7 @@ from stereo_drive import room_drive, write_kitti
 
 pytest.importorskip('rclpy')
 
-from segfloor_ros.cli.replay_measured import NodeFigures, figure_rows
+from segfloor_ros.cli.replay_session import NodeFigures, figure_rows
 
 
 def test_the_figures_are_of_the_quarters_after_the_first() -> None:

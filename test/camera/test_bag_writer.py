@@ -12,10 +12,10 @@ from camera_recordings import grey_pairs, opened, sensor_yaml, write_folders, wr
 from rosbags.highlevel import AnyReader
 
 from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, convert
+from segfloor_ros.camera.model import ImuSample, MeasurementLog
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.measurements import ImuSample, MeasurementLog
 
 
 def assert_same_recording(one: StereoSource, other: StereoSource) -> None:

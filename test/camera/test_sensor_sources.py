@@ -19,10 +19,10 @@ from camera_recordings import (
     write_rosbag2,
 )
 
+from segfloor_ros.camera.model import ImuSample, MeasurementLog, WheelPose
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.camera.sources.bag import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
 from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.measurements import ImuSample, MeasurementLog, WheelPose
 
 WHEELS = '# t x y z qx qy qz qw\n0.00 2 0 0 0 0 0 1\n0.05 2.1 0 0 0 0 0.6 0.8\n0.2 3 0 0 0 0 0 1\n'
 IMU = '#timestamp [ns],w x,w y,w z,a x,a y,a z\n' + ''.join(

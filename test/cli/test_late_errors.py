@@ -21,12 +21,17 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 
 from segfloor_ros.camera.bag_writer import convert
-from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.camera.model import (
+    ImuSample,
+    RecordedSensor,
+    StereoCameraSettings,
+    WheelPose,
+    is_sound,
+)
 from segfloor_ros.camera.sources import open_source
+from segfloor_ros.files.saved_map import read_map_file
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.map_file import read_map_file
-from segfloor_ros.measurements import ImuSample, RecordedSensor, WheelPose, is_sound
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.trajectory import read_trajectory
 

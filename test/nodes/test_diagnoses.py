@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from node_messages import cloud_messages, publish
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
@@ -240,6 +241,23 @@ def test_rates_counts_and_state_are_told(make_graph) -> None:
     assert {f'rate_hz {name}' for name in alone} <= values.keys()
     graph.call(SetBool, 'cloud_labelling/pause', SetBool.Request(data=True))
     graph.until(lambda: health(graph, 'cloud_labelling').values['state'] == 'paused', 'the pause')
+
+
+def test_a_problem_is_logged_when_it_begins_and_when_it_is_over(make_graph) -> None:
+    graph = make_graph()
+    node = graph.add(CloudLabellingNode())
+    lines: list[str] = []
+    take = lambda message: lines.append(message.msg)  # noqa: E731
+    graph.tester.create_subscription(Log, '/rosout', take, 100)
+    graph.until(lambda: node.count_subscribers('/rosout'), 'the listener to the log')
+    for _ in range(3):
+        node.reporter.diagnose('light', 'it is dark; switch the light on')
+        graph.comes(lambda: False, 0.3)
+    says(graph, 'cloud_labelling', 'it is dark')
+    graph.until(lambda: 'over: it is dark' in lines, 'the end')
+    assert lines.count('it is dark; switch the light on') == 1
+    node.reporter.diagnose('light', 'it is dark; switch the light on')
+    graph.until(lambda: lines.count('it is dark; switch the light on') == 2, 'the second time')
 
 
 def test_rate_delay_and_problems_are_those_of_the_time() -> None:

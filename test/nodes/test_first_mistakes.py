@@ -32,7 +32,6 @@ GIVEN = (
     '-p', 'camera_roll_rad:=0.0',
 )  # fmt: skip
 CALIBRATION = rectified_calibration(CAMERA)
-CONSOLE_S = 25.0
 
 
 @pytest.fixture
@@ -124,7 +123,7 @@ def test_a_topic_that_nobody_publishes_is_one_short_line_and_its_remedy_a_diagno
     graph.until(line, 'the warning')
     seconds, text = line()[0]
     # Others may be started at the same time, and are seen one after the other.
-    assert SETTLED_S < seconds < CONSOLE_S
+    assert seconds > SETTLED_S
     assert 'left/image_raw' in text
     assert 'right/image_raw' in text
     assert len(text) < 120

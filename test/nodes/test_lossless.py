@@ -79,7 +79,7 @@ def test_a_lossless_camera_waits_while_nobody_listens_and_loses_nothing_then(pla
     graph, listener = play()
     sent = len(listener.stamps)
     listener.turn_away()
-    camera = next(node for node in graph._nodes if node.get_name() == 'stereo_camera')
+    camera = next(node for node in graph.nodes if node.get_name() == 'stereo_camera')
     graph.until(lambda: not camera.count_subscribers('left/image_raw'), 'the pause')
     graph.comes(lambda: False, 0.3)
     listener.listen()

@@ -54,7 +54,7 @@ def test_masks_on_dynamic_mask_keep_features_out_and_come_back_with_the_keyframe
         mask = image_message(frame.stamp_ns, 'left', drive.mask(index))
         inputs = publish(graph, {'dynamic_mask': mask}, inputs)
         stamp_ns = frame.stamp_ns
-        graph.until(lambda stamp_ns=stamp_ns: stamp_ns in node._masks._masks, 'the mask')
+        graph.until(lambda stamp_ns=stamp_ns: stamp_ns in node.masks.images, 'the mask')
         publish(graph, stereo_messages(frame), inputs)
         graph.until(
             lambda stamp_ns=stamp_ns: (

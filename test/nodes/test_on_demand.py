@@ -28,10 +28,10 @@ def test_without_listeners_nothing_is_received(
     graph.be_deaf()
     node = graph.add(make())
     graph.until(lambda: not node.count_subscribers(received), 'the end of the subscription')
-    assert node.state_in_words == 'idle'
+    assert node.states.in_words == 'idle'
     graph.collect(made)
     graph.until(lambda: node.count_subscribers(received), 'the subscription')
-    assert node.state_in_words == 'active'
+    assert node.states.in_words == 'active'
 
 
 def test_the_grid_maps_whether_anybody_listens_or_not(make_graph) -> None:
@@ -41,7 +41,7 @@ def test_the_grid_maps_whether_anybody_listens_or_not(make_graph) -> None:
     publish(graph, grid_messages(STAMP_NS))
     late = graph.collect('map')
     graph.until(lambda: late, 'the map')
-    assert node.state_in_words == 'active'
+    assert node.states.in_words == 'active'
 
 
 def test_while_the_time_of_a_recording_stands_still_status_and_map_come(make_graph) -> None:

@@ -18,8 +18,8 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli.main import main
 from segfloor_ros.cli.replay_nodes import unconnected
+from segfloor_ros.files.saved_map import read_map_file
 from segfloor_ros.grid.map_file import FREE, load_map
-from segfloor_ros.map_file import read_map_file
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
 from segfloor_ros.trajectory import read_trajectory
 
@@ -101,6 +101,24 @@ def test_the_replay_gives_what_the_run_gives(drive, tmp_path) -> None:
     assert 'keyframes that failed: 0' in out
 
 
+def test_a_path_alone_is_that_of_the_run(drive, tmp_path) -> None:
+    for kind, rate in (('run', ()), ('replay', ('--rate', 0))):
+        out = tmp_path / kind
+        status, _, errors = segfloor(kind, drive, '--out', out, '--no-map', *rate)
+        assert status == 0, errors
+    same = set(SAME_FILES) - {'map.pgm', 'map.yaml'}
+    assert {path.name for path in (tmp_path / 'replay').glob('[!.]*')} == same | {'summary.json'}
+    for name in same:
+        run, replay = ((tmp_path / kind / name).read_bytes() for kind in ('run', 'replay'))
+        assert run == replay, name
+    run, replay = (
+        json.loads((tmp_path / kind / 'summary.json').read_text()) for kind in ('run', 'replay')
+    )
+    for key in ('map', 'frames', 'tracked_frames', 'keyframes', 'map_updates', 'camera_height_m'):
+        assert run[key] == replay[key], key
+    assert (run['map'], run['camera_height_m'], run['tracked_frames']) == (None, None, FRAMES)
+
+
 def test_eyes_that_are_exchanged_are_said_also_where_no_map_comes_of_it(tmp_path) -> None:
     frames = [replace(f, left=f.right, right=f.left) for f in room_drive(5)[0]]
     drive = write_kitti(tmp_path / 'exchanged', frames)
@@ -133,6 +151,24 @@ def test_the_replay_saves_loads_and_localizes_as_the_run_does(drive, tmp_path) -
     summary = json.loads((tmp_path / 'replay' / 'localized' / 'summary.json').read_text())
     assert summary['keyframes'] == len(run.parts['slam']['keyframe_stamp_ns'])
     assert summary['tracked_frames'] >= FRAMES - 2
+
+
+@pytest.mark.slow
+def test_an_interrupted_map_does_not_replace_the_one_that_was_loaded(drive, tmp_path) -> None:
+    home, out = tmp_path / 'home.map', tmp_path / 'out'
+    status, _, errors = segfloor('run', drive, '--out', tmp_path / 'run', '--save-map', home)
+    assert status == 0, errors
+    before = home.read_bytes()
+    maps = ('--load-map', home, '--save-map', home)
+    replay = start('replay', drive, '--out', out, '--rate', 0.2, *maps)
+    while not list(tmp_path.rglob('made/floor_masks/*.png')) and replay.poll() is None:
+        time.sleep(0.05)
+    replay.send_signal(signal.SIGINT)
+    _, errors = replay.communicate(timeout=60)
+    assert replay.returncode == 128 + signal.SIGINT, errors
+    assert home.read_bytes() == before
+    assert f'{home}: stays as it was; the map is in {home}.interrupted' in errors
+    assert read_map_file(tmp_path / 'home.map.interrupted').parts.keys() >= {'slam', 'grid'}
 
 
 def test_a_node_that_dies_ends_the_replay_by_its_name(drive, tmp_path) -> None:

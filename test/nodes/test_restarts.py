@@ -16,9 +16,9 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.cloud.labelled_cloud import UNKNOWN, LabelledPoints
+from segfloor_ros.files.saved_map import MapFile
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.map_file import MapFile
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.maps import labelled_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array
@@ -252,6 +252,14 @@ def known_cells(grid: OccupancyGrid) -> dict[tuple[int, int], bool]:
     return dict(zip(places, occupied.tolist(), strict=True))
 
 
+@pytest.fixture
+def own_folder(monkeypatch, tmp_path) -> Path:
+    """Where nodes keep their maps in this test."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+    monkeypatch.setenv('XDG_RUNTIME_DIR', str(tmp_path))
+    return tmp_path
+
+
 def some_map(value: int = 1) -> MapFile:
     return MapFile({'start_ns': 7}, {'grid': {'a': np.array([value])}})
 
@@ -266,8 +274,7 @@ def kept_value(kept: KeptState) -> int | None:
     return None if saved is None else int(saved.parts['grid']['a'][0])
 
 
-def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkeypatch) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_folder) -> None:
     kept = KeptState('/robot/stereo_slam', 30.0)
     keep(kept)
     assert KeptState('/other/stereo_slam', 30.0).take() is None
@@ -278,36 +285,34 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(monkey
     keep(again, 3)  # too soon after the last one
     assert kept_value(again) == 2
     keep(KeptState('/robot/stereo_slam', 30.0))
-    file = Path(kept._file)
+    file = kept.file
     long_ago = file.stat().st_mtime - 31
     os.utime(file, (long_ago, long_ago))
     assert kept.take() is None
     assert not file.exists()
 
 
-def test_what_was_noted_last_comes_with_the_map_and_tells_its_age(monkeypatch) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+def test_what_was_noted_last_comes_with_the_map_and_tells_its_age(own_folder) -> None:
     kept = KeptState('/robot/noting', 30.0)
     keep(kept)
     for stamp_ns in (1, 2):
         kept.note({'stamp_ns': stamp_ns})
-    long_ago = kept._file.stat().st_mtime - 31
-    os.utime(kept._file, (long_ago, long_ago))  # it has stood since, and made no keyframe
+    long_ago = kept.file.stat().st_mtime - 31
+    os.utime(kept.file, (long_ago, long_ago))  # it has stood since, and made no keyframe
     assert KeptState('/robot/noting', 30.0).take().header['note'] == {'stamp_ns': 2}
-    assert [file.name for file in kept._file.parent.glob('test-robot-noting*')] == []
+    assert [file.name for file in kept.file.parent.glob('test-robot-noting*')] == []
     off = KeptState('/robot/noting', 0.0)
     off.note({'stamp_ns': 3})
-    assert [file.name for file in kept._file.parent.glob('test-robot-noting*')] == []
+    assert [file.name for file in kept.file.parent.glob('test-robot-noting*')] == []
 
 
-def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+def test_what_is_damaged_or_not_wanted_is_not_taken(own_folder) -> None:
     off = KeptState('/robot/damaged', 0.0)
     keep(off)
     kept = KeptState('/robot/damaged', 30.0)
     assert kept.take() is None
     keep(kept)
-    kept._file.write_bytes(kept._file.read_bytes()[:-3])
+    kept.file.write_bytes(kept.file.read_bytes()[:-3])
     assert kept.take() is None
     kept = KeptState('/robot/damaged', 30.0)
     keep(kept)
@@ -316,29 +321,25 @@ def test_what_is_damaged_or_not_wanted_is_not_taken(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize('mode', [0o777, 0o750, 0o705])
-def test_a_folder_that_is_not_private_is_not_touched(monkeypatch, tmp_path, mode) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
-    monkeypatch.setattr('segfloor_ros.nodes.shared.maps.IN_MEMORY', tmp_path)
+def test_a_folder_that_is_not_private_is_not_touched(own_folder, mode) -> None:
     kept = KeptState('/robot/open', 30.0)
     keep(kept)
-    before = kept._file.read_bytes()
-    kept._file.parent.chmod(mode)
+    before = kept.file.read_bytes()
+    kept.file.parent.chmod(mode)
     assert kept.take() is None
     kept.remove()
     keep(KeptState('/robot/open', 30.0), value=2)
-    assert [path.read_bytes() for path in kept._file.parent.iterdir()] == [before]
-    kept._file.parent.chmod(0o700)
+    assert [path.read_bytes() for path in kept.file.parent.iterdir()] == [before]
+    kept.file.parent.chmod(0o700)
     assert kept_value(kept) == 1
 
 
-def test_a_link_in_place_of_the_folder_is_not_followed(monkeypatch, tmp_path) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
-    monkeypatch.setattr('segfloor_ros.nodes.shared.maps.IN_MEMORY', tmp_path)
+def test_a_link_in_place_of_the_folder_is_not_followed(own_folder) -> None:
     kept = KeptState('/robot/linked', 30.0)
-    (theirs := tmp_path / 'theirs').mkdir(mode=0o700)
-    (theirs / kept._file.name).write_text('mine')
-    kept._file.parent.symlink_to(theirs)
+    (theirs := own_folder / 'theirs').mkdir(mode=0o700)
+    (theirs / kept.file.name).write_text('mine')
+    kept.file.parent.symlink_to(theirs)
     assert kept.take() is None
     kept.remove()
     keep(kept)
-    assert (theirs / kept._file.name).read_text() == 'mine'
+    assert (theirs / kept.file.name).read_text() == 'mine'

@@ -13,14 +13,14 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, depth_of_room
 
 from segfloor_ros.camera.images import imu_sample, wheel_pose
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
-from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.messages.images import grey8_image, right_image
-from segfloor_ros.messages.poses import imu_message, pose_array, wheel_message
-from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.messages.poses import imu_message, pose_array, transform_message, wheel_message
+from segfloor_ros.messages.topics import KEYFRAMES, to_ns
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.slam_camera import DISCOVERY_S
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.slam_sensors import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -81,7 +81,7 @@ def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> 
     graph.add(StereoCameraNode())
 
     def places() -> list[list[float]]:
-        samples = slam._slam.sensors.gyroscope.samples if slam._slam else []
+        samples = slam.slam.sensors.gyroscope.samples if slam.slam else []
         return [sample.place_m.tolist() for sample in samples]
 
     graph.until(lambda: len(places()) > 100, 'a hundred samples of the IMU')
@@ -94,7 +94,7 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
 ) -> None:
     folder, poses = drive
     (folder / 'wheel_odometry.txt').unlink()
-    monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.TF_AFTER_S', 0.0)
+    monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.DISCOVERY_S', 0.0)
     arguments = [
         *('-p', f'input:={folder}', '-p', 'rate:=0.0', '-p', 'background:=false'),
         *('-p', 'publish_odom_tf:=false', '-p', f'camera_height_m:={MOUNT.height_m}'),
@@ -102,16 +102,21 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
     ]
     graph = make_graph(*arguments)
     odometry = graph.collect('odometry')
+    tf_msgs = pytest.importorskip('tf2_msgs.msg')
     slam = graph.add(StereoSlamNode())
-    for k, pose in enumerate(poses):
-        slam._transforms._tf.add_moving(round(k * 1e8), 'odom', 'base_link', pose)
+    others = graph.tester.create_publisher(tf_msgs.TFMessage, '/tf', KEYFRAMES)
+    graph.until(lambda: graph.tester.count_subscribers('/tf'), 'the listener to tf')
+    told = [
+        transform_message(round(k * 1e8), 'odom', 'base_link', pose) for k, pose in enumerate(poses)
+    ]
+    others.publish(tf_msgs.TFMessage(transforms=told))
     graph.add(StereoCameraNode())
     graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
     for message in odometry:
         truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
         error = invert(truth) @ pose_array(message.pose.pose)
         assert np.linalg.norm(error[:3, 3]) < 0.02
-    assert slam._slam.sensors.messages['wheel_odometry'] >= FRAMES - 2
+    assert slam.slam.sensors.messages['wheel_odometry'] >= FRAMES - 2
 
 
 def test_wheels_and_imu_survive_the_way_through_messages() -> None:
@@ -145,12 +150,8 @@ class Tf:
 
 @pytest.fixture
 def sensors(make_graph):
-    graph = make_graph()
-    node = graph.add(StereoSlamNode())
-    made = SensorInput.__new__(SensorInput)
-    made._node, made._transforms, made._on_message = node, Tf(), lambda: None
-    made.reset()
-    return made
+    graph = make_graph('-p', 'autostart:=false')
+    return SensorInput(graph.add(StereoSlamNode()), Tf(), lambda: None)
 
 
 def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
@@ -159,29 +160,29 @@ def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
 
 def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
     sensors.begin('left', np.eye(3))
-    sensors._receive('imu', imu(1, 'imu_link'))
+    sensors.receive('imu', imu(1, 'imu_link'))
     (sample,) = sensors.take(0)
     np.testing.assert_allclose(sample.accel_m_s2, [0, -9.81, 0])
     np.testing.assert_allclose(sample.place_m, [0.0, 0.1, -0.3])
     sensors.reset()
     sensors.begin('left', np.eye(3))
-    sensors._receive('imu', imu(2, 'elsewhere'))
+    sensors.receive('imu', imu(2, 'elsewhere'))
     assert sensors.take(0) == []
-    sensors._receive('imu', imu(3, 'elsewhere'))
+    sensors.receive('imu', imu(3, 'elsewhere'))
     assert not sensors.is_behind(100 * MS)  # no image waits for it
     assert sensors.take(0) == []
-    sensors._receive('imu', imu(4, '', (0.0, -9.81, 0.0)))
+    sensors.receive('imu', imu(4, '', (0.0, -9.81, 0.0)))
     assert [m.stamp_ns for m in sensors.take(0)] == [4]
 
 
 def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> None:
     for k in (0, 2, 1, 3, 4, 5):
-        sensors._receive('imu', imu(k * 5 * MS, 'imu_link'))
-    sensors._receive('wheel_odometry', wheel_message(WheelPose(8 * MS, np.eye(4)), 'base_link'))
+        sensors.receive('imu', imu(k * 5 * MS, 'imu_link'))
+    sensors.receive('wheel_odometry', wheel_message(WheelPose(8 * MS, np.eye(4)), 'base_link'))
     sensors.begin('left', np.eye(3))  # the first image is looked at
     assert [m.stamp_ns // MS for m in sensors.take(6 * MS)] == [8, 0, 5, 10]
     assert [m.stamp_ns // MS for m in sensors.take(13 * MS, lag_ns=4 * MS)] == [15, 20]
-    sensors._receive('imu', imu(12 * MS, 'imu_link'))  # late
+    sensors.receive('imu', imu(12 * MS, 'imu_link'))  # late
     assert [m.stamp_ns // MS for m in sensors.take(30 * MS)] == [12, 25]
 
 
@@ -189,9 +190,9 @@ def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monk
     now_s = [100.0]
     monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.time.monotonic', lambda: now_s[0])
     assert not sensors.is_behind(50 * MS)  # nothing was ever heard
-    sensors._receive('imu', imu(40 * MS, ''))
+    sensors.receive('imu', imu(40 * MS, ''))
     assert sensors.is_behind(60 * MS)
-    sensors._receive('imu', imu(60 * MS, ''))
+    sensors.receive('imu', imu(60 * MS, ''))
     assert not sensors.is_behind(60 * MS)
     assert not sensors.is_behind(60 * MS, lag_ns=2 * MS)  # what comes next would tell little more
     assert sensors.is_behind(70 * MS)
@@ -203,18 +204,19 @@ def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monk
 
 def test_messages_that_came_while_the_node_was_busy_are_taken_at_once(make_graph) -> None:
     graph = make_graph()
-    node = graph.add(StereoSlamNode())
+    node = graph.add(CloudLabellingNode())
+    taken: list[Imu] = []
+    node.inputs.subscribe('imu', taken.append, takes_all=True)
+    node.inputs.update()
     imus = graph.publisher('imu')
     graph.connected([imus])
-    node._sensors.begin('left', np.eye(3))
-    waiting = node._sensors._waiting['imu']
     for k in range(60):
         imus.publish(imu(k * 5 * MS, 'left'))
     time.sleep(0.5)  # the middleware receives them meanwhile
     passes = set()
-    graph.until(lambda: passes.add(len(waiting)) or len(waiting) == 60, 'the samples')
+    graph.until(lambda: passes.add(len(taken)) or len(taken) == 60, 'the samples')
     assert len(passes) < 20
-    assert [to_ns(m.header.stamp) for m in waiting] == [k * 5 * MS for k in range(60)]
+    assert [to_ns(m.header.stamp) for m in taken] == [k * 5 * MS for k in range(60)]
 
 
 @pytest.fixture

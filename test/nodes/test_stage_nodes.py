@@ -123,13 +123,13 @@ class TestStereoSlam:
         '-p', 'camera_roll_rad:=0.0',
     )  # fmt: skip
 
-    def _inputs(self, graph):
+    def inputs(self, graph):
         names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
         publishers = {name: graph.publisher(name) for name in names}
         graph.connected(list(publishers.values()))
         return publishers
 
-    def _send(self, inputs, frame, sides=('left', 'right')) -> None:
+    def send(self, inputs, frame, sides=('left', 'right')) -> None:
         for side in sides:
             eye, image = getattr(CALIBRATION, side), getattr(frame, side)
             info = camera_info_message(frame.stamp_ns, side, eye)
@@ -146,10 +146,10 @@ class TestStereoSlam:
         )  # fmt: skip
         received = {name: graph.collect(name) for name in names}
         graph.add(StereoSlamNode())
-        inputs = self._inputs(graph)
+        inputs = self.inputs(graph)
         self._wait_for_outputs(graph)
         for frame in frames:
-            self._send(inputs, frame)
+            self.send(inputs, frame)
             graph.until(
                 lambda frame=frame: frame.stamp_ns in _stamps(graph.reports('stereo_slam')),
                 f'frame {frame.index}',
@@ -187,7 +187,7 @@ class TestStereoSlam:
         frames, _ = room_drive(1)
         graph = make_graph(*self.ARGUMENTS)
         graph.add(StereoSlamNode())
-        self._send(self._inputs(graph), frames[0])
+        self.send(self.inputs(graph), frames[0])
         graph.until(lambda: graph.reports('stereo_slam'), 'the answer')
         late = graph.collect('camera_mount')
         graph.until(lambda: late, 'the mount')
@@ -201,11 +201,11 @@ class TestStereoSlam:
         graph = make_graph(*self.ARGUMENTS)
         poses = graph.collect('odometry')
         graph.add(StereoSlamNode())
-        inputs = self._inputs(graph)
+        inputs = self.inputs(graph)
         self._wait_for_outputs(graph)
-        self._send(inputs, frames[0])
+        self.send(inputs, frames[0])
         blind = type(frames[1])(1, frames[1].stamp_ns, dark, dark)
-        self._send(inputs, blind)
+        self.send(inputs, blind)
         graph.until(lambda: len(graph.reports('stereo_slam')) == 2, 'both answers')
         tracked, lost = graph.reports('stereo_slam')
         assert (tracked.level, lost.level) == (Level.OK, Level.ERROR)
@@ -217,16 +217,16 @@ class TestStereoSlam:
         frames, _ = room_drive(4)
         graph = make_graph(*self.ARGUMENTS)
         graph.add(StereoSlamNode())
-        inputs = self._inputs(graph)
-        self._send(inputs, frames[0])
+        inputs = self.inputs(graph)
+        self.send(inputs, frames[0])
         broken = image_message(frames[1].stamp_ns, 'left', frames[1].left)
         broken.encoding = '64FC7'
         inputs['left/image_raw'].publish(broken)
         inputs['right/image_raw'].publish(
             image_message(frames[1].stamp_ns, 'right', frames[1].right)
         )
-        self._send(inputs, frames[2], sides=('left',))
-        self._send(inputs, frames[3])
+        self.send(inputs, frames[2], sides=('left',))
+        self.send(inputs, frames[3])
         graph.until(lambda: len(graph.reports('stereo_slam')) == 4, 'four statuses')
         by_stamp = {s.stamp_ns: s for s in graph.reports('stereo_slam')}
         assert 'left/image_raw' in by_stamp[frames[1].stamp_ns].message
@@ -342,7 +342,7 @@ class TestFreeScan:
         scans = graph.collect('scan')
         mount = transform_message(0, 'base_link', 'left', MOUNT.T_base_left)
         publishers = publish(graph, {'camera_mount': mount})
-        graph.until(lambda: node._mount is not None, 'the mount')
+        graph.until(lambda: node.mount is not None, 'the mount')
         publish(graph, self.frame_messages(frame), publishers)
         graph.until(lambda: scans, 'the scan')
         stage = FloorSegmentation(CAMERA, FloorSegmentationSettings())
@@ -359,10 +359,10 @@ class TestFreeScan:
         received = {name: graph.collect(name) for name in self.frame_messages(frames[0])}
         graph.add(StereoSlamNode())
         slam = TestStereoSlam()
-        inputs = slam._inputs(graph)
+        inputs = slam.inputs(graph)
         graph.until(lambda: all(graph.tester.count_publishers(n) for n in received), 'the topics')
         for frame in frames:
-            slam._send(inputs, frame)
+            slam.send(inputs, frame)
             graph.until(
                 lambda frame=frame: frame.stamp_ns in _stamps(graph.reports('stereo_slam')), 'SLAM'
             )

@@ -101,7 +101,8 @@ def test_the_map_of_two_hosts_is_that_of_one(
     given = {**PARAMETERS, **parameters, 'input': drive, 'map_file': file}
     options = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
     ros = {'ROS_DOMAIN_ID': '7', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
-           'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILES)}  # fmt: skip
+           'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILES),
+           'XDG_RUNTIME_DIR': str(tmp_path)}  # fmt: skip
     with processes() as start, joined_hosts(start) as (robot, base):
         for host in (robot, base):
             (tmp_path / host).mkdir()

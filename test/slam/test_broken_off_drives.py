@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
-from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, save_slam
 from segfloor_ros.slam.settings import StereoSlamSettings

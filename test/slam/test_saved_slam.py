@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.files.saved_map import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert
-from segfloor_ros.map_file import MapFile, from_bytes, to_bytes
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam

@@ -8,10 +8,9 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import RecordedSensor, StereoFrame, WheelPose
 from segfloor_ros.configuration import resolve
 from segfloor_ros.geometry import invert
-from segfloor_ros.measurements import RecordedSensor, WheelPose
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from tools.ablation import app

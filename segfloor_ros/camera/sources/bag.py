@@ -27,7 +27,13 @@ from segfloor_ros.camera.images import (
     wheel_pose,
     xyz,
 )
-from segfloor_ros.camera.model import StereoCamera, StereoCameraSettings
+from segfloor_ros.camera.model import (
+    Measurement,
+    RecordedSensor,
+    StereoCamera,
+    StereoCameraSettings,
+    WheelPose,
+)
 from segfloor_ros.camera.sources import bag_file as bag_topics
 from segfloor_ros.camera.sources.bag_file import BagFile, check_given, open_bag_file
 from segfloor_ros.camera.sources.files import (
@@ -43,7 +49,6 @@ from segfloor_ros.camera.sources.source import PairEntry, Stamped, StampPairing,
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.files.whole import checked_ns
 from segfloor_ros.geometry import Array, FrameTree, make_transform
-from segfloor_ros.measurements import Measurement, RecordedSensor, WheelPose
 
 STAMPS_FOR_RATE = 20
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
+from segfloor_ros.camera.model import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 from segfloor_ros.camera.sources.source import (
     DEFAULT_RATE_HZ,
     PairEntry,
@@ -27,7 +28,6 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array
-from segfloor_ros.measurements import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
 
 T = TypeVar('T')
 

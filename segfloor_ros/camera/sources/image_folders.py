@@ -27,7 +27,7 @@ from segfloor_ros.camera.calibration.files import (
 )
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCameraSettings
 from segfloor_ros.camera.sources import files
 from segfloor_ros.camera.sources.files import (
     IMU,
@@ -43,7 +43,6 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
 from segfloor_ros.files.whole import nanoseconds, whole_nanoseconds
 from segfloor_ros.geometry import invert, make_transform
-from segfloor_ros.measurements import DEPTH, RecordedSensor
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
 NANOSECOND_DIGITS = 16

@@ -19,10 +19,9 @@ from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.depth import is_disparity
 from segfloor_ros.camera.images import EightBitScale
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_mask
-from segfloor_ros.measurements import DEPTH, RecordedSensor
 
 DEFAULT_RATE_HZ = 10.0
 """Frame rate of a recording that has no stamps."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import Mount, StereoCamera, Up
 from segfloor_ros.floor.plane.mirror import (
     MIRRORED_SHARE,
     MirrorView,
@@ -28,7 +28,6 @@ from segfloor_ros.floor.plane.plane_fit import (
     shares,
 )
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.measurements import Up
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""

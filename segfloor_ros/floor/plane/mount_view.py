@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.floor.disparity.matching import (
     DisparityMatcher,
     TwoScaleMatcher,
@@ -48,7 +48,6 @@ from segfloor_ros.floor.plane.plane_fit import (
     with_known,
 )
 from segfloor_ros.geometry import Array
-from segfloor_ros.measurements import Up
 
 _SAMPLES = 4000
 _LEAST_HALVED_PX = 480

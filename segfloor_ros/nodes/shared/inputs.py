@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,13 +18,17 @@ from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import TOPICS, stamp_of, to_ns
 from segfloor_ros.nodes.shared.reporter import Reporter
 
-LEAST_PERIOD_S = 0.001
+LEAST_PERIOD_S, LOOK_S, CHECK_S = 0.005, 0.05, 0.1
+"""Of timers: the shortest, of what has to follow soon, and of what may take a moment."""
+
+DISCOVERY_S = 4.0
+"""Publishers of one process are seen one after the other, the last ones after so long."""
 
 
 @dataclass
 class Input:
-    """A subscription or timer: what makes it, what ends it, and when it is wanted while the node
-    works. entity: what has been made; None while it is closed.
+    """A subscription, timer or guard: what makes it, what ends it, and when it is wanted while the
+    node works. entity: what has been made; None while it is closed.
     """
 
     make: Callable[[], Any]
@@ -56,33 +60,27 @@ class Inputs:
         callback: Callable[[Any], None],
         choose_profile: Callable[[], QoSProfile] | None = None,
         is_wanted: Callable[[], bool] = lambda: True,
-        is_rapid: bool = False,
+        takes_all: bool = False,
     ) -> None:
         """Receive a topic of `TOPICS`. choose_profile: asked whenever the subscription is made.
-        is_wanted: asked whenever the inputs open, and by `update`. is_rapid: with a message all
-        are taken that have come: to wait for each costs more than the message itself.
+        is_wanted: asked whenever the inputs open, and by `update`. takes_all: with a message all
+        are taken that have come, before anything else is done.
         """
         topic = TOPICS[name]
 
         def take(message: Any, info: Mapping[str, Any]) -> None:
-            take_one(message, info)
-            for _ in range(topic.profile.depth if is_rapid else 0):
-                more = _taken(self.subscriptions[name])
-                if more is None:
-                    return
-                take_one(*more)
-
-        def take_one(message: Any, info: Mapping[str, Any]) -> None:
-            stamp_ns, subscription = stamp_of(message), self.subscriptions[name]
-            self._reporter.note_received(topic, stamp_ns, info, subscription)
-            try:
-                callback(message)
-            except Exception as error:
-                self._reporter.log_fault(name, error)
+            subscription = self.subscriptions[name]
+            more = _waiting(subscription, topic.profile.depth) if takes_all else ()
+            for one, its_info in ((message, info), *more):
+                self._reporter.note_received(topic, stamp_of(one), its_info, subscription)
+                try:
+                    callback(one)
+                except Exception as error:
+                    self._reporter.log_fault(name, error)
 
         def subscribe() -> Subscription:
             profile = choose_profile() if choose_profile else topic.profile
-            # What does not connect is reported by `qos_check`, in words and on /diagnostics.
+            # What does not connect is reported in words and on /diagnostics.
             quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
             # rclpy's annotation knows callbacks of one argument only.
             two_arguments: Any = take
@@ -105,6 +103,7 @@ class Inputs:
         on_message: Callable[[str, int], None] | None = None,
         choose_profile: Callable[[], QoSProfile] | None = None,
         is_wanted: Callable[[], bool] = lambda: True,
+        takes_all: bool = False,
         **limits: Any,
     ) -> None:
         """Receive topics whose messages belong together by their stamps; `process` gets the stamp
@@ -124,7 +123,7 @@ class Inputs:
                 process(stamp_ns, complete)
 
         for part in joiner.all_parts:
-            self.subscribe(part, partial(take, part), choose_profile, is_wanted)
+            self.subscribe(part, partial(take, part), choose_profile, is_wanted, takes_all)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call something regularly while the inputs are open."""
@@ -145,6 +144,20 @@ class Inputs:
             return timer
 
         self._inputs.append(Input(start, self._node.destroy_timer))
+
+    def later(self, step: Callable[[], None]) -> Callable[[], None]:
+        """Return what has a step taken while the inputs are open, once the messages are taken that
+        have come: an executor looks at guard conditions after the subscriptions.
+        """
+        made = partial(self._node.create_guard_condition, step)
+        guard = Input(made, self._node.destroy_guard_condition)
+        self._inputs.append(guard)
+
+        def request() -> None:
+            if guard.entity is not None:
+                guard.entity.trigger()
+
+        return request
 
     def steady_timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Make a timer that also runs while the time of a recording stands still."""
@@ -192,11 +205,6 @@ class Inputs:
         self._inputs.clear()
         self._joiners.clear()
 
-    def publisher_count(self, name: str) -> int:
-        """Return how many publishers of a topic that is received now are seen."""
-        found = self.subscriptions.get(name)
-        return found.get_publisher_count() if found is not None else 0
-
     def publishing_nodes(self, name: str) -> int:
         """Return how many nodes publish a topic that is received now. One that was killed and
         started again is one, though for a while both its lives are seen.
@@ -206,10 +214,11 @@ class Inputs:
         return len({(info.node_namespace, info.node_name) for info in infos})
 
 
-def _taken(subscription: Subscription) -> tuple[Any, Mapping[str, Any]] | None:
-    """Return a message that has come, None without one."""
+def _waiting(subscription: Subscription, most: int) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """Yield the messages that have come, oldest first."""
     with subscription.handle:
-        message: tuple[Any, Mapping[str, Any]] | None = subscription.handle.take_message(
-            subscription.msg_type, subscription.raw
-        )
-    return message
+        for _ in range(most):
+            message = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if message is None:
+                return
+            yield message

@@ -22,15 +22,12 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import replacing
-from segfloor_ros.map_file import Arrays, MapFile, read_map_file, write_to
-from segfloor_ros.messages.maps import (
-    is_of_loaded_map,
-    map_file_message,
-    map_file_of,
-    map_start_ns,
-)
+from segfloor_ros.files.saved_map import Arrays, MapFile, read_map_file, write_to
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.maps import is_of_loaded_map, map_file_message, map_file_of, map_start_ns
 from segfloor_ros.messages.topics import (
     KEYFRAME_DONE,
+    KEYFRAMES,
     MAP_LOADED,
     MAP_PART,
     MAP_START,
@@ -46,9 +43,7 @@ Process = Callable[[int, dict[str, Any]], Mapping[str, Any]]
 """Gets the stamp and the messages by topic; returns values for the status."""
 
 
-MAX_WAITING = 100
-
-IN_MEMORY = Path('/dev/shm')
+IN_MEMORY = '/dev/shm'
 LEAST_SHARE = 20
 """Times the duration of a save that passes before the next one: keeping costs little time."""
 
@@ -75,8 +70,8 @@ class KeyframeJoin:
         self._node = node
         self._process = process
         self._is_last = is_last
-        self._done = node.output(KEYFRAME_DONE)
-        self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=MAX_WAITING)
+        self._done = node.outputs.publisher(KEYFRAME_DONE)
+        self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEYFRAMES.depth)
         self._left_ns: int | None = None
         self.map_start_ns: int | None = None
         """When the map was begun; None where nobody has told."""
@@ -84,7 +79,7 @@ class KeyframeJoin:
         """Whether the map goes on from a file."""
 
         def is_told(topic: str) -> bool:
-            return node.inputs.publisher_count(topic) > 0
+            return bool(node.inputs.subscriptions[topic].get_publisher_count())
 
         told = {topic: partial(is_told, topic) for topic in (MAP_START, *optional)}
         node.inputs.join(parts, self._take, optional=told)
@@ -104,9 +99,21 @@ class KeyframeJoin:
         """Process what is kept, as far as it may be."""
         while self._waiting and self.may_process():
             stamp_ns, parts = self._waiting.popleft()
-            is_well = self._node.work(stamp_ns, partial(self._process, stamp_ns, parts))
+            is_well = self._work(stamp_ns, parts)
             if self._is_last or not is_well:
                 self._done.publish(make_header(stamp_ns, ''))
+
+    def _work(self, stamp_ns: int, parts: dict[str, Any]) -> bool:
+        """Have the node process a keyframe and report how it went; returns whether it went well."""
+        start = time.perf_counter()
+        try:
+            values = self._process(stamp_ns, parts)
+        except Exception as error:
+            self._node.reporter.report_fault(stamp_ns, error)
+            return False
+        milliseconds = 1e3 * (time.perf_counter() - start)
+        self._node.reporter.report_processed(stamp_ns, Level.OK, 'running', milliseconds, **values)
+        return True
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         if MAP_START in parts and not self._follow(parts[MAP_START]):
@@ -146,7 +153,7 @@ class MapPart:
         self._arrays = arrays
         self._loaded_ns: int | None = None
         self._wanted_ns: int | None = None
-        self._output = node.output(MAP_PART)
+        self._output = node.outputs.publisher(MAP_PART)
         node.inputs.subscribe(MAP_LOADED, self._take_loaded)
         node.inputs.subscribe(MAP_WANTED, self._take_wanted)
         keyframes.may_process = self._is_here
@@ -203,7 +210,7 @@ class MapPart:
 
 class KeptState:
     """A saved map in a folder of this user's own, one per node name and ROS domain; in memory where
-    the system has such a folder, so that no disk is worn.
+    the system has such a folder (`XDG_RUNTIME_DIR`, `/dev/shm`), so that no disk is worn.
 
     A node that ends in order removes it, so that only one that was killed finds it again, and
     only within `resume_within_s`, so that the next drive does not begin in the map of the last
@@ -212,10 +219,11 @@ class KeptState:
 
     def __init__(self, node_name: str, resume_within_s: float) -> None:
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
-        parent = IN_MEMORY if IN_MEMORY.is_dir() else Path(tempfile.gettempdir())
+        places = [os.environ.get('XDG_RUNTIME_DIR') or IN_MEMORY, IN_MEMORY, tempfile.gettempdir()]
+        parent = next(Path(place) for place in places if Path(place).is_dir())
         folder = parent / f'segfloor_ros-{os.getuid()}'
-        self._file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
-        self._note = self._file.with_suffix('.json')
+        self.file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
+        self._note = self.file.with_suffix('.json')
         self._resume_within_s = resume_within_s
         self._next_save_s = -float('inf')
         self._writing: threading.Thread | None = None
@@ -234,7 +242,7 @@ class KeptState:
         if self._resume_within_s <= 0:
             return
         with contextlib.suppress(OSError):
-            self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
             written = self._note.with_suffix('.note')
             written.write_text(json.dumps(values))
@@ -252,9 +260,9 @@ class KeptState:
 
     def _write(self, saved: MapFile, start_s: float) -> None:
         with contextlib.suppress(OSError):
-            self._file.parent.mkdir(mode=0o700, exist_ok=True)
+            self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
-            with replacing(self._file) as file:
+            with replacing(self.file) as file:
                 write_to(file, saved, compress=False)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
@@ -271,11 +279,11 @@ class KeptState:
         """
         try:
             self._check_private()
-            files = [file for file in (self._file, self._note) if file.is_file()]
+            files = [file for file in (self.file, self._note) if file.is_file()]
             age_s = time.time() - max((file.lstat().st_mtime for file in files), default=0.0)
             if age_s > self._resume_within_s:
                 return None
-            saved = read_map_file(self._file)
+            saved = read_map_file(self.file)
             if self._note in files:
                 saved.header['note'] = json.loads(self._note.read_text())
             return saved
@@ -289,14 +297,14 @@ class KeptState:
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()
-            for file in (self._file, self._note):
+            for file in (self.file, self._note):
                 file.unlink(missing_ok=True)
 
     def _check_private(self) -> None:
         """Raise PermissionError unless the folder is this user's own, no link, and nobody else can
         look into it or change it: then nobody else decides what lies there.
         """
-        found = self._file.parent.lstat()
+        found = self.file.parent.lstat()
         is_own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
         if not is_own or found.st_mode & 0o077:
-            raise PermissionError(f'{self._file.parent} is not private')
+            raise PermissionError(f'{self.file.parent} is not private')

@@ -5,11 +5,10 @@ listens to, topics that do not connect, or look like one that nobody publishes; 
 from __future__ import annotations
 
 import difflib
-import math
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -31,14 +30,8 @@ from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic, describe_policies
 from segfloor_ros.timing import rss_mb
 
-if TYPE_CHECKING:
-    from segfloor_ros.nodes.shared.inputs import Inputs
-
-LOSS_LASTS_S = 10.0
-
-PROBLEM_LASTS_S = 3.0
-
-REPEAT_S = 5.0
+LASTS_S, EVENT_LASTS_S = 3.0, 10.0
+"""So long a problem counts that is looked for once a second, or shows now and then."""
 
 SETTLED_S = 10.0
 """Nodes that are started together are seen one after the other: what is missing is not logged
@@ -53,11 +46,6 @@ SIDES = {
 """How drivers call the two sides."""
 
 FALLS_BEHIND_S = 2.0
-
-KILLED_SEEN_S = 20.0
-"""How long Fast DDS shows a process that was killed."""
-
-REPEAT_TWIN_S = 30.0
 
 
 class LossCounter:
@@ -109,6 +97,7 @@ class Reporter:
         self.health = Health()
         self._opened_s = time.monotonic()
         self._losses: dict[str, LossCounter] = {}
+        self._said: dict[str, str] = {}
         self._silent_until_s: dict[str, float] = {}
 
     def note_received(
@@ -130,7 +119,7 @@ class Reporter:
             self.health.lost(topic.name, lost)
             name, profile = self._node.get_name(), subscription.qos_profile
             text = loss_in_words(topic.name, lost, name, profile)
-            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, LOSS_LASTS_S)
+            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, EVENT_LASTS_S)
 
     def note_opened(self) -> None:
         """Note that messages are received from now on."""
@@ -177,7 +166,7 @@ class Reporter:
             self.health.count('dropped')
             # Others may still be starting; a second publisher is wrong from the first moment.
             if crowded or time.monotonic() - self._opened_s >= SETTLED_S:
-                self.warn(text, about=names + crowded)
+                self.diagnose(f'parts {names}{crowded}', text, lasts_s=EVENT_LASTS_S)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def diagnose(
@@ -185,32 +174,32 @@ class Reporter:
         about: str,
         text: str,
         level: Level = Level.WARN,
-        lasts_s: float = PROBLEM_LASTS_S,
-        repeat_s: float = REPEAT_S,
+        lasts_s: float = LASTS_S,
+        line: str | None = '',
     ) -> None:
-        """Tell what is wrong and what to do about it: in the log now and then, on /diagnostics as
-        long as it is found again within `lasts_s`.
+        """Report what is wrong and what to do about it: on /diagnostics as long as it is found
+        again within `lasts_s`, in the log when it begins and when it is over. line: what the log
+        says, if less; None for nothing yet.
         """
         self.health.found(about, level, text, lasts_s)
-        self.warn(text, about, repeat_s)
-
-    def warn(self, text: str, about: str = '', repeat_s: float = REPEAT_S) -> None:
-        """Log a warning, at most every so many seconds about the same."""
-        if self._is_due(about or text, repeat_s):
-            self._node.get_logger().warning(text)
+        if about not in self._said and line is not None:
+            self._node.get_logger().warning(line or text)
+            self._said[about] = line or text
 
     def over(self, about: str) -> None:
         """Note that a problem is over; when it comes again it is logged again."""
         self.health.over(about)
-        self._silent_until_s.pop(about, None)
+        self._said.pop(about, None)
 
     def log_fault(self, where: str, error: Exception) -> None:
         """Log a fault in one line, at most every few seconds; the traceback of an unexpected one
         goes to the debug log.
         """
-        text, log = one_line(error), self._node.get_logger()
-        if not self._is_due(text):
+        text, log, now_s = one_line(error), self._node.get_logger(), time.monotonic()
+        self._silent_until_s = {k: s for k, s in self._silent_until_s.items() if s > now_s}
+        if text in self._silent_until_s:
             return
+        self._silent_until_s[text] = now_s + EVENT_LASTS_S
         log.error(text if text.startswith(where) else f'{where}: {text}')
         if not isinstance(error, SegfloorError):
             log.debug(''.join(traceback.format_exception(error)))
@@ -218,6 +207,9 @@ class Reporter:
     def publish_health(self, state: str) -> None:
         """Publish how the node fares. state: of the node, in a word."""
         level, words, values = self.health.summary(state)
+        for about in self._said.keys() - self.health.problems.keys():
+            what = self._said.pop(about).partition(';')[0]
+            self._node.get_logger().info(f'over: {what}')
         values['rss_mb'] = f'{rss_mb():.1f}'
         self.publish(HEALTH, self._node.get_clock().now().nanoseconds, level, words, values)
 
@@ -228,14 +220,6 @@ class Reporter:
         name = self._node.get_fully_qualified_name() + (f': {kind}' if kind else '')
         texts = {key: str(value) for key, value in values.items()}
         self.publisher.publish(status_message(Status(stamp_ns, name, level, message, texts)))
-
-    def _is_due(self, about: str, repeat_s: float = REPEAT_S) -> bool:
-        now_s = time.monotonic()
-        self._silent_until_s = {key: s for key, s in self._silent_until_s.items() if s > now_s}
-        if about in self._silent_until_s:
-            return False
-        self._silent_until_s[about] = now_s + repeat_s
-        return True
 
 
 def one_line(error: Exception) -> str:
@@ -261,23 +245,22 @@ def incompatible_topics(
     node: Node, publishers: Iterable[Publisher], subscriptions: Iterable[Subscription]
 ) -> Iterator[tuple[str, str]]:
     """Yield the topics whose other side cannot connect, each with what to do about it."""
-    name = node.get_name()
     for subscription in subscriptions:
         topic, wanted = subscription.topic_name, subscription.qos_profile
         for other in node.get_publishers_info_by_topic(topic):
-            if not _fits(other.qos_profile, wanted):
-                theirs, ours = describe_policies(other.qos_profile), describe_policies(wanted)
-                text = f'nothing arrives from {_full_name(other)}, which offers {theirs}; {name} '
-                text += f'asks for {ours}; {_remedy(node, other.qos_profile, wanted)}'
-                yield topic, f'{topic}: {text}'
+            if not _fits(offered := other.qos_profile, wanted):
+                remedy = _remedy(node, offered, wanted)
+                what = f'nothing arrives from {_full_name(other)}, which offers'
+                ours = f'{node.get_name()} asks for {describe_policies(wanted)}'
+                yield topic, f'{topic}: {what} {describe_policies(offered)}; {ours}; {remedy}'
     for publisher in publishers:
         topic, offered = publisher.topic_name, publisher.qos_profile
         for other in node.get_subscriptions_info_by_topic(topic):
-            if not _fits(offered, other.qos_profile):
-                theirs, ours = describe_policies(other.qos_profile), describe_policies(offered)
-                text = f'nothing reaches {_full_name(other)}, which asks for {theirs}; {name} '
-                text += f'offers {ours}; subscribe with what is offered'
-                yield topic, f'{topic}: {text}'
+            if not _fits(offered, wanted := other.qos_profile):
+                what = f'nothing reaches {_full_name(other)}, which asks for'
+                ours = f'{node.get_name()} offers {describe_policies(offered)}'
+                remedy = 'subscribe with what is offered'
+                yield topic, f'{topic}: {what} {describe_policies(wanted)}; {ours}; {remedy}'
 
 
 def _full_name(other: TopicEndpointInfo) -> str:
@@ -339,35 +322,37 @@ def in_words(names: Sequence[str]) -> str:
 
 
 class Connections:
-    """Counts the subscribers of a node's outputs and finds inputs that do not connect."""
+    """Counts the subscribers of a node's outputs and finds inputs that do not connect. publishers,
+    subscriptions: the open ones by the topic's name as in the code.
+    """
 
-    def __init__(self, node: Node, reporter: Reporter, inputs: Inputs) -> None:
+    def __init__(
+        self,
+        node: Node,
+        reporter: Reporter,
+        publishers: Mapping[str, Publisher],
+        subscriptions: Mapping[str, Subscription],
+    ) -> None:
         self._node = node
         self._reporter = reporter
-        self._inputs = inputs
-        self._reported: dict[str, str] = {}
+        self._publishers = publishers
+        self._subscriptions = subscriptions
+        self._reported: dict[str, int] = {}
         self._last_needed_s = time.monotonic()
         self._silent_since_s: dict[str, float] = {}
-        self.outputs: dict[str, Publisher] = {}
-        """The publishers by the topic's name as in the code."""
 
-    def count_listeners(self) -> dict[str, str]:
-        """Return the number of subscribers by topic, with that of the status."""
-        counts = {name: str(out.get_subscription_count()) for name, out in self.outputs.items()}
-        counts[DIAGNOSTICS.name] = str(self._reporter.publisher.get_subscription_count())
-        return counts
-
-    def report(self, counts: Mapping[str, str], always: bool) -> None:
-        """Publish the counts when they have changed, or always."""
+    def report(self, always: bool) -> None:
+        """Publish the number of subscribers by topic when it has changed, or always."""
+        counts = self._count_listeners()
         if always or counts != self._reported:
-            self._reported = dict(counts)
+            self._reported = counts
             stamp_ns = self._node.get_clock().now().nanoseconds
             self._reporter.publish(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
 
-    def are_needed(self, counts: Mapping[str, str], is_needed_otherwise: bool) -> bool:
-        """Whether somebody listens, or did a short time ago."""
+    def are_needed(self, is_needed_otherwise: bool) -> bool:
+        """Whether somebody listens, to the status, too, or did a short time ago."""
         now_s = time.monotonic()
-        if is_needed_otherwise or any(int(count) for count in counts.values()):
+        if is_needed_otherwise or any(self._count_listeners().values()):
             self._last_needed_s = now_s
         return now_s - self._last_needed_s < NEED_LASTS_S
 
@@ -384,19 +369,21 @@ class Connections:
             )
             self._reporter.diagnose('queues', text)
 
+    def _count_listeners(self) -> dict[str, int]:
+        outputs = {**self._publishers, DIAGNOSTICS.name: self._reporter.publisher}
+        return {name: output.get_subscription_count() for name, output in outputs.items()}
+
     def _find_incompatible(self) -> None:
-        subscriptions = self._inputs.subscriptions.values()
-        found = incompatible_topics(self._node, self.outputs.values(), subscriptions)
-        for topic, text in found:
+        sides = self._publishers.values(), self._subscriptions.values()
+        for topic, text in incompatible_topics(self._node, *sides):
             self._reporter.diagnose(f'QoS of {topic}', text, Level.ERROR)
 
     def _find_silent(self) -> None:
         """Report inputs that nobody publishes, each with what is published that looks like it."""
-        inputs = self._inputs
         silent = [
             name
-            for name in inputs.subscriptions
-            if not TOPICS[name].is_optional and not inputs.publisher_count(name)
+            for name, subscription in self._subscriptions.items()
+            if not TOPICS[name].is_optional and not subscription.get_publisher_count()
         ]
         now_s = time.monotonic()
         self._silent_since_s = {name: self._silent_since_s.get(name, now_s) for name in silent}
@@ -406,10 +393,9 @@ class Connections:
         what = f'nobody publishes {in_words(silent)}'
         hints = [hint for name in silent if (hint := self._hint(name))]
         text = '; '.join([what, 'start the node that does, or remap', *hints])
-        self._reporter.health.found('publishers', Level.WARN, text, PROBLEM_LASTS_S)
-        if now_s - min(self._silent_since_s.values()) >= SETTLED_S:
-            line = f'{what}; /diagnostics says what to do'
-            self._reporter.warn(line, 'publishers', repeat_s=math.inf)
+        is_settled = now_s - min(self._silent_since_s.values()) >= SETTLED_S
+        line = f'{what}; /diagnostics says what to do' if is_settled else None
+        self._reporter.diagnose('publishers', text, line=line)
 
     def _hint(self, name: str) -> str:
         """Return what is published that looks like a topic, in words; '' where nothing does."""
@@ -424,14 +410,12 @@ class Connections:
 
     def _find_twin(self) -> None:
         """Report another node of the same name: both would publish on the same topics."""
-        name, namespace = self._node.get_name(), self._node.get_namespace()
-        same = [
-            one for one in self._node.get_node_names_and_namespaces() if one == (name, namespace)
-        ]
-        if len(same) > 1:
+        own = self._node.get_name(), self._node.get_namespace()
+        count = self._node.get_node_names_and_namespaces().count(own)
+        if count > 1:
             text = (
-                f'{len(same)} nodes are called {self._node.get_fully_qualified_name()} and publish '
+                f'{count} nodes are called {self._node.get_fully_qualified_name()} and publish '
                 'on the same topics; stop the other one, or give this one a namespace; one that '
-                f'was killed is seen for up to {KILLED_SEEN_S:g} s'
+                'was killed is seen for up to 20 s by Fast DDS'
             )
-            self._reporter.diagnose('twin', text, Level.ERROR, repeat_s=REPEAT_TWIN_S)
+            self._reporter.diagnose('twin', text, Level.ERROR)

@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -38,7 +39,7 @@ from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.files.yaml_files import yaml_value
 from segfloor_ros.settings import SettingSpec, suggestion
 
-PROFILES = Path(__file__).parents[1] / 'fastdds.xml'
+PROFILES = Path(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))
 """Shared memory for stereo images and prompt repetition of what was lost, for Fast DDS, the
 default middleware of ROS 2 Jazzy. Other middlewares do not read it.
 """
@@ -197,22 +198,26 @@ class NodeParameters(Generic[Settings]):
     """The parameters of one node.
 
     The node must have been created with `automatically_declare_parameters_from_overrides`, which
-    is how unknown names are found. Raises SettingsError naming parameter, value and range.
+    is how unknown names are found. on_change: called when live parameters have changed. Raises
+    SettingsError naming parameter, value and range.
     """
 
-    def __init__(self, node: Node, settings: Settings) -> None:
+    def __init__(self, node: Node, settings: Settings, on_change: Callable[[], None]) -> None:
         self.settings = settings
+        self._on_change = on_change
         self._read_overrides(node)
         for spec in settings.specs():
             value = getattr(self.settings, spec.name)
             node.declare_parameter(spec.name, value, descriptor(spec), True)
+        node.add_on_set_parameters_callback(self._change)
 
-    def change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+    def _change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Take over new values of live parameters, or none of them with the reason."""
         try:
             self._replace({parameter.name: parameter.value for parameter in parameters})
         except SettingsError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self._on_change()
         return SetParametersResult(successful=True)
 
     def _replace(self, values: Mapping[str, Any]) -> None:

@@ -17,13 +17,11 @@ from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, FrameTree, invert
 from segfloor_ros.messages.poses import transform_array, transform_message
-from segfloor_ros.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, to_ns
+from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, LATCHED, LATCHED_BY_MANY, to_ns
+from segfloor_ros.nodes.shared.inputs import LOOK_S
+from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult
-
-MAX_UNCORRECTED = 30
-
-TICK_S = 0.05
 
 DISCOVERY_S = 1.0
 """Who publishes tf is known so long after the start; where nobody does, tf is not waited for."""
@@ -72,11 +70,11 @@ class TfLink:
             ('/tf_static', LATCHED, LATCHED_BY_MANY),
         ):
             output = self._outputs[topic] = node.create_publisher(TFMessage, topic, sent)
-            node.at_clean_up(partial(node.destroy_publisher, output))
+            node.outputs.at_clean_up(partial(node.destroy_publisher, output))
             take = partial(self._take, topic == '/tf_static')
             made = node.create_subscription(TFMessage, topic, take, heard)
             self._stop.append(partial(node.destroy_subscription, made))
-        node.at_clean_up(self.stop_listening)
+        node.outputs.at_clean_up(self.stop_listening)
 
     def _publish(self, topic: str, transforms: tuple[TransformStamped, ...]) -> None:
         if self.is_there:
@@ -92,7 +90,8 @@ class TfLink:
                     stamp_ns = to_ns(found.header.stamp)
                     self.frames.add_moving(stamp_ns, parent, child, transform_array(found))
             except InputError as error:
-                self._node.reporter.warn(f'tf from {parent} to {child}: {error}')
+                text = f'tf from {parent} to {child}: {error}'
+                self._node.reporter.diagnose(f'{parent} {child}', text, lasts_s=EVENT_LASTS_S)
 
 
 class Transforms:
@@ -104,7 +103,8 @@ class Transforms:
     so that whoever looks up map → base_link finds it as fresh as the odometry.
     """
 
-    def __init__(self, node: AnyStageNode, own: StereoSlamNodeSettings) -> None:
+    def __init__(self, node: AnyStageNode) -> None:
+        own: StereoSlamNodeSettings = node.settings
         self._node = node
         self._own = own
         self._link = TfLink(node)
@@ -112,7 +112,7 @@ class Transforms:
         self._opened_s = self._deadline_s = 0.0
         self._has_own_mount = False
         self._unsent_mount: tuple[int, str, Mount] | None = None
-        self._uncorrected: deque[FrameResult] = deque(maxlen=MAX_UNCORRECTED)
+        self._uncorrected: deque[FrameResult] = deque(maxlen=IMAGES.depth)
         self._T_map_odom: Array | None = None
         self._corrected_ns = 0
         self._is_fused = own.publish_tf and not own.publish_odom_tf
@@ -121,7 +121,7 @@ class Transforms:
                 'no tf: tf2_msgs is not installed; the mount of the camera comes from the '
                 'parameters camera_height_m, camera_pitch_rad and camera_roll_rad or is measured'
             )
-        node.inputs.every(TICK_S, self._advance)
+        node.inputs.every(LOOK_S, self._advance)
 
     def listener_count(self) -> int:
         """Return how many other nodes listen to tf."""
@@ -250,11 +250,12 @@ class Transforms:
                 while self._uncorrected and self._uncorrected[0].stamp_ns <= result.stamp_ns:
                     self._uncorrected.popleft()
                 return
-        if len(self._uncorrected) == MAX_UNCORRECTED:
-            self._node.reporter.warn(
+        if len(self._uncorrected) == IMAGES.depth:
+            self._node.reporter.diagnose(
+                'no tf',
                 f'no tf from {odom} to {base} at the times of the images, so none from '
                 f'{self._own.map_frame} to {odom} is broadcast; publish_odom_tf is off, which '
-                'leaves it to another node'
+                'leaves it to another node',
             )
 
     def _send_correction(self, stamp_ns: int, T_map_odom: Array) -> None:

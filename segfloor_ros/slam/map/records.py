@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import Up
+from segfloor_ros.files.saved_map import Arrays, check_lengths
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.map_file import Arrays, check_lengths
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 from segfloor_ros.slam.tracking.features import Features

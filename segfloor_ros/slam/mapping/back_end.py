@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from segfloor_ros.camera.model import Up
+from segfloor_ros.files.saved_map import Arrays
 from segfloor_ros.geometry import Array
-from segfloor_ros.map_file import Arrays
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global

@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.normal_equations import (

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import StereoFrame, Up
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.rig import CHI2_95, huber_cost, huber_weights, weighted_jacobian, with_moment
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion

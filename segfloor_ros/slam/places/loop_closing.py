@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from segfloor_ros.files.saved_map import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
-from segfloor_ros.map_file import Arrays
 from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from segfloor_ros.files.saved_map import Arrays, joined, split
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
-from segfloor_ros.map_file import Arrays, joined, split
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import CHANCE_SHARE, MOST, SAME, Track

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import Measurement, WheelPose, is_sound
 from segfloor_ros.geometry import Array, adjoint, invert, make_transform
-from segfloor_ros.measurements import Measurement, WheelPose, is_sound
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (

@@ -14,8 +14,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import MAX_LAG_S, ImuSample
 from segfloor_ros.geometry import Array, rotation_angle
-from segfloor_ros.measurements import MAX_LAG_S, ImuSample
 
 HISTORY = 8000
 MAX_GAP_NS = 100_000_000

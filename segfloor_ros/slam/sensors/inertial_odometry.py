@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import Array, rotation_angle
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 

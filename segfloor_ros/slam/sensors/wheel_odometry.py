@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.geometry import Array, between, invert, make_transform
-from segfloor_ros.measurements import WheelPose
 from segfloor_ros.slam.sensors.gyroscope import TimedSeries, is_late, lag_in_words
 
 HISTORY, NEEDED = 2000, 20

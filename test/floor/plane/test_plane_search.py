@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from segfloor_ros.camera.model import Up
 from segfloor_ros.floor.plane.mount_view import PlaneSearch
 from segfloor_ros.floor.plane.plane_fit import Samples, plane_of
-from segfloor_ros.measurements import Up
 
 UNKNOWN = np.full(3, np.nan)
 DISPARITY_M = 40.0

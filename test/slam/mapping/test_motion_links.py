@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import invert, make_transform, se3_exp, se3_log
-from segfloor_ros.measurements import Up
 from segfloor_ros.slam.mapping.normal_equations import Level, Link, System, chi2, cost, with_factors
 from segfloor_ros.slam.rig import CHI2_95
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion

@@ -9,9 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.geometry import invert
-from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.slam.results import Track
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.model import Mount
+from segfloor_ros.camera.model import ImuSample, Mount, WheelPose
 from segfloor_ros.geometry import adjoint, invert, make_transform, se3_exp, se3_log
-from segfloor_ros.measurements import ImuSample, WheelPose
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.wheel_odometry import (

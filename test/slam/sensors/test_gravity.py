@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import ImuSample
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.measurements import ImuSample
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_gravity import BESIDE, RATE_HZ, imu_sample, pose
 
+from segfloor_ros.camera.model import ImuSample
 from segfloor_ros.geometry import invert, make_transform
-from segfloor_ros.measurements import ImuSample
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.motion import (
     MAX_BLIND_SIGMA_M,

@@ -3,7 +3,7 @@
 import numpy as np
 from stereo_room import MOUNT, planar_pose
 
-from segfloor_ros.measurements import WheelPose
+from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.motion import CameraMotion, sigma_m
 

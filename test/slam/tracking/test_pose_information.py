@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.measurements import WheelPose
+from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
