@@ -25,31 +25,16 @@ DEFAULT_TOLERANCE_M = 0.1
 DRAWS_PER_NODE = 200
 """Free cells drawn per wanted node before giving up on the minimum distance."""
 
-Colour = tuple[int, int, int]
-
-AGREE_FREE: Colour = (255, 255, 255)
-
-AGREE_OCCUPIED: Colour = (40, 40, 40)
-
-FALSE_FREE: Colour = (60, 60, 230)
-
-FALSE_OCCUPIED: Colour = (190, 70, 190)
-
-MISSED_FLOOR: Colour = (245, 200, 130)
-
-MISSED_OBSTACLE: Colour = (0, 165, 255)
-
-NOTHING: Colour = (214, 214, 214)
-
-LEGEND = (
-    ('free, agree', AGREE_FREE),
-    ('occupied, agree', AGREE_OCCUPIED),
-    ('free, but is not', FALSE_FREE),
-    ('occupied, but is free', FALSE_OCCUPIED),
-    ('floor missed', MISSED_FLOOR),
-    ('obstacle missed', MISSED_OBSTACLE),
-)
-"""Name and colour (blue, green, red) of each class in the picture."""
+COLOURS = {
+    'free, agree': (255, 255, 255),
+    'occupied, agree': (40, 40, 40),
+    'free, but is not': (60, 60, 230),
+    'occupied, but is free': (190, 70, 190),
+    'floor missed': (245, 200, 130),
+    'obstacle missed': (0, 165, 255),
+    'nothing': (214, 214, 214),
+}
+"""Blue, green, red of each class in the picture."""
 
 WANTED_SIDE_PX = 1000
 
@@ -315,21 +300,22 @@ def save_overlay(maps: Comparison, path: Path) -> None:
 def _coloured(maps: Comparison) -> NDArray[np.uint8]:
     estimate, truth = maps.estimate, maps.truth
     free, occupied = estimate == FREE, estimate == OCCUPIED
-    picture = np.full((*truth.shape, 3), NOTHING, np.uint8)
-    picture[maps.wanted_floor & ~free] = MISSED_FLOOR
-    picture[maps.wanted_obstacles & ~occupied] = MISSED_OBSTACLE
-    picture[free & (truth == FREE)] = AGREE_FREE
-    picture[occupied & (truth == OCCUPIED)] = AGREE_OCCUPIED
-    picture[free & (truth != FREE)] = FALSE_FREE
-    picture[occupied & (truth == FREE)] = FALSE_OCCUPIED
+    picture = np.full((*truth.shape, 3), COLOURS['nothing'], np.uint8)
+    picture[maps.wanted_floor & ~free] = COLOURS['floor missed']
+    picture[maps.wanted_obstacles & ~occupied] = COLOURS['obstacle missed']
+    picture[free & (truth == FREE)] = COLOURS['free, agree']
+    picture[occupied & (truth == OCCUPIED)] = COLOURS['occupied, agree']
+    picture[free & (truth != FREE)] = COLOURS['free, but is not']
+    picture[occupied & (truth == FREE)] = COLOURS['occupied, but is free']
     return picture
 
 
 def _legend(width: int) -> NDArray[np.uint8]:
+    legend = [item for item in COLOURS.items() if item[0] != 'nothing']
     columns = max(1, width // 240)
-    rows = -(-len(LEGEND) // columns)
+    rows = -(-len(legend) // columns)
     strip = np.full((rows * LEGEND_ROW_PX + 6, width, 3), 250, np.uint8)
-    for index, (name, colour) in enumerate(LEGEND):
+    for index, (name, colour) in enumerate(legend):
         x = 10 + (index % columns) * (width // columns)
         y = 6 + (index // columns) * LEGEND_ROW_PX
         cv2.rectangle(strip, (x, y), (x + 18, y + 18), colour, cv2.FILLED)

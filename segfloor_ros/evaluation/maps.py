@@ -7,6 +7,7 @@ a coarse raster (Fourier domain) and then refined by a shrinking pattern search.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -34,8 +35,6 @@ from segfloor_ros.trajectory import read_trajectory
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""
 
-DEFAULT_FOV_RAD = np.pi / 2
-
 BEARINGS = 361
 SAME_PLACE_M = 0.1
 SAME_HEADING_RAD = 0.05
@@ -47,7 +46,9 @@ COARSE_CELL_M = 0.1
 COARSE_HEADINGS = 120
 NEAR_OBSTACLE_M = 0.05
 MAX_SCORED_CELLS = 40000
-REFINEMENT_STEPS_M = (0.1, 0.05, 0.025, 0.0125)
+REFINEMENTS = 4
+"""Steps of the refinement: a coarse cell, then half of the one before."""
+
 TURN_PER_METRE = 0.15
 """Radians of a refinement step that go with a metre: a lever of about 7 m."""
 
@@ -62,7 +63,7 @@ class MapTruth:
     grid: OccupancyGrid
     start_pose: Pose2d | None = None
     base_poses: Array | None = None
-    fov_rad: float = float(DEFAULT_FOV_RAD)
+    fov_rad: float = math.pi / 2
 
     @property
     def start(self) -> Pose2d:
@@ -268,7 +269,7 @@ def _refine(fit: _Fit, start: Pose2d) -> Pose2d:
     """Move to the best of the neighbouring poses until none is better, with shrinking steps."""
     best, best_score = start, fit.score(start)
     moves = [move for move in product((-1, 0, 1), repeat=3) if any(move)]
-    for step in REFINEMENT_STEPS_M:
+    for step in COARSE_CELL_M / 2 ** np.arange(REFINEMENTS):
         improved = True
         while improved:
             centre, improved = best, False

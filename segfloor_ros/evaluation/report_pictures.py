@@ -29,14 +29,21 @@ from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
+from segfloor_ros.grid.map_file import (
+    FREE,
+    FREE_PIXEL,
+    OCCUPIED,
+    OCCUPIED_PIXEL,
+    UNKNOWN_PIXEL,
+    OccupancyGrid,
+    load_map,
+)
 from segfloor_ros.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.trajectory import read_trajectory
 
 FLOOR_TINT, NO_EVIDENCE_TINT, MOVING_TINT = (80, 190, 60), (60, 200, 240), (60, 60, 230)
 MOVING = 255
 STRIP_WIDTH_PX = 480
-FREE_GREY, OCCUPIED_GREY, UNKNOWN_GREY = 1.0, 0.1, 0.8
 MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
 PATH_CELL_M = 0.05
@@ -155,12 +162,13 @@ def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
 
 def _show_grid(axes: Axes, grid: OccupancyGrid) -> None:
     state = states(grid)
-    grey = np.select([state == FREE, state == OCCUPIED], [FREE_GREY, OCCUPIED_GREY], UNKNOWN_GREY)
+    shades = [FREE_PIXEL, OCCUPIED_PIXEL]
+    grey = np.select([state == FREE, state == OCCUPIED], shades, UNKNOWN_PIXEL)
     rows, columns = state.shape
     x, y = grid.origin_xy_m
     extent = (x, x + columns * grid.resolution_m, y, y + rows * grid.resolution_m)
     axes.imshow(
-        grey, extent=extent, origin='lower', cmap='gray', vmin=0, vmax=1, interpolation='nearest'
+        grey, extent=extent, origin='lower', cmap='gray', vmin=0, vmax=255, interpolation='nearest'
     )
 
 

@@ -19,10 +19,10 @@ from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.trajectory import read_trajectory
 
 MAX_STAMP_DIFFERENCE_S = 0.02
-RPE_STEP_M = 1.0
-MIN_MATCHES = 3
+STEP_M = 1.0
+"""Of path: errors are those of such steps, and the first one of a plot says what is ahead."""
 
-FIRST_STRETCH_M = 1.0
+MIN_MATCHES = 3
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def score_trajectory(matched: MatchedTrajectories) -> TrajectoryScore:
 
 
 def _relative(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> float:
-    metric = metrics.RPE(relation, RPE_STEP_M, metrics.Unit.meters, all_pairs=True)
+    metric = metrics.RPE(relation, STEP_M, metrics.Unit.meters, all_pairs=True)
     try:
         return _statistics(metric, matched)
     except (metrics.MetricsException, FilterException):
@@ -146,11 +146,11 @@ def _relative(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> f
 
 def _relative_of_sparse(relation: metrics.PoseRelation, matched: MatchedTrajectories) -> float:
     """Return the error per metre over pairs of frames: each one and the first that is at least
-    `RPE_STEP_M` further along the path.
+    `STEP_M` further along the path.
     """
     steps_m = np.linalg.norm(np.diff(matched.truth[:, :3, 3], axis=0), axis=1)
     along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    last = np.searchsorted(along_m, along_m + RPE_STEP_M - 1e-9)
+    last = np.searchsorted(along_m, along_m + STEP_M - 1e-9)
     first = np.flatnonzero(last < len(along_m))
     if len(first) == 0:
         return float('nan')
@@ -246,7 +246,7 @@ def plane_axes(path: Array) -> Array:
     largest = int(np.argmax(np.abs(up)))
     up = up * np.sign(up[largest]) * (-1 if largest == 1 else 1)
     moved = np.linalg.norm(path - path[0], axis=1)
-    ahead = path[int(np.argmax(moved >= min(FIRST_STRETCH_M, moved.max() / 2)))] - path[0]
+    ahead = path[int(np.argmax(moved >= min(STEP_M, moved.max() / 2)))] - path[0]
     ahead = ahead - (ahead @ up) * up
     length = float(np.linalg.norm(ahead))
     if length == 0:

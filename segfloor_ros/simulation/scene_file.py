@@ -26,7 +26,7 @@ from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
-from segfloor_ros.simulation.scene import Scene
+from segfloor_ros.simulation.scene import Scene, Wall
 
 EXPECTED = 'names and values, e.g. `walls:`'
 FARTHEST_M = 1e4
@@ -43,7 +43,6 @@ RANGES = {
 }  # fmt: skip
 """Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
 
-WALL_HEIGHT_M = 2.5
 FURNITURE_HEIGHTS_M = (0.4, 0.8, 1.2, 1.8)
 WALL_TEXTURES = ('rough_plaster', 'bricks', 'concrete', 'books', 'goods')
 FURNITURE_TEXTURES = ('wood', 'granite', 'goods', 'metal')
@@ -52,8 +51,6 @@ TEXTURE_PATCH_M = 5.0
 
 WALL_EXTENT_M = 2.5
 """Connected obstacles at least this large are walls, up to the ceiling; smaller ones furniture."""
-
-DEFAULT_SEED = 1
 
 Cells = NDArray[np.int64]
 
@@ -64,7 +61,7 @@ CLEARANCE_M = 0.45
 COMFORT_M = 1.2
 """Nearer to an obstacle than this the way counts longer, up to three times at the clearance."""
 
-PLANNING_CELL_M = 0.15
+PLANNING_CELL_M = CLEARANCE_M / 3
 
 SEEN_RADIUS_M = 4.0
 
@@ -213,7 +210,7 @@ def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     occupied = grid.cells == OCCUPIED
     if not occupied.any():
         raise InputError(f'{file}: the map has no occupied cell to build walls from')
-    seed = int(overrides.get('seed', DEFAULT_SEED))
+    seed = int(overrides.get('seed', Scene.seed))
     waypoints = overrides.get('path', {}).get('waypoints')
     if waypoints is None:
         waypoints = plan_tour(grid.cells == FREE, grid.resolution_m, grid.origin_xy_m).tolist()
@@ -251,7 +248,7 @@ def _boxes(grid: OccupancyGrid, occupied: NDArray[np.bool_], seed: int) -> list[
     rng = np.random.default_rng([seed, 5])
     extent_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * grid.resolution_m
     is_wall = extent_m >= WALL_EXTENT_M
-    height_m = np.where(is_wall, WALL_HEIGHT_M, rng.choice(FURNITURE_HEIGHTS_M, count))
+    height_m = np.where(is_wall, Wall.height_m, rng.choice(FURNITURE_HEIGHTS_M, count))
     boxes = []
     for rectangle in merged_rectangles(occupied):
         label = int(labels[rectangle[0], rectangle[2]])

@@ -44,11 +44,10 @@ Mover = Person | Car
 MOVING_WITHIN_S = 0.2
 """What changes its place within this time around a moment moves."""
 
-# Of a person of 1.75 m, in metres: the joints and how long the limbs are between them.
-REFERENCE_HEIGHT_M = 1.75
-HIP_M, SHOULDER_M = 0.88, 1.42
-THIGH_M, SHIN_M = 0.44, 0.42
-SOLE_M = 0.02
+# Of a person of the usual height, in metres: the joints and how long the limbs are between them.
+THIGH_M, SHIN_M, SOLE_M = 0.44, 0.42, 0.02
+HIP_M = THIGH_M + SHIN_M + SOLE_M
+SHOULDER_M = 1.42
 STRIDE_RAD = 0.42
 """Largest swing of a thigh; with it the length of a step follows, so that feet do not slide."""
 
@@ -290,7 +289,7 @@ def part_solids(mover: Mover) -> list[list[Prism]]:
     """Return the solids of each part of a mover, in the frame of the part's joint."""
     if isinstance(mover, Car):
         return [_car_solids(mover)]
-    scale, cloth, trousers = mover.height_m / REFERENCE_HEIGHT_M, mover.texture, 'cloth:7'
+    scale, cloth, trousers = mover.height_m / Person.height_m, mover.texture, 'cloth:7'
     torso = [
         block((0.0, 0.0), (0.22, 0.36, 0.54), cloth, bottom_m=0.0),
         cylinder((0.0, 0.0), 0.06, 0.12, 'concrete', 0.54),
@@ -314,7 +313,7 @@ def part_poses(mover: Mover, time_s: float) -> Array:
     T_world_mover = make_transform(Rotation.from_euler('Z', yaw).as_matrix(), np.array([x, y, 0]))
     if isinstance(mover, Car):
         return T_world_mover[None]
-    return T_world_mover @ _limbs(walked_m, mover.height_m / REFERENCE_HEIGHT_M)
+    return T_world_mover @ _limbs(walked_m, mover.height_m / Person.height_m)
 
 
 def is_moving(mover: Mover, time_s: float) -> bool:

@@ -6,10 +6,7 @@ import pytest
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.map_score import (
-    AGREE_FREE,
-    AGREE_OCCUPIED,
-    FALSE_FREE,
-    MISSED_FLOOR,
+    COLOURS,
     RoadMapPlan,
     candidate_edges,
     compare,
@@ -231,7 +228,11 @@ def test_overlay_colours_each_class(tmp_path):
     corners = [
         [tuple(int(v) for v in picture[r * side, c * side]) for c in range(3)] for r in (0, 1)
     ]
-    assert corners[0] == [AGREE_OCCUPIED, FALSE_FREE, MISSED_FLOOR]
-    assert corners[1] == [AGREE_FREE] * 3
+    assert corners[0] == [
+        COLOURS['occupied, agree'],
+        COLOURS['free, but is not'],
+        COLOURS['floor missed'],
+    ]
+    assert corners[1] == [COLOURS['free, agree']] * 3
     save_overlay(maps, tmp_path / 'new' / 'overlay.png')
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / 'new' / 'overlay.png')), picture)
