@@ -43,7 +43,13 @@ setup(
     maintainer_email='segfloor@example.org',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
-        f'{PACKAGE}.simulation': ['scenes/*.yaml', 'demo/*', 'furniture.yaml', 'world.xml'],
+        f'{PACKAGE}.simulation': [
+            'scenes/*.yaml',
+            'cameras/*.yaml',
+            'demo/*',
+            'furniture.yaml',
+            'world.xml',
+        ],
         f'{PACKAGE}.evaluation': ['report.css'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
         f'{PACKAGE}.slam.places': ['vocabulary.npy'],

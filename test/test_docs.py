@@ -13,7 +13,7 @@ import yaml
 from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped_scenes
+from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped
 from segfloor_ros.simulation.textures import GENERATORS
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -38,7 +38,7 @@ def table_rows(text: str) -> list[set[str]]:
 
 
 def test_the_simulation_page_lists_the_shipped_scenes() -> None:
-    assert {frozenset({name}) for name in shipped_scenes()} <= {
+    assert {frozenset({name}) for name in shipped()} <= {
         frozenset(row) for row in table_rows(SIMULATION)
     }
 
@@ -70,7 +70,7 @@ def test_the_page_names_no_entry_that_does_not_exist() -> None:
 
 def test_the_scene_of_the_page_can_be_opened() -> None:
     values = yaml.safe_load(SIMULATION.partition('```yaml\n')[2].partition('```')[0])
-    assert values.pop('like') in shipped_scenes()
+    assert values.pop('like') in shipped()
     scene = scene_from_mapping(values, 'docs')
     assert scene.boxes[0].size == (0.6, 0.4, 0.3)
 

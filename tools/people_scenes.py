@@ -18,7 +18,7 @@ import typer
 import yaml
 
 from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.drive import Drive, plan_drive
+from segfloor_ros.simulation.motion import Drive, plan_drive
 from segfloor_ros.simulation.scene import Person, Route
 from segfloor_ros.simulation.solids import place
 

@@ -155,6 +155,10 @@ def simulate(
         ),
     ],
     out: terminal.Out,
+    camera: Annotated[
+        str | None,
+        typer.Option(help='See through one of a kind: webcam, oak, realsense, zed, kinect.'),
+    ] = None,
     set_values: Annotated[
         list[str] | None,
         typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
@@ -177,7 +181,8 @@ def simulate(
     from segfloor_ros.simulation.scene_file import open_scene
     from segfloor_ros.simulation.simulation import Simulation
 
-    described = open_scene(scene, set_values or ())
+    kind = [f'camera.kind={camera}'] if camera is not None else []
+    described = open_scene(scene, [*kind, *(set_values or ())])
     wanted = RecordingOptions(floor_every, disparity)
     with (
         about(scene),

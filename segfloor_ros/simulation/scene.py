@@ -149,9 +149,21 @@ class CameraRig:
     """The stereo camera. Position and angles are of the left camera on the base; pitch looks
     down, roll to the right. fov_x_deg: of the rectified image. distortion: k1 k2 p1 p2 k3 of the
     raw images; with it, or with misalignment_deg (rotation of either raw camera against the
-    rectified pair), the images are written unrectified. exposure_s: motion blur. right_gain:
-    brightness of the right image over that of the left. covered: when something hides the lenses,
+    rectified pair), the images are written unrectified. covered: when something hides the lenses,
     pairs of start and end in seconds.
+
+    What follows in the list is what a real camera does to its images; `kind` in a scene file, or
+    `--camera`, names a camera whose values it takes over. noise_sigma: of the readout, in grey
+    levels. shot_noise: that of the light, at white; its variance grows with the grey level.
+    exposure_s: motion blur. rolling_s: from the readout of the first to that of the last row.
+    auto_exposure: share of a change of brightness for which the camera makes up, each eye by what
+    it sees. vignetting: share of the light that is lost in the corners. softness_px: deviation of
+    the spread of a point. bayer: one colour per pixel. jpeg: quality in percent, 0 for none.
+
+    Of the right eye against the left: right_gain: brightness. row_offset_px: image lower.
+    pair_roll_deg: image turned to the right. pair_focal: share by which the focal length is
+    larger. lag_s: taken later. drift_s: period in which all of these but the lag swing to their
+    opposite and back, 0 for never.
     """
 
     width: int = 640
@@ -163,13 +175,25 @@ class CameraRig:
     pitch_deg: float = 7.0
     roll_deg: float = 0.0
     rate_hz: float = 10.0
-    noise_sigma: float = 1.5
     distortion: tuple[float, ...] = ()
     misalignment_deg: float = 0.0
-    right_gain: float = 1.0
-    exposure_s: float = 0.0
     covered: tuple[Point, ...] = ()
     vibration: Vibration = field(default_factory=Vibration)
+    noise_sigma: float = 1.5
+    shot_noise: float = 0.0
+    exposure_s: float = 0.0
+    rolling_s: float = 0.0
+    auto_exposure: float = 0.0
+    vignetting: float = 0.0
+    softness_px: float = 0.0
+    bayer: bool = False
+    jpeg: int = 0
+    right_gain: float = 1.0
+    row_offset_px: float = 0.0
+    pair_roll_deg: float = 0.0
+    pair_focal: float = 0.0
+    lag_s: float = 0.0
+    drift_s: float = 0.0
 
     @property
     def rectified(self) -> bool:
@@ -210,7 +234,9 @@ class Imu:
 class DepthSensor:
     """A depth image aligned with the rectified left image; without a maximum there is none. It is
     measured as a disparity over `baseline_m` with noise, in steps of `step_px`. hole_share: of the
-    image without a measurement, in patches.
+    image without a measurement, in patches; nor is there one of what is darker than dark_grey or
+    lighter than shiny_grey. flying_share: of the pixels at edges that have a depth between both
+    sides; the others have none. lag_s: how much earlier than the image it was taken.
     """
 
     max_m: float = 0.0
@@ -219,6 +245,10 @@ class DepthSensor:
     noise_px: float = 0.08
     step_px: float = 0.0625
     hole_share: float = 0.02
+    dark_grey: float = 0.0
+    shiny_grey: float = 255.0
+    flying_share: float = 0.0
+    lag_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,10 @@ RANGES = {
     'thickness_m': (1e-4, 100), 'step_px': (1e-6, 1000), 'max_m': (0, FARTHEST_M),
     'track_m': (0.01, 100), 'frequency_hz': (0.01, 100), 'noise_m': (0, 10), 'noise_px': (0, 1000),
     'hole_share': (0, 1), 'raster_phase': (0, 1),
-    'right_gain': (0, 100), 'ambient': (0, 1), 'reflectance': (0, 1),
+    'right_gain': (0, 100), 'ambient': (0, 1), 'reflectance': (0, 1), 'shot_noise': (0, 255),
+    'rolling_s': (0, 1), 'auto_exposure': (0, 1), 'vignetting': (0, 1), 'softness_px': (0, 100),
+    'jpeg': (0, 100), 'pair_focal': (-0.5, 0.5), 'lag_s': (0, 1), 'drift_s': (0, FARTHEST_M),
+    'flying_share': (0, 1), 'dark_grey': (0, 255), 'shiny_grey': (0, 255),
 }  # fmt: skip
 """Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
 
@@ -68,9 +71,9 @@ SEEN_RADIUS_M = 4.0
 MAX_TOUR_M = 60.0
 
 
-def shipped_scenes() -> dict[str, Path]:
-    """Return the scene files that come with the package, by name."""
-    folder = Path(str(resources.files('segfloor_ros.simulation') / 'scenes'))
+def shipped(kind: str = 'scenes') -> dict[str, Path]:
+    """Return the `scenes` or `cameras` that come with the package, by name."""
+    folder = Path(str(resources.files('segfloor_ros.simulation') / kind))
     return {file.stem: file for file in sorted(folder.glob('*.yaml'))}
 
 
@@ -81,10 +84,21 @@ def read_scene_values(path: Path) -> dict[str, Any]:
     values = read_yaml(path, EXPECTED)
     if 'like' not in values:
         return values
-    name, shipped = str(values.pop('like')), shipped_scenes()
-    if name not in shipped or shipped[name] == path:
-        raise InputError(f'{path}: like: {name} is no shipped scene{suggestion(name, [*shipped])}')
-    return _merged(read_scene_values(shipped[name]), values)
+    name, scenes = str(values.pop('like')), shipped()
+    if name not in scenes or scenes[name] == path:
+        raise InputError(f'{path}: like: {name} is no shipped scene{suggestion(name, [*scenes])}')
+    return _merged(read_scene_values(scenes[name]), values)
+
+
+def _with_camera_of_a_kind(values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the values over those of the camera that `camera: {kind: …}` names."""
+    camera = values.get('camera')
+    if not isinstance(camera, dict) or 'kind' not in camera:
+        return values
+    kind, cameras = str(camera.pop('kind')), shipped('cameras')
+    if kind not in cameras:
+        raise InputError(f'{where}: camera {kind} is none of {", ".join(cameras)}')
+    return _merged(read_yaml(cameras[kind], EXPECTED), values)
 
 
 def _merged(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -162,18 +176,17 @@ def open_scene(name: str, assignments: Iterable[str] = ()) -> Scene:
 
     A map_server map becomes a scene with extruded walls and a planned path. Raises InputError.
     """
-    path = Path(name)
-    shipped = shipped_scenes()
-    if not path.exists() and name not in shipped:
-        raise InputError(f'{name}: no such scene or file{suggestion(name, list(shipped))}')
-    file = path if path.exists() else shipped[name]
+    path, scenes = Path(name), shipped()
+    if not path.exists() and name not in scenes:
+        raise InputError(f'{name}: no such scene or file{suggestion(name, list(scenes))}')
+    file = path if path.exists() else scenes[name]
     if file.is_dir():
         raise InputError(f'{name}: is a folder; name a scene file or a map YAML')
     if is_map_file(read_yaml(file, EXPECTED)):
         values = scene_of_map(file, assigned({}, assignments))
     else:
         values = read_scene_values(file)
-    return scene_from_mapping(assigned(values, assignments), name)
+    return scene_from_mapping(_with_camera_of_a_kind(assigned(values, assignments), name), name)
 
 
 def assigned(values: dict[str, Any], assignments: Iterable[str]) -> dict[str, Any]:

@@ -16,21 +16,28 @@ from numpy.typing import NDArray
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, quaternion_xyzw
 from segfloor_ros.grid.map_file import OCCUPIED, OccupancyGrid
-from segfloor_ros.simulation import rig as sensors
-from segfloor_ros.simulation.drive import Drive, plan_drive
-from segfloor_ros.simulation.rig import (
+from segfloor_ros.simulation.camera import (
     Picture,
-    RigMotion,
+    depth_reading_mm,
     develop,
     ideal_image,
+    moments_s,
     plan_imaging,
     rectified_camera,
+)
+from segfloor_ros.simulation.motion import (
+    Drive,
+    ImuReadings,
+    RigMotion,
+    WheelReadings,
+    imu_readings,
+    plan_drive,
+    smooth_motion,
+    wheel_readings,
 )
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.solids import floors, is_moving, obstacles, part_poses, true_map
 from segfloor_ros.simulation.world import CAMERAS, RIG, World, build_world, mover_bodies
-
-BLUR_SAMPLES = 6
 
 GREY_OF_RGB = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -67,7 +74,7 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene, supersampling: int = 1):
-        self.scene = scene
+        self.scene, self._finer = scene, supersampling
         self.drive: Drive = plan_drive(scene.path, scene.camera.rate_hz)
         self.camera = rectified_camera(scene.camera)
         self.imaging = plan_imaging(scene)
@@ -104,8 +111,8 @@ class Simulation:
         """Render one pair."""
         time_s = float(self.drive.times_s[index])
         left, right = (
-            develop(picture, self.imaging, self.scene, side, index, time_s)
-            for side, picture in enumerate(self._exposed(time_s))
+            develop(self._exposed(side, time_s), self.imaging, self.scene, side, index, time_s)
+            for side in range(len(CAMERAS))
         )
         pose = self.motion.T_world_left(time_s)
         return SimulatedFrame(index, time_s, left, right, pose, self._depth_mm(index))
@@ -118,24 +125,26 @@ class Simulation:
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
         return FrameTruth(self._truth.floor_mask(CAMERAS[0]), depth_m, disparity_px)
 
-    def wheels(self) -> sensors.WheelReadings | None:
+    def wheels(self) -> WheelReadings | None:
         """Return what the wheels tell of the whole drive, where the scene has such."""
         if not self.scene.sensors.wheel_odometry.rate_hz:
             return None
-        return sensors.wheel_readings(self.scene, sensors.smooth_motion(self.motion))
+        return wheel_readings(self.scene, smooth_motion(self.motion))
 
-    def imu(self) -> sensors.ImuReadings | None:
+    def imu(self) -> ImuReadings | None:
         """Return what the IMU tells of the whole drive, where the scene has one."""
         if not self.scene.sensors.imu.rate_hz:
             return None
-        return sensors.imu_readings(self.scene, sensors.smooth_motion(self.motion))
+        return imu_readings(self.scene, smooth_motion(self.motion))
 
     def _depth_mm(self, index: int) -> NDArray[np.uint16] | None:
         if not self.scene.sensors.depth.max_m:
             return None
-        true_m = self.truth(index).depth_m
         time_s = float(self.drive.times_s[index])
-        return sensors.depth_reading_mm(self.scene, self.camera.fx, true_m, index, time_s)
+        taken_s = time_s - self.scene.sensors.depth.lag_s
+        self._renderer.move(self.motion.T_world_left(taken_s), taken_s)
+        true_m, grey = self._truth.depth_m(CAMERAS[0]), self._truth.grey(CAMERAS[0])
+        return depth_reading_mm(self.scene, self.camera.fx, true_m, grey, index, time_s)
 
     def moving_mask(self, index: int) -> NDArray[np.uint8]:
         """Render what moves in one frame's left image: (H, W) uint8, 255 moving."""
@@ -145,18 +154,18 @@ class Simulation:
         share = ideal_image(mask.astype(np.float32), self.imaging, 0)
         return np.where(share > 127, np.uint8(255), np.uint8(0))
 
-    def _exposed(self, time_s: float) -> list[Picture]:
-        """Return the ideal left and right pictures, averaged over the exposure around a time."""
-        exposure_s = self.scene.camera.exposure_s
-        moments = [time_s]
-        if exposure_s > 0:
-            moments = list(time_s + exposure_s * (np.arange(BLUR_SAMPLES) / BLUR_SAMPLES - 0.5))
-        pictures: list[list[Picture]] = [[], []]
-        for moment in moments:
+    def _exposed(self, side: int, time_s: float) -> Picture:
+        """Return the ideal picture of a camera, each row over its exposure around a time."""
+        moments, weights = moments_s(self.scene, side)
+        # The picture may be finer than the image, and larger, with the same middle, for the lens.
+        rows = np.arange(self.imaging.height * self._finer) // self._finer
+        margin, last = (self.imaging.height - len(weights)) // 2, len(weights) - 1
+        weights = weights[(rows - margin).clip(0, last)]
+        exposed = np.zeros((len(rows), 1), np.float32)
+        for moment, weight in zip(time_s + moments, weights.T, strict=True):
             self._renderer.move(self.motion.T_world_left(moment), moment)
-            for side, camera in enumerate(CAMERAS):
-                pictures[side].append(self._pictures.grey(camera))
-        return [np.mean(side, axis=0, dtype=np.float32) for side in pictures]
+            exposed = exposed + weight[:, None] * self._pictures.grey(CAMERAS[side])
+        return exposed
 
 
 def _check_clear(grid: OccupancyGrid, drive: Drive) -> None:

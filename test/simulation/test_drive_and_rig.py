@@ -5,17 +5,15 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.simulation.drive import plan_drive
-from segfloor_ros.simulation.rig import (
-    RigMotion,
+from segfloor_ros.simulation.camera import (
     brightness,
     develop,
     plan_imaging,
     raw_cameras,
     rectified_camera,
-    shake,
     undistort,
 )
+from segfloor_ros.simulation.motion import RigMotion, plan_drive, shake
 from segfloor_ros.simulation.scene import CameraRig, Lighting, Route, Scene, Slope, Vibration
 from segfloor_ros.simulation.solids import floors
 

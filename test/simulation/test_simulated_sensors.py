@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from segfloor_ros.simulation.drive import plan_drive
-from segfloor_ros.simulation.rig import (
+from segfloor_ros.simulation.camera import depth_reading_mm
+from segfloor_ros.simulation.motion import (
     RigMotion,
-    depth_reading_mm,
     imu_readings,
+    plan_drive,
     smooth_motion,
     wheel_readings,
 )
@@ -18,6 +18,7 @@ from segfloor_ros.simulation.scene import CameraRig, DepthSensor, Imu, Route, Sc
 STRAIGHT = Route(((0.0, 0.0), (3.0, 0.0)), speed_m_s=0.5)
 CORNER = Route(((0.0, 0.0), (2.0, 0.0), (2.0, 2.0)))
 EXACT_WHEELS = Wheels(rate_hz=50.0, noise_m=0.0)
+GREY = np.full((60, 80), 100, np.float32)
 EXACT_IMU = Imu(200.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -98,9 +99,9 @@ def test_depth_is_measured_as_a_disparity_in_steps():
     # 320 px times 0.05 m over 2 m is a disparity of 8 px; the next step is 8.0625 px: 1.984 m.
     true_m = np.full((60, 80), 2.0, np.float32)
     scene = depth_scene(max_m=5.0, noise_px=1e-4, hole_share=0.0)
-    assert (depth_reading_mm(scene, 320.0, true_m, 0, 0.0) == 2000).all()
+    assert (depth_reading_mm(scene, 320.0, true_m, GREY, 0, 0.0) == 2000).all()
     scene = depth_scene(max_m=5.0, noise_px=0.06, hole_share=0.0)
-    told = depth_reading_mm(scene, 320.0, true_m, 0, 0.0)
+    told = depth_reading_mm(scene, 320.0, true_m, GREY, 0, 0.0)
     assert {1984, 2000, 2016} <= set(np.unique(told).tolist())
     assert 16 / (told / 1000).mean() == pytest.approx(8.0, abs=0.02)
 
@@ -108,10 +109,10 @@ def test_depth_is_measured_as_a_disparity_in_steps():
 def test_depth_has_holes_at_edges_beyond_its_range_and_under_a_cover():
     true_m = np.full((60, 80), 2.0, np.float32)
     true_m[:, 40:], true_m[:, 70:] = 3.0, 9.0
-    told = depth_reading_mm(depth_scene(max_m=5.0, hole_share=0.0), 320.0, true_m, 0, 1.0)
+    told = depth_reading_mm(depth_scene(max_m=5.0, hole_share=0.0), 320.0, true_m, GREY, 0, 1.0)
     assert (told[:, 39:41] == 0).all() and (told[:, 70:] == 0).all()
     assert (told[:, :38] > 0).all() and (told[:, 42:68] > 0).all()
-    told = depth_reading_mm(depth_scene(max_m=5.0, hole_share=0.1), 320.0, true_m, 0, 1.0)
+    told = depth_reading_mm(depth_scene(max_m=5.0, hole_share=0.1), 320.0, true_m, GREY, 0, 1.0)
     assert (told[:, :38] == 0).mean() == pytest.approx(0.1, abs=0.08)
     covered = depth_scene(covered=((0.5, 2.0),), max_m=5.0)
-    assert not depth_reading_mm(covered, 320.0, true_m, 0, 1.0).any()
+    assert not depth_reading_mm(covered, 320.0, true_m, GREY, 0, 1.0).any()

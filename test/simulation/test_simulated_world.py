@@ -15,7 +15,7 @@ from segfloor_ros.simulation.scene_file import (
     plan_tour,
     read_scene_values,
     scene_from_mapping,
-    shipped_scenes,
+    shipped,
 )
 from segfloor_ros.simulation.solids import (
     block,
@@ -47,7 +47,7 @@ def cell(grid, x, y):
     return grid.cells[row, column]
 
 
-@pytest.mark.parametrize('name', sorted(shipped_scenes()))
+@pytest.mark.parametrize('name', sorted(shipped()))
 def test_shipped_scenes_leave_room_for_the_robot(name):
     scene = open_scene(name)
     grid = map_of(scene)

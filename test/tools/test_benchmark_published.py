@@ -11,7 +11,7 @@ from rich.console import Console
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.simulation.scene_file import open_scene, shipped_scenes
+from segfloor_ros.simulation.scene_file import open_scene, shipped
 from segfloor_ros.simulation.simulation import RenderingError
 from tools.benchmark_published import as_document, published_table, run_scene
 from tools.published_figures import PUBLISHED, parse_scenes
@@ -25,7 +25,7 @@ def test_an_unknown_scene_is_refused():
 
 
 def test_the_published_scenes_are_shipped():
-    assert set(PUBLISHED) <= set(shipped_scenes())
+    assert set(PUBLISHED) <= set(shipped())
 
 
 @pytest.mark.slow
