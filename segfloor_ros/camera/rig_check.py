@@ -3,7 +3,8 @@
 Points of the left image are found in the right one and in the left one before. In images that are
 rectified and taken together, both eyes have a point in one row. Row differences that depend on the
 place in the image are those of a wrong rectification: offset, roll, focal length. Those that grow
-with the motion of the points along the columns are those of a lag between the eyes.
+with the motion of the points along the columns are those of a lag between the eyes. Measured depth
+has edges where the image has them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import is_disparity
+from segfloor_ros.camera.depth_check import DepthCheck
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 
@@ -86,15 +88,28 @@ def _eyes_swapped(share: float) -> InputFault:
     )
 
 
-def _not_simultaneous(lag_s: float, frame_s: float) -> InputFault:
-    late, early = ('right', 'left') if lag_s > 0 else ('left', 'right')
+def _depth_unaligned(shift_px: float, scale: float) -> InputFault:
+    return InputFault(
+        'depth_unaligned',
+        round(shift_px, 1),
+        'px',
+        f'are not aligned: the edges of depth lie {shift_px:.0f} px beside those of the image, '
+        f'which is {scale:.2f} times as large',
+        'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
+    )
+
+
+def _not_simultaneous(
+    lag_s: float, frame_s: float, names: tuple[str, str] = ('right', 'left')
+) -> InputFault:
+    late, early = names if lag_s > 0 else names[::-1]
     return InputFault(
         'not_simultaneous',
         round(1e3 * lag_s, 1),
         'ms',
         f'are not taken at the same time: the {late} one lags {1e3 * abs(lag_s):.0f} ms '
         f'({abs(lag_s) / frame_s:.1f} frames) behind the {early} one',
-        'trigger both cameras together, and pair the images by the time of exposure',
+        'take both at once, and pair them by the time of exposure',
     )
 
 
@@ -111,12 +126,13 @@ class RigCheck:
         self._before: tuple[NDArray[np.uint8], int] | None = None
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
         self._frame_s = 0.0
+        self._depth = DepthCheck()
 
     def see(self, frame: StereoFrame) -> None:
-        """Take in a frame that shows something; of a depth camera nothing is found."""
-        if is_disparity(frame.right):
-            return
-        if self.frames % EVERY == 0:
+        """Take in a frame that shows something."""
+        if self.frames % EVERY == 0 and is_disparity(frame.right):
+            self._judge_depth(frame)
+        elif self.frames % EVERY == 0:
             self._looks.append(self._look(frame))
             self._judge()
         self.frames += 1
@@ -193,6 +209,21 @@ class RigCheck:
             found.append(_rows_apart(rows_px))
             self._rows_px = float(np.median(apart[:, 1]))
         self.faults.update({fault.fault: fault for fault in found})
+
+    def _judge_depth(self, frame: StereoFrame) -> None:
+        if self._before is None:
+            return
+        before, stamp_ns = self._before
+        self._depth.look(frame.left, before, frame.right)
+        misfit = self._depth.misfit()
+        if misfit is None:
+            return
+        frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
+        if misfit.lag and misfit.scale == 1.0:
+            fault = _not_simultaneous(misfit.lag * frame_s, frame_s, ('depth', 'colour'))
+        else:
+            fault = _depth_unaligned(misfit.shift_px, misfit.scale)
+        self.faults[fault.fault] = fault
 
     def _lag_s(self, seen: Array) -> float:
         """Return by how much the right images are late, in seconds, by points (N, 6); 0 where that
