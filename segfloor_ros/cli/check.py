@@ -47,6 +47,10 @@ HEADINGS = ('tracked %', 'error m', 'prec. %', 'recall %', 'time')
 def check_suite(
     suite: Annotated[Path, typer.Argument(metavar='SUITE.yaml', help='Recordings and bounds.')],
     out: Annotated[Path, typer.Option('--out', help='Folder for the results.')],
+    data: Annotated[
+        Path | None,
+        typer.Option(help='Folder of the recordings, of which those that are there are mapped.'),
+    ] = None,
     jobs: Annotated[
         int,
         typer.Option(
@@ -79,7 +83,9 @@ def check_suite(
     ] = False,
 ) -> None:
     """Map recordings and hold the results against bounds. Status 1: a bound failed."""
-    described = read_suite(suite)
+    described = read_suite(suite, data)
+    for name in described.missing:
+        print_error(f'{name}: is not in {data}, skipped')
     known = read_baseline(baseline) if baseline is not None else None
     _check_out(out, described)
     if baseline_to_write is not None:
@@ -194,7 +200,7 @@ def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline
     # Imported here: Matplotlib takes a second that other commands should not wait for.
     from segfloor_ros.suite.page import junit, page
 
-    console.print(_table(result))
+    console.print(_table(result, described))
     for checked in result.recordings:
         for complaint in checked.complaints:
             print_error(complaint)
@@ -212,11 +218,16 @@ def _print_progress(checked: Checked, done: int, total: int) -> None:
     console.print(f'{done}/{total} {checked.name}: {checked.state} ({origin})', highlight=False)
 
 
-def _table(result: SuiteResult) -> Table:
-    table = figure_table('recording', 'result', *HEADINGS)
-    for checked in result.recordings:
+def _table(result: SuiteResult, described: Suite) -> Table:
+    methods = list(described.published)
+    table = figure_table('recording', 'result', *HEADINGS, *methods)
+    if methods:
+        sources = (f'{method}: {source}' for method, source in described.published.items())
+        table.caption = 'error m of ' + '; '.join(sources)
+    for entry, checked in zip(described.entries, result.recordings, strict=True):
         state = Text(checked.state, 'green' if checked.holds else 'red')
-        values = (checked.measured.get(name) for name in COLUMNS)
+        values = [checked.measured.get(name) for name in COLUMNS]
+        values += [entry.published.get(method) for method in methods]
         cells = ('' if value is None else number(value) for value in values)
         table.add_row(checked.name, state, *cells)
     return table

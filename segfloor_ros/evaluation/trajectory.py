@@ -12,9 +12,10 @@ from evo.core.filters import FilterException
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import write_file
-from segfloor_ros.files.whole import read_json
+from segfloor_ros.files.whole import number, read_json, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.trajectory import read_trajectory
 
@@ -67,9 +68,29 @@ def match_files(estimate: Path, truth: Path, frames: int | None = None) -> Match
     """
     estimate_file = _file_in(estimate, 'camera_trajectory.txt')
     truth_file = _file_in(truth, 'poses.txt')
-    estimated, true = read_trajectory(estimate_file), read_trajectory(truth_file)
+    estimated, true = read_trajectory(estimate_file), read_truth(truth_file)
     frames = frames or _frames_of_run(estimate) or _expected_frames(estimated[0], true[0])
     return match(estimated, true, frames)
+
+
+def read_truth(path: Path) -> tuple[Array, Array]:
+    """Return times (N,) in seconds and poses (N, 4, 4) of a true path: a TUM or KITTI file, or the
+    data.csv of an EuRoC folder, whose body is brought to the left camera. Raises InputError.
+    """
+    if path.suffix != '.csv':
+        return read_trajectory(path)
+    times_s, poses = [], []
+    for where, line in read_lines(path):
+        stamp, *words = (word.strip() for word in line.split(','))
+        try:
+            x, y, z, qw, *q_xyz = (number(word) for word in words[:7])
+            rotation = Rotation.from_quat([*q_xyz, qw]).as_matrix()
+            times_s.append(whole_nanoseconds(stamp) / 1e9)
+        except ValueError as error:
+            raise InputError(f'{where}: expected ns, x, y, z, qw, qx, qy, qz ({error})') from None
+        poses.append(make_transform(rotation, np.array([x, y, z])))
+    T_body_left = read_body_pose(path.parents[1] / 'cam0' / 'sensor.yaml')
+    return np.array(times_s), np.array(poses).reshape(-1, 4, 4) @ T_body_left
 
 
 def match(

@@ -19,10 +19,10 @@ from segfloor_ros.suite.result_files import find_recordings, is_url
 RUN, REPLAY = 'run', 'replay'
 RECORDING, SCENE, RESULTS = SOURCES = ('input', 'simulate', 'results')
 TIMEOUT_S = 3600.0
-SUITE_KEYS = ('name', 'defaults', 'recordings')
+SUITE_KEYS = ('name', 'defaults', 'recordings', 'about', 'published')
 SHARED_KEYS = ('truth', 'reference_map', 'mode', 'rate', 'params', 'set', 'timeout_s', 'expect',
-               'no_worse_by')  # fmt: skip
-RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name', 'continue_from')
+               'no_worse_by', 'no_map')  # fmt: skip
+RECORDING_KEYS = (*SOURCES, 'seed', 'scene', 'name', 'continue_from', 'published')
 PREVIOUS = 'previous'
 
 
@@ -35,7 +35,7 @@ class Entry:
     `run`, or `replay` through the nodes at `rate`. truth, reference_map: paths or URLs; truth ''
     means the recording itself where it holds one. params: a parameter file, '' for none. slacks: by
     measure, for a baseline. continue_from: name of the recording whose map this one continues, ''
-    for none.
+    for none. no_map: the path alone is measured. published: path errors of others, by method.
     """
 
     name: str
@@ -52,35 +52,53 @@ class Entry:
     bounds: tuple[Bound, ...] = ()
     slacks: Mapping[str, Slack] = field(default_factory=dict)
     continue_from: str = ''
+    no_map: bool = False
+    published: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Recordings and what must hold for their maps."""
+    """Recordings and what must hold for their maps. published: by method, where its figures are
+    from and how they were aligned. missing: names of recordings that are not there.
+    """
 
     name: str
     entries: tuple[Entry, ...]
+    published: Mapping[str, str] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
 
 
-def read_suite(path: Path) -> Suite:
-    """Read a suite. Raises SettingsError naming the file, the line and what is wrong."""
+def read_suite(path: Path, data: Path | None = None) -> Suite:
+    """Read a suite. data: folder of its recordings, some of which may be missing; else they are
+    where the suite is, all of them. Raises SettingsError naming the file, the line and what is
+    wrong.
+    """
     document = read_marked_yaml(path, SettingsError)
     values = _mapping(document, (), document.values, SUITE_KEYS)
+    published = values.get('published') or {}
     defaults = _mapping(document, ('defaults',), values.get('defaults') or {}, SHARED_KEYS)
     recordings = values.get('recordings')
     if not isinstance(recordings, list) or not recordings:
         raise document.error(('recordings',), 'recordings: expected a list of recordings')
     entries: list[Entry] = []
+    missing: list[str] = []
     for index, item in enumerate(recordings):
         key: Key = ('recordings', index)
         own = _mapping(document, key, item, RECORDING_KEYS + SHARED_KEYS)
-        for entry in _Reader(document, key, own, defaults).entries():
+        _mapping(document, (*key, 'published'), own.get('published') or {}, tuple(published))
+        reader = _Reader(document, key, own, defaults, data)
+        if data is not None and not reader.is_there():
+            missing.append(str(own.get('name') or own[RECORDING]))
+            continue
+        for entry in reader.entries():
             entries.append(_continued(document, key, own.get('continue_from'), entry, entries))
         names = [entry.name for entry in entries]
         doubled = [name for name in names if names.count(name) > 1]
         if doubled:
             raise document.error(key, f'two recordings are called {doubled[0]}; give one a name')
-    return Suite(str(values.get('name') or path.stem), tuple(entries))
+    if not entries:
+        raise SettingsError(f'{data}: has none of the recordings of {path}, e.g. {missing[0]}')
+    return Suite(str(values.get('name') or path.stem), tuple(entries), published, tuple(missing))
 
 
 def _continued(
@@ -109,9 +127,24 @@ class _Reader:
     """Reads one item of `recordings`, which is several entries where its input is a pattern."""
 
     def __init__(
-        self, document: MarkedYaml, key: Key, own: dict[str, Any], defaults: dict[str, Any]
+        self,
+        document: MarkedYaml,
+        key: Key,
+        own: dict[str, Any],
+        defaults: dict[str, Any],
+        data: Path | None,
     ) -> None:
         self._document, self._key, self._own, self._defaults = document, key, own, defaults
+        self._folder = (data or document.path.parent).absolute()
+
+    def is_there(self) -> bool:
+        """Whether there is a recording, where one is named."""
+        try:
+            return RECORDING not in self._own or bool(
+                find_recordings(self._resolved(str(self._own[RECORDING])))
+            )
+        except SegfloorError:
+            return False
 
     def entries(self) -> list[Entry]:
         """Return the entries."""
@@ -125,6 +158,11 @@ class _Reader:
             'reference_map': self._path('reference_map'),
             'bounds': tuple(self._bounds()),
             'slacks': self._slacks(),
+            'no_map': self._value('no_map') is True,
+            'published': {
+                method: self._limit((*self._key, 'published', method), value)
+                for method, value in (self._own.get('published') or {}).items()
+            },
         }
         self._check_parameters(shared['params'], shared['assignments'])
         given = [source for source in SOURCES if source in self._own]
@@ -265,10 +303,10 @@ class _Reader:
             raise self._error(('set',) if assignments else ('params',), str(error)) from None
 
     def _resolved(self, text: str) -> str:
-        """Return a path, relative to the suite's folder, in full; a URL as it is."""
+        """Return a path, relative to the folder of the recordings, in full; a URL as it is."""
         if is_url(text):
             return text
-        return str((self._document.path.parent / Path(text).expanduser()).absolute())
+        return str(self._folder / Path(text).expanduser())
 
     def _at(self, name: str) -> Key:
         own: Key = (*self._key, name)

@@ -110,7 +110,8 @@ class Job:
         return _digest_of_text(' '.join([rest, *(digest_of(path) for path in files)]))
 
     def _digest(self, **without: Any) -> str:
-        entry = dataclasses.replace(self.entry, bounds=(), slacks={}, params='', **without)
+        without |= {'bounds': (), 'slacks': {}, 'published': {}, 'params': ''}
+        entry = dataclasses.replace(self.entry, **without)
         kind = (self.is_continued, self.origin)
         return _digest_of_text(repr((package_digest(), entry, self.params, kind)))
 
@@ -219,6 +220,7 @@ def _run(job: Job, recording: Path, loaded: Path | None, temporary: Path) -> Pat
     entry, out, log, saved = job.entry, *(temporary / n for n in ('out', LOG, SAVED_MAP))
     words = [entry.mode, str(recording), '--out', str(out), '--report']
     words += ['--rate', str(entry.rate)] if entry.mode == REPLAY else []
+    words += ['--no-map'] if entry.no_map else []
     words += ['--load-map', str(loaded)] if loaded is not None else []
     words += ['--save-map', str(saved)] if job.is_continued else []
     if job.params:

@@ -25,6 +25,8 @@ from segfloor_ros.trajectory import read_trajectory
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 
 ROUNDING = 1e-9
+PATHS = ('.txt', '.csv')
+"""Of files with a true path."""
 
 FORMAT = 1
 Baseline = Mapping[str, Mapping[str, float]]
@@ -77,21 +79,25 @@ def measure_run(
 ) -> dict[str, float]:
     """Return the measures of a results folder by name, those that its files and the truth allow.
 
-    truth: a folder with map.yaml (and scene.yaml, base_poses.txt), poses.txt or floor/, or a map
-    YAML. reference_map: a map of an earlier run from the same start. start_pose: where the map's
-    frame lies in the truth's. reference_ms: median time of the reference workload. Raises
-    InputError naming what cannot be read.
+    truth: a folder with map.yaml (and scene.yaml, base_poses.txt), poses.txt or floor/, a map YAML,
+    or a path (.txt, .csv). reference_map: a map of an earlier run from the same start. start_pose:
+    where the map's frame lies in the truth's. reference_ms: median time of the reference workload.
+    Raises InputError naming what cannot be read.
     """
-    grid = load_map(run / 'map.yaml')
-    known = float((states(grid) != UNKNOWN).sum())
-    measured = {'known_area_m2': known * grid.resolution_m**2}
-    if (run / 'summary.json').is_file():
-        measured.update(_of_summary(read_summary(run / 'summary.json'), reference_ms))
+    grid, measured = None, {}
+    summary = run / 'summary.json'
+    # A run without a map says so in its summary.
+    if (run / 'map.yaml').is_file() or not summary.is_file():
+        grid = load_map(run / 'map.yaml')
+        known = float((states(grid) != UNKNOWN).sum())
+        measured['known_area_m2'] = known * grid.resolution_m**2
+    if summary.is_file():
+        measured.update(_of_summary(read_summary(summary), reference_ms))
     if (run / 'trajectory.txt').is_file():
         measured['return_m'] = _return_m(run / 'trajectory.txt')
     if truth is not None:
         measured.update(_against_truth(run, grid, truth, start_pose))
-    if reference_map is not None:
+    if reference_map is not None and grid is not None:
         measured['agreement_percent'] = 100 * agreement(grid, load_map(reference_map))
     return {name: round(value, 6) for name, value in measured.items() if np.isfinite(value)}
 
@@ -113,7 +119,7 @@ def start_pose_of(truth: Path | None) -> Pose2d | None:
 def _has_map(truth: Path) -> bool:
     if not truth.exists():
         raise InputError(f'{truth}: there is no such truth')
-    return not truth.is_dir() or (truth / 'map.yaml').is_file()
+    return (truth / 'map.yaml').is_file() if truth.is_dir() else truth.suffix not in PATHS
 
 
 def agreement(grid: OccupancyGrid, reference: OccupancyGrid) -> float:
@@ -147,20 +153,25 @@ def _return_m(trajectory: Path) -> float:
 
 
 def _against_truth(
-    run: Path, grid: OccupancyGrid, truth: Path, start_pose: Pose2d | None
+    run: Path, grid: OccupancyGrid | None, truth: Path, start_pose: Pose2d | None
 ) -> dict[str, float]:
     measured: dict[str, float] = {}
-    if _has_map(truth):
+    if _has_map(truth) and grid is not None:
         score = score_map(grid, load_truth(truth), start_pose or (0.0, 0.0, 0.0))
         measured['precision_percent'] = 100 * score.opened.precision.mean
         measured['recall_percent'] = 100 * score.opened.recall.mean
         measured['free_precision_percent'] = 100 * score.cells.free_precision
         measured['free_recall_percent'] = 100 * score.cells.free_recall
-    if (truth / 'poses.txt').is_file() and (run / 'camera_trajectory.txt').is_file():
+    path_file = truth / 'poses.txt' if truth.is_dir() else truth
+    if (
+        path_file.is_file()
+        and path_file.suffix in PATHS
+        and (run / 'camera_trajectory.txt').is_file()
+    ):
         # Imported here: evo takes a second that no other command should wait for.
         from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 
-        path = score_trajectory(match_files(run, truth))
+        path = score_trajectory(match_files(run, path_file))
         measured['path_error_m'] = path.ate_rmse_m
         measured['end_error_m'] = path.end_error_m
     if _share_masks(run / 'floor_masks', truth / 'floor'):

@@ -8,6 +8,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.trajectory import (
     match_files,
     plane_axes,
+    read_truth,
     save_trajectory_plot,
     score_trajectory,
 )
@@ -138,6 +139,29 @@ def test_malformed_files_name_what_is_wrong(tmp_path, content, message):
     with pytest.raises(InputError, match=message) as error:
         read_trajectory(path)
     assert 'bad.txt' in str(error.value)
+
+
+def test_the_truth_of_a_body_is_brought_to_its_left_camera(tmp_path):
+    # The camera is 0.1 m ahead of the body's middle, along its x; the body turns on the spot.
+    yaw = np.linspace(0, np.pi, 20)
+    rows = [
+        f'{10**9 + i * 10**8},1,2,3,{np.cos(a / 2)},0,0,{np.sin(a / 2)},0,0,0'
+        for i, a in enumerate(yaw)
+    ]
+    truth = tmp_path / 'state_groundtruth_estimate0' / 'data.csv'
+    for folder in (truth.parent, tmp_path / 'cam0'):
+        folder.mkdir()
+    truth.write_text('\n'.join(['#timestamp [ns], p, q wxyz, v', *rows]))
+    T_BS = [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    (tmp_path / 'cam0' / 'sensor.yaml').write_text(f'T_BS: {{rows: 4, cols: 4, data: {T_BS}}}')
+    times_s, poses = read_truth(truth)
+    np.testing.assert_allclose(times_s, 1 + 0.1 * np.arange(20))
+    expected = [1, 2, 3] + 0.1 * np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
+    np.testing.assert_allclose(poses[:, :3, 3], expected, atol=1e-9)
+    np.testing.assert_allclose(poses[-1, :3, 0], [-1, 0, 0], atol=1e-9)
+    truth.write_text('1000000000,1,2,3,1,0')
+    with pytest.raises(InputError, match=r'data.csv, line 1: expected ns, x, y, z, qw, qx, qy, qz'):
+        read_truth(truth)
 
 
 def test_missing_file_and_missing_times_are_named(tmp_path):

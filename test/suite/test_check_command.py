@@ -220,3 +220,35 @@ def test_a_recording_that_fails_keeps_the_results_of_last_time(room, tmp_path):
     assert done.returncode == 2
     assert 'holds measured.json' in done.stderr
     assert (tmp_path / 'mine.json').read_text() == 'mine'
+
+
+BENCHMARK = """
+name: rooms
+published: {{Other: 'a paper, table I; rigid alignment'}}
+defaults:
+  no_map: true
+  set: {{stereo_slam.num_features: 700}}
+recordings:
+  - input: {room.name}
+    published: {{Other: 0.025}}
+    expect: {{path_error_m: 0.02}}
+  - input: far_away
+"""
+
+
+@pytest.mark.slow
+def test_paths_are_held_beside_published_ones_and_what_is_missing_is_said(room, tmp_path):
+    suite, out = tmp_path / 'suite.yaml', tmp_path / 'out'
+    suite.write_text(BENCHMARK.format(room=room))
+    done = check(suite, '--out', out, '--no-cache', '--data', room.parent)
+    assert done.returncode == 0, done.stderr
+    assert f'far_away: is not in {room.parent}, skipped' in done.stderr
+    row = next(line for line in done.stdout.splitlines() if f'{room.name} ' in line and '│' in line)
+    cells = [cell.strip() for cell in row.strip('│').split('│')]
+    # Tracked, our error, no map, and the published error.
+    assert cells[:3] == [room.name, 'ok', '100']
+    assert float(cells[3]) < 0.02
+    assert cells[4:6] == ['', '']
+    assert cells[-1] == '0.025'
+    assert 'a paper, table I' in done.stdout
+    assert not (out / room.name / 'map.yaml').exists()

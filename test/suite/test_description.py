@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
+import yaml
 
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.suite.description import SCENE, read_suite
 from segfloor_ros.suite.measures import Bound, Slack
+
+SUITES = Path(__file__).resolve().parents[2] / 'suites'
 
 
 def write(folder, text):
@@ -154,3 +158,50 @@ def test_a_bad_suite_is_named_with_its_line(tmp_path, text, line, words):
 def test_a_suite_that_is_not_there_is_named(tmp_path):
     with pytest.raises(SettingsError, match=r'no\.yaml: cannot be read'):
         read_suite(tmp_path / 'no.yaml')
+
+
+# Public benchmarks
+
+BENCHMARK = """
+    published:
+      Other: a paper, table I; rigid alignment
+    defaults: {no_map: true}
+    recordings:
+      - input: one
+        published: {Other: 0.035}
+      - input: two
+      - input: three
+        truth: three/truth.txt
+    """
+
+
+def test_recordings_that_are_not_in_the_folder_of_data_are_named(tmp_path):
+    suite, data = write(tmp_path, BENCHMARK), tmp_path / 'data'
+    for name in ('one', 'two'):
+        (data / name).mkdir(parents=True)
+    found = read_suite(suite, data)
+    assert [entry.input for entry in found.entries] == [str(data / 'one'), str(data / 'two')]
+    assert found.missing == ('three',)
+    assert found.published == {'Other': 'a paper, table I; rigid alignment'}
+    assert [entry.published for entry in found.entries] == [{'Other': 0.035}, {}]
+    assert all(entry.no_map for entry in found.entries)
+    with pytest.raises(SettingsError, match='no such recording'):
+        read_suite(suite)
+    with pytest.raises(SettingsError, match=r'has none of the recordings of .*, e.g. one'):
+        read_suite(suite, tmp_path / 'bags')
+    with pytest.raises(SettingsError, match='line 7: unknown Anther'):
+        read_suite(write(tmp_path, BENCHMARK.replace('published: {O', 'published: {An')), data)
+
+
+@pytest.mark.parametrize('path', sorted(SUITES.glob('*.yaml')), ids=lambda path: path.stem)
+def test_the_shipped_suites_can_be_read(path, tmp_path):
+    for item in (described := yaml.safe_load(path.read_text()))['recordings']:
+        (tmp_path / item['input']).mkdir()
+        if 'truth' in item:
+            (tmp_path / item['truth']).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / item['truth']).touch()
+    suite = read_suite(path, tmp_path)
+    assert len(suite.entries) == len(described['recordings']) and not suite.missing
+    assert all('rigid alignment' in source for source in suite.published.values())
+    assert {name for entry in suite.entries for name in entry.published} == set(suite.published)
+    assert 'https://' in described['about']
