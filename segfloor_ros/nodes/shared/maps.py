@@ -220,7 +220,7 @@ class KeptState:
     def __init__(self, node_name: str, resume_within_s: float) -> None:
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         places = [os.environ.get('XDG_RUNTIME_DIR') or IN_MEMORY, IN_MEMORY, tempfile.gettempdir()]
-        parent = next(Path(place) for place in places if Path(place).is_dir())
+        parent = next(Path(place) for place in places if os.access(place, os.W_OK))
         folder = parent / f'segfloor_ros-{os.getuid()}'
         self.file = folder / f'{domain}-{node_name.strip("/").replace("/", "-")}.map'
         self._note = self.file.with_suffix('.json')

@@ -54,7 +54,6 @@ class LossCounter:
     """
 
     def __init__(self) -> None:
-        self.total = 0
         self._last: int | None = None
 
     def note(self, number: int | None) -> int:
@@ -64,12 +63,7 @@ class LossCounter:
         last, self._last = self._last, number
         if last is None or number is None or number <= last:
             return 0
-        self.total += number - last - 1
         return number - last - 1
-
-    def skip(self) -> None:
-        """Let the numbers of the next messages be any: nothing was to be received meanwhile."""
-        self._last = None
 
 
 def loss_in_words(topic: str, lost: int, node: str, profile: QoSProfile) -> str:
@@ -122,13 +116,9 @@ class Reporter:
             self.diagnose(f'loss on {topic.name}', text, Level.ERROR, EVENT_LASTS_S)
 
     def note_opened(self) -> None:
-        """Note that messages are received from now on."""
+        """Note that messages are received from now on; what came before is not missed."""
         self._opened_s = time.monotonic()
-
-    def restart_loss_counts(self) -> None:
-        """What comes from now on is not missed."""
-        for losses in self._losses.values():
-            losses.skip()
+        self._losses.clear()
 
     def report(self, stamp_ns: int, level: Level, message: str, **values: Any) -> None:
         """Publish a status about one stamp."""
@@ -337,22 +327,29 @@ class Connections:
         self._reporter = reporter
         self._publishers = publishers
         self._subscriptions = subscriptions
+        self._counts: dict[str, int] = {}
         self._reported: dict[str, int] = {}
         self._last_needed_s = time.monotonic()
         self._silent_since_s: dict[str, float] = {}
 
     def report(self, always: bool) -> None:
-        """Publish the number of subscribers by topic when it has changed, or always."""
-        counts = self._count_listeners()
+        """Publish the number of subscribers by topic, as counted last, when it has changed, or
+        always.
+        """
+        counts = self._counts
         if always or counts != self._reported:
             self._reported = counts
             stamp_ns = self._node.get_clock().now().nanoseconds
             self._reporter.publish(CONNECTIONS, stamp_ns, Level.OK, 'subscribers by topic', counts)
 
     def are_needed(self, is_needed_otherwise: bool) -> bool:
-        """Whether somebody listens, to the status, too, or did a short time ago."""
+        """Count who listens, to the status, too. Returns whether somebody does, or did a short time
+        ago.
+        """
+        outputs = {**self._publishers, DIAGNOSTICS.name: self._reporter.publisher}
+        self._counts = {name: one.get_subscription_count() for name, one in outputs.items()}
         now_s = time.monotonic()
-        if is_needed_otherwise or any(self._count_listeners().values()):
+        if is_needed_otherwise or any(self._counts.values()):
             self._last_needed_s = now_s
         return now_s - self._last_needed_s < NEED_LASTS_S
 
@@ -368,10 +365,6 @@ class Connections:
                 'lower the rate or the size of the images, or let stereo_slam make fewer keyframes'
             )
             self._reporter.diagnose('queues', text)
-
-    def _count_listeners(self) -> dict[str, int]:
-        outputs = {**self._publishers, DIAGNOSTICS.name: self._reporter.publisher}
-        return {name: output.get_subscription_count() for name, output in outputs.items()}
 
     def _find_incompatible(self) -> None:
         sides = self._publishers.values(), self._subscriptions.values()

@@ -186,7 +186,6 @@ class States(ManagedEntity):
             node.on_inputs_opened()
         elif not wanted and node.inputs.is_open:
             node.inputs.close()
-            node.reporter.restart_loss_counts()
             node.on_inputs_closed()
 
     def _answer_pause(
