@@ -16,8 +16,7 @@ from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Pair, StereoInput
-from segfloor_ros.nodes.slam_maps import SlamMaps
-from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamResults
+from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
 from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
 from segfloor_ros.pipeline import CAMERA_AS_BASE, make_slam
 from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, saved_camera
