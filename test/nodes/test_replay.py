@@ -156,7 +156,8 @@ def test_the_replay_saves_loads_and_localizes_as_the_run_does(drive, tmp_path) -
 @pytest.mark.slow
 def test_an_interrupted_map_does_not_replace_the_one_that_was_loaded(drive, tmp_path) -> None:
     home, out = tmp_path / 'home.map', tmp_path / 'out'
-    status, _, errors = segfloor('run', drive, '--out', tmp_path / 'run', '--save-map', home)
+    start_of_it = write_kitti(tmp_path / 'start', room_drive(FRAMES)[0][:6])
+    status, _, errors = segfloor('run', start_of_it, '--out', tmp_path / 'run', '--save-map', home)
     assert status == 0, errors
     before = home.read_bytes()
     maps = ('--load-map', home, '--save-map', home)
