@@ -71,11 +71,6 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     def set_up(self) -> None:
         """Make the topics."""
         self._robot_check = RobotCheck(self, 'floor_segmentation')
-        self._labelled = self.outputs.publisher('labelled_points')
-        self._by_label = {
-            FLOOR: self.outputs.publisher('floor_points'),
-            OBSTACLE: self.outputs.publisher('obstacle_points'),
-        }
         keyframes = KeyframeJoin(self, (MAP_POINTS, FEATURES, POSE, MASK), self._label)
         self._part = MapPart(self, keyframes, 'cloud', lambda: self._stage.to_arrays())
         self.inputs.subscribe('odometry', self._keep_alive, is_wanted=self._obstacles_are_wanted)
@@ -115,22 +110,23 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         T_map_base = pose_array(parts[POSE].pose.pose)
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
-        self._labelled.publish(clouds.labelled_message(stamp_ns, frame_id, labelled))
+        message = clouds.labelled_message(stamp_ns, frame_id, labelled)
+        self.outputs.publish('labelled_points', message)
         self._publish_by_label(stamp_ns, frame_id, labelled)
         self._part.note(stamp_ns, frame_id)
         return {'points': len(labelled.point_id)}
 
     def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
         """Publish floor and obstacles, each while someone listens."""
-        if self._by_label[FLOOR].get_subscription_count():
+        if self.outputs.listeners('floor_points'):
             floor = clouds.points_of_label(stamp_ns, frame_id, labelled, FLOOR)
-            self._by_label[FLOOR].publish(floor)
+            self.outputs.publish('floor_points', floor)
         if self._obstacles_are_wanted():
             self._obstacles = clouds.points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
-            self._by_label[OBSTACLE].publish(self._obstacles)
+            self.outputs.publish('obstacle_points', self._obstacles)
 
     def _obstacles_are_wanted(self) -> bool:
-        return self._by_label[OBSTACLE].get_subscription_count() > 0
+        return self.outputs.listeners('obstacle_points') > 0
 
     def _keep_alive(self, message: Odometry) -> None:
         """Publish the obstacles again at the time of a tracked frame when they have become old. A
@@ -142,7 +138,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             age_s = 1e-9 * (stamp_ns - to_ns(obstacles.header.stamp))
             if not 0 <= age_s < KEEP_ALIVE_S:
                 obstacles.header.stamp = message.header.stamp
-                self._by_label[OBSTACLE].publish(obstacles)
+                self.outputs.publish('obstacle_points', obstacles)
 
 
 def main() -> None:

@@ -42,7 +42,6 @@ class FreeScan:
     def __init__(self, node: AnyStageNode, mount: Callable[[], tuple[str, Mount] | None]) -> None:
         self._node = node
         self._mount = mount
-        self._output = node.outputs.publisher('scan')
         self._work = node.inputs.later(self._process)
         self.reset()
         node.inputs.join(FRAME_PARTS, self._take, is_wanted=self._is_wanted, takes_all=True)
@@ -54,7 +53,7 @@ class FreeScan:
         self._newest: tuple[int, dict[str, Any]] | None = None
 
     def _is_wanted(self) -> bool:
-        return self._output.get_subscription_count() > 0
+        return self._node.outputs.listeners('scan') > 0
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         self._newest = stamp_ns, parts
@@ -76,7 +75,8 @@ class FreeScan:
             self._camera = camera
             self._stage = FloorSegmentation(camera, self._node.settings)
         floor = self._stage.process(left, right, mount)
-        self._output.publish(free_scan_message(stamp_ns, base_frame, floor.scan))
+        message = free_scan_message(stamp_ns, base_frame, floor.scan)
+        self._node.outputs.publish('scan', message)
 
 
 class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
@@ -91,11 +91,6 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         self.mount: Mount | None = None
         self._mount_stamp_ns = 0
         self._base_frame = ''
-        self._disparity = self.outputs.publisher('keyframe/disparity')
-        self._overlay = self.outputs.publisher('keyframe/floor_overlay')
-        self._v_disparity = self.outputs.publisher('keyframe/v_disparity')
-        self._mask = self.outputs.publisher('keyframe/floor_mask')
-        self._scan = self.outputs.publisher('keyframe/floor_scan')
         self._free_scan = FreeScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (*KEYFRAME_PARTS, POSE)
@@ -142,16 +137,18 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         T_map_base = pose_array(parts[POSE].pose.pose)
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
         floor = stage.process(left, right, self.mount, T_map_base, moving)
-        self._mask.publish(image_message(stamp_ns, frame_id, floor.mask))
-        self._scan.publish(scan_message(stamp_ns, self._base_frame, floor.scan))
-        if self._disparity.get_subscription_count():
-            self._disparity.publish(disparity_message(stamp_ns, frame_id, camera, floor))
-        if self._overlay.get_subscription_count():
+        out, at = self.outputs, (stamp_ns, frame_id)
+        out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
+        scan = scan_message(stamp_ns, self._base_frame, floor.scan)
+        out.publish('keyframe/floor_scan', scan)
+        if out.listeners('keyframe/disparity'):
+            out.publish('keyframe/disparity', disparity_message(*at, camera, floor))
+        if out.listeners('keyframe/floor_overlay'):
             picture = mask_overlay(left, floor.mask)
-            self._overlay.publish(image_message(stamp_ns, frame_id, picture, 'bgr8'))
-        if self._v_disparity.get_subscription_count():
+            out.publish('keyframe/floor_overlay', image_message(*at, picture, 'bgr8'))
+        if out.listeners('keyframe/v_disparity'):
             picture = v_disparity_picture(floor)
-            self._v_disparity.publish(image_message(stamp_ns, frame_id, picture, 'bgr8'))
+            out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
         if self._mount_check is not None and not self._mount_check.is_done:
             self._compare_mounts(self._mount_check.add(left, right, T_map_base))
         return {}

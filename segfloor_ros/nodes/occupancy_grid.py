@@ -34,7 +34,6 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
     def set_up(self) -> None:
         """Make the topics and the service."""
         self._later: Timer | None = None
-        self._map = self.outputs.publisher('map')
         parts = (POINTS, FEATURES, PATH, POSE, SCAN)
         self._keyframes = KeyframeJoin(self, parts, self._update, is_last=True)
         self._part = MapPart(self, self._keyframes, 'grid', lambda: self._stage.to_arrays())
@@ -88,7 +87,7 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
             self._later = None
         self._published_s = time.monotonic()
         last_ns, frame_id = self._part.last_ns, self._part.frame_id
-        self._map.publish(grid_message(last_ns, frame_id, self._stage.grid()))
+        self.outputs.publish('map', grid_message(last_ns, frame_id, self._stage.grid()))
 
     def _save(self) -> str:
         name = self.settings.map_file

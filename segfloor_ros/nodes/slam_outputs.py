@@ -8,12 +8,14 @@ import json
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.task import Future
 from std_msgs.msg import UInt8MultiArray
 
@@ -29,12 +31,15 @@ from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.maps import map_file_message, map_file_of, map_start_message
 from segfloor_ros.messages.topics import (
+    FRAME_PARTS,
+    KEYFRAME_PARTS,
     MAP_LOADED,
     MAP_PART,
     MAP_START,
     MAP_WANTED,
     MOVING_MASK,
     PATIENCE_S,
+    SIDES,
     make_header,
 )
 from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
@@ -45,8 +50,6 @@ from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
-
-SIDES = ('left', 'right')
 
 MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 
@@ -70,21 +73,7 @@ class SlamTopics:
 
     def __init__(self, node: AnyStageNode) -> None:
         self._own: StereoSlamNodeSettings = node.settings
-        publisher = node.outputs.publisher
-        self._odometry = publisher('odometry')
-        self._map_pose = publisher('pose')
-        self._mount = publisher('camera_mount')
-        self._pose = publisher('keyframe/odometry')
-        self._images = {s: publisher(f'keyframe/{s}/image_rect') for s in SIDES}
-        self._infos = {s: publisher(f'keyframe/{s}/camera_info') for s in SIDES}
-        self._frame_images = {s: publisher(f'frame/{s}/image_rect') for s in SIDES}
-        self._frame_infos = {s: publisher(f'frame/{s}/camera_info') for s in SIDES}
-        self._features = publisher('keyframe/features')
-        self._path = publisher('keyframe/path')
-        self._map_points = publisher('map_points')
-        self._moving_points = publisher('moving_points')
-        self._moving_mask = publisher(MOVING_MASK)
-        self._map_start = publisher(MAP_START)
+        self._out = node.outputs
         self.map_start_ns = 0
         """When the map was begun, by which the nodes behind know one map from another."""
         self._is_loaded = False
@@ -105,9 +94,8 @@ class SlamTopics:
     def publish_mount(self, mount: Mount) -> None:
         """Publish where the left camera sits on the base; the stamp tells for which map."""
         base, left = self._own.base_frame, self.frames.left
-        self._mount.publish(
-            poses.transform_message(self.map_start_ns, base, left, mount.T_base_left)
-        )
+        message = poses.transform_message(self.map_start_ns, base, left, mount.T_base_left)
+        self._out.publish('camera_mount', message)
 
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
@@ -116,23 +104,36 @@ class SlamTopics:
         if result.moving is not None:
             frame_id = self._own.map_frame
             message = clouds.moving_points_message(result.stamp_ns, frame_id, result.moving)
-            self._moving_points.publish(message)
+            self._out.publish('moving_points', message)
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe)
         self._last = result
 
     def publish_frame(self, frame: StereoFrame) -> None:
         """Publish the rectified images of a tracked frame, shrunk, while someone listens."""
-        if not any(output.get_subscription_count() for output in self._frame_images.values()):
+        if not any(self._out.listeners(name) for name in FRAME_PARTS[::2]):
             return
         camera = self._calibration.camera
         factor = shrink_factor(camera)
         small = rectified_calibration(shrunk_camera(camera, factor))
-        for side in SIDES:
-            at = frame.stamp_ns, getattr(self.frames, side)
-            image = shrunk_image(getattr(frame, side), factor)
-            self._frame_infos[side].publish(camera_info_message(*at, getattr(small, side)))
-            self._frame_images[side].publish(image_message(*at, image))
+        images = (shrunk_image(image, factor) for image in (frame.left, frame.right))
+        self._publish_pair(FRAME_PARTS, frame.stamp_ns, images, small)
+
+    def _publish_pair(
+        self,
+        topics: Sequence[str],
+        stamp_ns: int,
+        images: Iterable[NDArray[Any]],
+        calibration: StereoCalibration,
+    ) -> None:
+        """Publish a left and a right image with their calibrations. topics: of the left ones, then
+        of the right ones.
+        """
+        names, infos = topics[::2], topics[1::2]
+        for side, name, info, image in zip(SIDES, names, infos, images, strict=True):
+            at = stamp_ns, getattr(self.frames, side)
+            self._out.publish(info, camera_info_message(*at, getattr(calibration, side)))
+            self._out.publish(name, image_message(*at, image))
 
     def _publish_odometry(self, result: FrameResult) -> None:
         last, twist, of_twist = self._last, None, None
@@ -143,52 +144,31 @@ class SlamTopics:
             before = poses.at_least(last.covariance, LEAST_VARIANCE)
             of_twist = poses.twist_covariance(before, result.T_odom_base, covariance, duration_s)
         own = self._own
-        if self._map_pose.get_subscription_count():
+        if self._out.listeners('pose'):
             T_map_base = result.T_map_odom @ result.T_odom_base
-            self._map_pose.publish(
-                poses.pose_with_covariance_message(
-                    result.stamp_ns, own.map_frame, T_map_base, covariance
-                )
-            )
-        self._odometry.publish(
-            poses.odometry_message(
-                result.stamp_ns,
-                own.odom_frame,
-                own.base_frame,
-                result.T_odom_base,
-                covariance,
-                twist,
-                of_twist,
-            )
+            at = result.stamp_ns, own.map_frame
+            message = poses.pose_with_covariance_message(*at, T_map_base, covariance)
+            self._out.publish('pose', message)
+        at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
+        odometry = poses.odometry_message(
+            *at, own.base_frame, T_odom_base, covariance, twist, of_twist
         )
+        self._out.publish('odometry', odometry)
 
     def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
-        stamp_ns, own = keyframe.stamp_ns, self._own
-        for side in SIDES:
-            at = stamp_ns, getattr(self.frames, side)
-            info = camera_info_message(*at, getattr(self._calibration, side))
-            self._infos[side].publish(info)
-            self._images[side].publish(image_message(*at, getattr(keyframe, side)))
+        own, out = self._own, self._out
+        stamp_ns, at = keyframe.stamp_ns, (keyframe.stamp_ns, own.map_frame)
+        images = keyframe.left, keyframe.right
+        self._publish_pair(KEYFRAME_PARTS, stamp_ns, images, self._calibration)
         moving = np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
-        self._moving_mask.publish(image_message(stamp_ns, self.frames.left, moving))
-        self._pose.publish(
-            poses.odometry_message(
-                stamp_ns,
-                own.map_frame,
-                own.base_frame,
-                keyframe.T_map_base,
-                poses.at_least(result.covariance, LEAST_VARIANCE),
-            )
-        )
-        features = clouds.features_message(stamp_ns, own.map_frame, keyframe.features)
-        self._features.publish(features)
-        self._path.publish(self._path_messages.next(stamp_ns, keyframe.path))
-        self._map_start.publish(
-            map_start_message(stamp_ns, own.map_frame, self.map_start_ns, self._is_loaded)
-        )
-        self._map_points.publish(
-            clouds.sparse_cloud_message(stamp_ns, own.map_frame, keyframe.cloud)
-        )
+        out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
+        covariance = poses.at_least(result.covariance, LEAST_VARIANCE)
+        pose = poses.odometry_message(*at, own.base_frame, keyframe.T_map_base, covariance)
+        out.publish('keyframe/odometry', pose)
+        out.publish('keyframe/features', clouds.features_message(*at, keyframe.features))
+        out.publish('keyframe/path', self._path_messages.next(stamp_ns, keyframe.path))
+        out.publish(MAP_START, map_start_message(*at, self.map_start_ns, self._is_loaded))
+        out.publish('map_points', clouds.sparse_cloud_message(*at, keyframe.cloud))
 
 
 class SlamResults:
@@ -317,8 +297,6 @@ class SlamMaps:
         self._kept_ns: int | None = None
         self._parts: dict[str, MapFile] = {}
         self._arrived: Future | None = None
-        self._loaded_output = node.outputs.publisher(MAP_LOADED)
-        self._wanted = node.outputs.publisher(MAP_WANTED)
         node.inputs.subscribe(MAP_PART, self._take_part)
         node.outputs.trigger('~/save_map', self._save)
         node.outputs.trigger('~/load_map', self._load)
@@ -358,7 +336,7 @@ class SlamMaps:
             'grid': grid | {'stamp_ns': grid['stamp_ns'] + loaded.shift_ns},
             'points': {'point_id': cloud.point_id, 'xyz_map': cloud.xyz_map},
         }
-        self._loaded_output.publish(map_file_message(MapFile(header, parts)))
+        self._node.outputs.publish(MAP_LOADED, map_file_message(MapFile(header, parts)))
 
     def _slam_part(self) -> MapFile:
         slam = self._slam()
@@ -388,7 +366,7 @@ class SlamMaps:
         self._arrived = Future()
         give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
-        self._wanted.publish(make_header(last_ns, self._own.map_frame))
+        self._node.outputs.publish(MAP_WANTED, make_header(last_ns, self._own.map_frame))
         try:
             await self._arrived
             for part in self._parts.values():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,15 @@ from segfloor_ros.messages.diagnostics import RECORDING, Level
 from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
-from segfloor_ros.messages.topics import FRAMES, PACED_BY, PATIENCE_S, TOPICS, stamp_of, to_time
+from segfloor_ros.messages.topics import (
+    FRAMES,
+    PACED_BY,
+    PATIENCE_S,
+    TOPICS,
+    Topic,
+    stamp_of,
+    to_time,
+)
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.reporter import SETTLED_S
 from segfloor_ros.nodes.shared.running import run_node
@@ -52,6 +60,10 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
     """Publishes every pair with its own stamp, once somebody listens."""
 
     settings_type = StereoCameraNodeSettings
+
+    def output_topics(self) -> Sequence[Topic]:
+        """Return none: they follow from the recording."""
+        return ()
 
     def set_up(self) -> None:
         """Open the recording and make the topics."""

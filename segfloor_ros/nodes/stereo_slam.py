@@ -33,7 +33,6 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
     def set_up(self) -> None:
         """Make the topics."""
         self.slam: StereoSlam | None = None
-        self._frame_done = self.outputs.publisher(FRAME_DONE)
         self._transforms = Transforms(self)
         self.masks = MaskInput(self, self.settings.mask_timeout_s)
         self._work = self.inputs.later(self._process_waiting)
@@ -117,7 +116,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         is_ready = self._is_ready(pairs[0][1])
         for stamp_ns, _ in pairs.skip_overdue(is_ready, self.settings.max_waiting_frames):
             self._camera.watch.report_skipped(stamp_ns, is_ready)
-            self._frame_done.publish(make_header(stamp_ns, self._results.topics.frames.left))
+            self._answer(stamp_ns)
         lag_ns = self.slam.sensors.lag_ns if self.slam is not None else 0
         if not is_ready or self._sensors.is_behind(pairs[0][0], lag_ns):
             return
@@ -125,7 +124,11 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._work()
         if self._is_in_order(stamp_ns):
             self._process(stamp_ns, pair)
-        self._frame_done.publish(make_header(stamp_ns, self._results.topics.frames.left))
+        self._answer(stamp_ns)
+
+    def _answer(self, stamp_ns: int) -> None:
+        """Report that a pair goes no further."""
+        self.outputs.publish(FRAME_DONE, make_header(stamp_ns, self._results.topics.frames.left))
 
     def _is_ready(self, pair: Pair) -> bool:
         """Whether calibration and mount are known: they come in their own time."""

@@ -70,7 +70,6 @@ class KeyframeJoin:
         self._node = node
         self._process = process
         self._is_last = is_last
-        self._done = node.outputs.publisher(KEYFRAME_DONE)
         self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEYFRAMES.depth)
         self._left_ns: int | None = None
         self.map_start_ns: int | None = None
@@ -101,7 +100,7 @@ class KeyframeJoin:
             stamp_ns, parts = self._waiting.popleft()
             is_well = self._work(stamp_ns, parts)
             if self._is_last or not is_well:
-                self._done.publish(make_header(stamp_ns, ''))
+                self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
 
     def _work(self, stamp_ns: int, parts: dict[str, Any]) -> bool:
         """Have the node process a keyframe and report how it went; returns whether it went well."""
@@ -117,7 +116,7 @@ class KeyframeJoin:
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         if MAP_START in parts and not self._follow(parts[MAP_START]):
-            self._done.publish(make_header(stamp_ns, ''))
+            self._node.outputs.publish(KEYFRAME_DONE, make_header(stamp_ns, ''))
             return
         self._waiting.append((stamp_ns, parts))
         self.process_waiting()
@@ -153,7 +152,6 @@ class MapPart:
         self._arrays = arrays
         self._loaded_ns: int | None = None
         self._wanted_ns: int | None = None
-        self._output = node.outputs.publisher(MAP_PART)
         node.inputs.subscribe(MAP_LOADED, self._take_loaded)
         node.inputs.subscribe(MAP_WANTED, self._take_wanted)
         keyframes.may_process = self._is_here
@@ -205,7 +203,7 @@ class MapPart:
 
     def _send(self) -> None:
         self._wanted_ns = None
-        self._output.publish(map_file_message(self._file()))
+        self._node.outputs.publish(MAP_PART, map_file_message(self._file()))
 
 
 class KeptState:

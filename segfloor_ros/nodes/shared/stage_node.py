@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -18,7 +18,7 @@ from segfloor_ros.configuration import NodeSettings
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.files.saved_map import MapFile
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.messages.topics import TOPICS, Topic, published_by
 from segfloor_ros.nodes.shared.inputs import CHECK_S, Inputs
 from segfloor_ros.nodes.shared.maps import KeptState
 from segfloor_ros.nodes.shared.reporter import Connections, Reporter, one_line
@@ -47,6 +47,15 @@ class Outputs:
         self.publishers[name] = made
         self.at_clean_up(lambda: self._node.destroy_publisher(made))
         return made
+
+    def publish(self, name: str, message: Any) -> None:
+        """Publish a message on a topic of `TOPICS`."""
+        self.publishers[name].publish(message)
+
+    def listeners(self, name: str) -> int:
+        """Return how many subscribers a topic of `TOPICS` has."""
+        count: int = self.publishers[name].get_subscription_count()
+        return count
 
     def service(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
         """Offer a service. answer: may be a coroutine; the node works on while it waits."""
@@ -167,6 +176,8 @@ class States(ManagedEntity):
             node.outputs.service(SetBool, '~/pause', self._answer_pause)
             node.outputs.service(Trigger, '~/reset', self._answer_reset)
             node.outputs.at_clean_up(node.kept_state.remove)
+            for topic in node.output_topics():
+                node.outputs.publisher(topic.name)
             node.set_up()
             node.reset_stage()
             kept = node.kept_state.take()
@@ -239,8 +250,14 @@ class StageNode(LifecycleNode, Generic[Settings]):
 
     # What the nodes fill in.
 
+    def output_topics(self) -> Sequence[Topic]:
+        """Return the topics that the node publishes whatever its parameters are."""
+        return published_by(self.settings.stage_name())
+
     def set_up(self) -> None:
-        """Make the topics and services. Raises SegfloorError when that cannot be."""
+        """Make the inputs, the services and further topics. Raises SegfloorError when that cannot
+        be.
+        """
         raise NotImplementedError
 
     def reset_stage(self) -> None:
