@@ -123,6 +123,18 @@ def test_heights_are_those_above_the_floor_below_the_base() -> None:
     assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE}
 
 
+def test_on_a_ramp_heights_are_those_above_the_ramp() -> None:
+    """A base that goes up by 10 degrees: floor runs on in its plane, not level."""
+    labelling = CloudLabelling(CloudLabellingSettings())
+    up = np.radians(10.0)
+    R = np.array([[np.cos(up), 0, -np.sin(up)], [0, 1, 0], [np.sin(up), 0, np.cos(up)]])
+    ramp = make_transform(R, np.array([3.0, 1.0, 0.5]))
+    in_base = {1: (1.2, 0.3, 0.0), 2: (1.2, -0.3, 0.4), 3: (-1.2, 0.0, 0.0)}
+    points = cloud({i: tuple(R @ xyz + ramp[:3, 3]) for i, xyz in in_base.items()})
+    labelled = labelling.update(points, features(dict.fromkeys(in_base, NOWHERE)), MASK, ramp)
+    assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE, 3: FLOOR}
+
+
 def test_heights_of_far_points_count_less() -> None:
     far, near = CloudLabelling(CloudLabellingSettings()), CloudLabelling(CloudLabellingSettings())
     seen = features({1: NOWHERE})

@@ -8,6 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.files.saved_map import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert
+from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -63,6 +64,15 @@ def test_a_loaded_map_is_the_one_that_was_saved(mapped):
     stamps = [k.stamp_ns for k in slam.map.keyframes]
     assert stamps[-1] < 0
     assert np.diff(stamps).tolist() == np.diff([k.stamp_ns for k in mapped.map.keyframes]).tolist()
+
+
+def test_the_disparity_offset_is_that_of_the_rig_that_made_the_map(mapped):
+    before = mapped.rig.offset.estimate
+    mapped.rig.offset.estimate = OffsetEstimate(0.37, 4200.0)
+    try:
+        assert loaded(mapped, localize=True).rig.offset.estimate == OffsetEstimate(0.37, 4200.0)
+    finally:
+        mapped.rig.offset.estimate = before
 
 
 def test_saving_again_does_not_grow_the_file(mapped):

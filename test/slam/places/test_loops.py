@@ -10,6 +10,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
+from segfloor_ros.slam.places.loop_closing import plan_closing
 from segfloor_ros.slam.places.loops import LoopChecks
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -91,3 +92,18 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
     assert LoopChecks(slam.map).is_level(match) is expected
+
+
+def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
+    """Links take up less of a contradiction than the loops beside them."""
+    slam, _ = closed
+    keyframes = slam.map.keyframes
+    relative = keyframes[-1].T_camera_world @ invert(keyframes[0].T_camera_world)
+    none = np.zeros(0, np.int32)
+    match = Match(keyframes[-1].index, 0, relative, none.astype(np.intp), none, none)
+    graph = plan_closing(slam.map, [match]).graph
+    links = len(slam.map.links()[0])
+    assert len(graph.sigma) == links + len(slam.map.loops) + 1
+    assert (graph.sigma[links:] > graph.sigma[:links].max(axis=0)).all()
+    assert (graph.i[-1], graph.j[-1]) == (keyframes[-1].index, 0)
+    np.testing.assert_allclose(graph.T_i_j[-1], relative, atol=1e-9)

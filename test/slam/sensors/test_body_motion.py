@@ -11,6 +11,7 @@ from segfloor_ros.geometry import adjoint, invert, make_transform, se3_exp, se3_
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
 from segfloor_ros.slam.sensors.gyroscope import Gyroscope
 from segfloor_ros.slam.sensors.wheel_odometry import (
+    MAX_WINDOWS,
     Stretch,
     WheelCalibration,
     WheelCalibrator,
@@ -114,6 +115,15 @@ def test_scale_yaw_and_offset_of_the_wheels_are_found():
     assert found.offset_m == pytest.approx((0.15, -0.05), abs=5e-3)
     assert found.turn_scale == pytest.approx(0.96, abs=2e-3)
     assert set(found.remarks()) == {'scale', 'turn_scale', 'yaw', 'offset'}
+
+
+def test_wheels_that_wear_are_known_as_they_are_now():
+    calibrator, motions = WheelCalibrator(), some_motions(MAX_WINDOWS)
+    for scale in (1.0, 1.05):
+        for one in driven((scale, 0.0, (0.0, 0.0), 1.0), motions):
+            calibrator.add(one)
+    assert len(calibrator) == MAX_WINDOWS
+    assert calibrator.current.scale == pytest.approx(1.05, abs=2e-3)
 
 
 def test_stamps_of_an_imu_that_are_late_are_found_out():
