@@ -63,6 +63,25 @@ def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():
     assert wrong_m.max() > 2 * errors_m.max()
 
 
+def test_a_blind_stretch_is_in_the_axes_of_the_camera_that_has_turned():
+    """One look after 0.6 s, in which the camera turns by a good part of a right angle."""
+    body = BodyMotion()
+    motion = CameraMotion(40.0, body)
+    start, seen_s, blind_s = invert(pose(0, True)), 8.8, 0.6
+    for k in range(1, round((seen_s + blind_s) * RATE_HZ) + 1):
+        sample = imu_sample(k / RATE_HZ, turns=True, place_m=(0.0, 0.0, 0.0))
+        body.add(ImuSample(sample.stamp_ns, sample.gyro_rad_s, sample.accel_m_s2, sample.place_m))
+        true = start @ pose(k / RATE_HZ, True)
+        if k % 20 == 0 and k / RATE_HZ <= seen_s:
+            motion.take(invert(true), 1e-6 * np.eye(6), sample.stamp_ns)
+    before = invert(motion.T_camera_world)
+    assert motion.bridge(sample.stamp_ns)
+    turned = Rotation.from_matrix(before[:3, :3]).inv() * Rotation.from_matrix(true[:3, :3])
+    assert turned.magnitude() > 0.2
+    assert np.linalg.norm(before[:3, 3] - true[:3, 3]) > 0.15
+    assert np.linalg.norm((true @ motion.T_camera_world)[:3, 3]) < 0.02
+
+
 def test_without_an_accelerometer_the_speed_is_constant_for_a_second():
     _, errors_m = blind_drive(SEEN_S + 3.0, has_accel=False)
     assert 10 <= len(errors_m) < 20
