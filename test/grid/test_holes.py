@@ -1,7 +1,9 @@
-"""What little is undecided in the middle of free cells."""
+"""Rays of free cells, and what little is undecided in the middle of them."""
 
 import numpy as np
+import pytest
 
+from segfloor_ros.grid.fold import draw_rays
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGridSettings
 from segfloor_ros.grid.raster import FREE_FROM, OCCUPIED_FROM, ZERO, LogOddsRaster, render, steps
 
@@ -44,3 +46,14 @@ def test_what_lies_at_the_edge_of_the_map_is_no_hole():
     cells = free_room()
     cells[0, 10] = 0
     assert drawn(cells)[0, 10] == UNKNOWN
+
+
+@pytest.mark.parametrize('short', [0.0, 0.5, 2.0])
+def test_a_ray_ends_as_much_before_its_point_as_it_should(short) -> None:
+    raster = np.zeros((20, 20), np.uint8)
+    draw_rays(raster, np.array([2.5, 3.5]), np.array([[10.0, 0.0], [0.0, 12.0]]), short)
+    expected = np.zeros_like(raster)
+    # From the middle of column 2, row 3: to 12.5 along the row and to 15.5 along the column.
+    expected[3, 2 : int(12.5 - short) + 1] = 1
+    expected[3 : int(15.5 - short) + 1, 2] = 1
+    np.testing.assert_array_equal(raster, expected)
