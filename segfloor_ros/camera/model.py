@@ -155,6 +155,9 @@ class StereoCameraSettings(StageSettings):
     """Where images come from and how left and right are paired."""
 
     input: str = setting('', 'Recording or device to read: folder, bag, video or device.')
+    start: int = setting(0, 'First frame of a recording that is read.', within=(0, 10**9))
+    frames: int = setting(0, 'Frames that are read; 0: to the end.', within=(0, 10**9))
+    every: int = setting(1, 'Read every n-th frame only.', within=(1, 10**6))
     rate_hz: float = setting(
         0.0,
         'Frame rate of a recording without time stamps; 0 takes 10 Hz.',

@@ -55,6 +55,9 @@ def run(
     out: terminal.Out,
     params: terminal.Params = None,
     assignments: terminal.Set = None,
+    start: terminal.Start = None,
+    frames: terminal.Frames = None,
+    every: terminal.Every = None,
     ignore: terminal.Ignore = None,
     depth: terminal.Depth = False,
     save_masks: Annotated[
@@ -76,7 +79,10 @@ def run(
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
     maps = MapOptions(load_map, save_map, localize)
-    configuration = terminal.configuration(params, assignments, input, masks, ignore, depth)
+    part = {'start': start, 'frames': frames, 'every': every}
+    configuration = terminal.configuration(
+        params, assignments, input, masks=masks, ignore=ignore, depth=depth, **part
+    )
     source = open_source(configuration.stereo_camera)
     terminal.print_sensors(source.sensors)
     inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
@@ -203,11 +209,15 @@ def convert(
     images: Annotated[
         ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
     ] = ImageCoding.raw,
+    start: terminal.Start = None,
+    frames: terminal.Frames = None,
+    every: terminal.Every = None,
     params: terminal.Params = None,
     assignments: terminal.Set = None,
 ) -> None:
     """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured."""
-    settings = terminal.configuration(params, assignments, input).stereo_camera
+    part = {'start': start, 'frames': frames, 'every': every}
+    settings = terminal.configuration(params, assignments, input, **part).stereo_camera
     source = open_source(settings)
     terminal.print_sensors(source.sensors)
     has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from typing import Annotated
 
 import typer
 
+import segfloor_ros
 from segfloor_ros.cli.check import check_suite
 from segfloor_ros.cli.commands import benchmark, calibrate, convert, demo, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
@@ -21,7 +23,6 @@ from segfloor_ros.processes import terminated_like_interrupted
 app = typer.Typer(
     help='Occupancy maps for ground robots from a stereo camera alone.',
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
@@ -30,8 +31,21 @@ app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')
 
 
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        typer.echo(f'segfloor_ros {segfloor_ros.__version__}')
+        raise typer.Exit
+
+
 @app.callback()
-def _options() -> None:
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            '--version', help='Print the version.', callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
     """Occupancy maps for ground robots from a stereo camera alone."""
 
 

@@ -28,6 +28,9 @@ def replay(
     ] = 1.0,
     params: terminal.Params = None,
     assignments: terminal.Set = None,
+    start: terminal.Start = None,
+    frames: terminal.Frames = None,
+    every: terminal.Every = None,
     ignore: terminal.Ignore = None,
     depth: terminal.Depth = False,
     save_masks: Annotated[
@@ -54,7 +57,10 @@ def replay(
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
     maps = MapOptions(load_map, save_map, localize)
-    configuration = terminal.configuration(params, assignments, input, masks, ignore, depth)
+    part = {'start': start, 'frames': frames, 'every': every}
+    configuration = terminal.configuration(
+        params, assignments, input, masks=masks, ignore=ignore, depth=depth, **part
+    )
     # The camera node reads it; it is opened here so that bad input ends at once.
     source = open_source(configuration.stereo_camera)
     if source.takes_depth:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -171,6 +171,9 @@ def within(
 Input = Annotated[
     str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')
 ]
+Start = Annotated[int | None, typer.Option('--start', help='First frame that is read.')]
+Frames = Annotated[int | None, typer.Option('--frames', help='How many frames are read.')]
+Every = Annotated[int | None, typer.Option('--every', help='Read every n-th frame only.')]
 Out = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
 Params = Annotated[
     Path | None,
@@ -219,14 +222,14 @@ NoMap = Annotated[
 
 
 def configuration(
-    params: Path | None,
-    assignments: list[str] | None,
-    input: str,
-    masks: Path | None = None,
-    ignore: str | None = None,
-    depth: bool = False,
+    params: Path | None, assignments: list[str] | None, input: str, **camera: Any
 ) -> Configuration:
-    """Return the configuration that the options of a command stand for."""
-    given = {'masks': masks and str(masks), 'ignore': ignore, 'depth': depth or None}
-    camera = {name: value for name, value in given.items() if value is not None}
-    return resolve(params, assignments or (), stereo_camera={'input': input, **camera})
+    """Return the configuration that the options of a command stand for. camera: settings of
+    `stereo_camera`; those that are None or False were not given.
+    """
+    given = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in camera.items()
+        if value is not None and value is not False
+    }
+    return resolve(params, assignments or (), stereo_camera={'input': input, **given})

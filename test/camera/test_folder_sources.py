@@ -74,6 +74,29 @@ def test_part_of_a_kitti_drive_keeps_its_numbers_and_times(tmp_path: Path) -> No
     assert stamps_ms(source) == [700, 800, 900]
 
 
+@pytest.mark.parametrize(
+    ('start', 'frames', 'every', 'expected'),
+    [(0, 0, 1, range(9)), (2, 0, 1, range(2, 9)), (0, 3, 1, range(3)), (1, 3, 2, [1, 3, 5])],
+)
+def test_a_part_of_a_recording_keeps_indices_and_times(
+    tmp_path, start, frames, every, expected
+) -> None:
+    folder = write_kitti(tmp_path, grey_pairs(9))
+    whole = list(opened(folder).frames())
+    part = opened(folder, start=start, frames=frames, every=every)
+    assert part.frame_count == len(expected)
+    read = list(part.frames())
+    assert [f.index for f in read] == list(expected)
+    assert [f.stamp_ns for f in read] == [whole[i].stamp_ns for i in expected]
+    for frame in read:
+        np.testing.assert_array_equal(frame.left, whole[frame.index].left)
+
+
+def test_a_part_behind_the_end_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match='has 3 frames; --start 3 is behind its end'):
+        opened(write_kitti(tmp_path, grey_pairs(3)), start=3)
+
+
 def test_kitti_colour_folders_are_read_as_grey(tmp_path: Path) -> None:
     red = np.zeros((48, 64, 3), np.uint8)
     red[:, :, 2] = 255

@@ -5,6 +5,7 @@ from chessboards import BOARD, K_TRUE, SQUARE_M, write_boards
 from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 
+import segfloor_ros
 from segfloor_ros.camera.calibration.files import read_calibration
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
@@ -21,6 +22,24 @@ def test_a_converted_recording_has_the_same_frames(tmp_path):
         assert frame.stamp_ns == original.stamp_ns
         np.testing.assert_array_equal(frame.left, original.left)
         np.testing.assert_array_equal(frame.right, original.right)
+
+
+def test_a_part_of_a_recording_is_converted(tmp_path):
+    frames, _ = room_drive(6, 0.05)
+    folder = write_kitti(tmp_path / 'drive', frames)
+    out = tmp_path / 'part.mcap'
+    done = segfloor('convert', folder, out, '--start', 1, '--frames', 2, '--every', 2)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith('2 pairs')
+    whole = list(open_source(StereoCameraSettings(input=str(folder))).raw_pairs())
+    part = list(open_source(StereoCameraSettings(input=str(out))).raw_pairs())
+    assert [pair.stamp_ns for pair in part] == [whole[1].stamp_ns, whole[3].stamp_ns]
+    np.testing.assert_array_equal(part[1].left, whole[3].left)
+
+
+def test_the_version_is_that_of_the_package():
+    done = segfloor('--version')
+    assert done.stdout == f'segfloor_ros {segfloor_ros.__version__}\n'
 
 
 def test_convert_does_not_overwrite(tmp_path):

@@ -58,6 +58,7 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
             raise InputError(
                 f'{source.name}: no depth images can be read from it; leave out --depth'
             )
+        source.cut(settings.start, settings.frames, settings.every)
         if settings.masks:
             source.masks = MaskFolder(Path(settings.masks).expanduser(), source.camera)
         return source

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -114,6 +115,7 @@ class StereoSource:
         self.frame_count = frame_count
         self.rate_hz = rate_hz
         self.masks: MaskFolder | None = None
+        self._part = slice(0, None)
         self.skipped_frames = 0
         self._warned_of: set[int] = set()
         self._eight_bit = EightBitScale(bit_depth)
@@ -128,6 +130,18 @@ class StereoSource:
     def takes_depth(self) -> bool:
         """Whether depth images stand in place of the right ones."""
         return any(sensor.name == DEPTH and sensor.used for sensor in self.sensors)
+
+    def cut(self, start: int, frames: int, every: int) -> None:
+        """Read a part of the recording only: from frame `start` on, so many frames (0: all), every
+        n-th one. Frames keep their index. Raises InputError where it ends before.
+        """
+        self._part = slice(start, start + frames * every if frames else None, every)
+        if self.frame_count is not None:
+            if start >= self.frame_count:
+                raise InputError(
+                    f'{self.name}: has {self.frame_count} frames; --start {start} is behind its end'
+                )
+            self.frame_count = len(range(self.frame_count)[self._part])
 
     def frames(self) -> Iterator[StereoFrame]:
         """Yield the rectified pairs in order of their stamps; the next ones are prepared
@@ -158,7 +172,8 @@ class StereoSource:
 
     def _decoded(self) -> Iterator[RawPair]:
         self.skipped_frames = 0
-        for entry in self._read(self):
+        part = self._part
+        for entry in islice(self._read(self), part.start, part.stop, part.step):
             try:
                 left, right = entry.load()
             except CorruptImageError as error:
