@@ -57,9 +57,14 @@ class SensorInput:
     """
 
     def __init__(
-        self, node: AnyStageNode, transforms: Transforms, on_message: Callable[[], None]
+        self,
+        node: AnyStageNode,
+        transforms: Transforms,
+        on_message: Callable[[], None],
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._node = node
+        self._clock_s = clock_s
         self._transforms = transforms
         self._on_message = on_message
         self._takes_best_effort = False
@@ -78,7 +83,7 @@ class SensorInput:
         }
         self._latest: dict[str, tuple[int, float]] = {}
         self._asked: tuple[int, float] = (0, 0.0)
-        self._began_s = time.monotonic()
+        self._began_s = self._clock_s()
         self._has_tf_wheels = False
 
     def begin(self, left_frame: str, R_rectified_left: Array) -> None:
@@ -117,7 +122,7 @@ class SensorInput:
         """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
         how much later its stamps are.
         """
-        now_s = time.monotonic()
+        now_s = self._clock_s()
         if self._asked[0] != stamp_ns:
             self._asked = stamp_ns, now_s
         if now_s > self._asked[1] + MAX_LATE_S:
@@ -183,7 +188,7 @@ class SensorInput:
 
     def _note(self, name: str, message: Odometry | Imu) -> None:
         latest_ns = max(_stamp_ns(message), self._latest.get(name, (0, 0.0))[0])
-        self._latest[name] = latest_ns, time.monotonic()
+        self._latest[name] = latest_ns, self._clock_s()
         self._on_message()
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import bag_file, open_source
+from segfloor_ros.camera.sources.bag_file import read_rosbag2_with
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 
@@ -22,8 +23,8 @@ def rosbag2_py(monkeypatch):
     """Make rosbag2_py importable: the real one where ROS has it, else one that rosbags backs."""
     if importlib.util.find_spec('rosbag2_py') is None:
         monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'ros_stand_in'))
-    monkeypatch.setattr(bag_file, '_ros_reader', None)
     yield
+    read_rosbag2_with(None)
     sys.modules.pop('rosbag2_py', None)
 
 
@@ -38,8 +39,8 @@ def pairs(path: Path, count: int):
 def test_a_bag_is_read_the_same_by_both(rosbag2_py) -> None:
     plain, expected = pairs(DEMO, 5)
     use_rosbag2_py()
-    assert bag_file._ros_reader is not None
     source, found = pairs(DEMO, 5)
+    assert 'rosbag2_py' in sys.modules
     assert source.calibration.camera == plain.calibration.camera
     assert (source.frame_count, source.rate_hz) == (plain.frame_count, plain.rate_hz)
     assert len(found) == 5
@@ -58,7 +59,7 @@ def test_without_rosbags_rosbag2_py_is_enough_and_without_both_there_is_one_line
     with pytest.raises(InputError, match=r'damaged\.mcap: cannot read the bag') as error:
         pairs(damaged, 1)
     assert '\n' not in str(error.value)
-    monkeypatch.setattr(bag_file, '_ros_reader', None)
+    read_rosbag2_with(None)
     for name in [name for name in sys.modules if name.partition('.')[0] == 'rosbags']:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match='pip install rosbags') as error:

@@ -149,9 +149,16 @@ class Tf:
 
 
 @pytest.fixture
-def sensors(make_graph):
+def now_s() -> list[float]:
+    """The time that the sensors are told."""
+    return [100.0]
+
+
+@pytest.fixture
+def sensors(make_graph, now_s):
     graph = make_graph('-p', 'autostart:=false')
-    return SensorInput(graph.add(StereoSlamNode()), Tf(), lambda: None)
+    node = graph.add(StereoSlamNode())
+    return SensorInput(node, Tf(), lambda: None, clock_s=lambda: now_s[0])
 
 
 def imu(stamp_ns: int, frame: str, accel=(0.0, 0.0, 9.81)) -> Imu:
@@ -186,9 +193,7 @@ def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> No
     assert [m.stamp_ns // MS for m in sensors.take(30 * MS)] == [12, 25]
 
 
-def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, monkeypatch) -> None:
-    now_s = [100.0]
-    monkeypatch.setattr('segfloor_ros.nodes.slam_sensors.time.monotonic', lambda: now_s[0])
+def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, now_s) -> None:
     assert not sensors.is_behind(50 * MS)  # nothing was ever heard
     sensors.receive('imu', imu(40 * MS, ''))
     assert sensors.is_behind(60 * MS)

@@ -64,8 +64,10 @@ OpenBag = Callable[[Path], tuple[dict[str, Topic], ReadMessages]]
 _ros_reader: OpenBag | None = None
 
 
-def read_rosbag2_with(open_bag: OpenBag) -> None:
-    """Have rosbag2 files read by another library from now on. It may raise anything."""
+def read_rosbag2_with(open_bag: OpenBag | None) -> None:
+    """Have rosbag2 files read by another library from now on, which may raise anything; None: by
+    rosbags again.
+    """
     global _ros_reader
     _ros_reader = open_bag
 
