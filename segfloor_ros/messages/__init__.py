@@ -1,1 +1,1 @@
-"""Conversions between NumPy data and ROS 2 messages, quality of service, and joining by stamp."""
+"""Conversions between NumPy data and ROS 2 messages, topics and their quality of service."""

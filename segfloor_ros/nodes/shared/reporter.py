@@ -8,7 +8,7 @@ import difflib
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -26,9 +26,11 @@ from segfloor_ros.messages.diagnostics import (
     Status,
     status_message,
 )
-from segfloor_ros.messages.join import StampJoiner
 from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic, describe_policies
 from segfloor_ros.timing import rss_mb
+
+if TYPE_CHECKING:
+    from segfloor_ros.nodes.shared.inputs import StampJoiner
 
 LASTS_S, EVENT_LASTS_S = 3.0, 10.0
 """So long a problem counts that is looked for once a second, or shows now and then."""
