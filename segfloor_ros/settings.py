@@ -39,6 +39,10 @@ GONE = {
     'max_height_log_odds': 'it is a constant now',
     'max_hit_error_m': 'it follows from resolution_m',
     'coarse_above_px': 'it is a constant now',
+    'obstacle_height_m': 'it is a constant now',
+    'fill_support': 'it is a constant now',
+    'fill_gap_m': 'it is a constant now',
+    'scan_gap_m': 'it follows from step_height_m',
 }
 """Settings of earlier versions, and what became of them."""
 

@@ -24,6 +24,8 @@ from segfloor_ros.geometry import Array, transform_points
 RANGE_STEP_M = 0.025
 _INCREMENT_RAD = 0.0087266
 """Half a degree between two bearings."""
+_GAP_STEPS = 5
+"""A gap in the floor as long as so many steps are high is no gap to the robot."""
 _GAP_ROWS = 4.0
 """So many image rows of floor may be missing, however many metres they are."""
 _CONTACT_ROWS = 2.5
@@ -62,7 +64,7 @@ class FloorScanner:
     def __init__(
         self, camera: StereoCamera, mount: Mount, settings: FloorSegmentationSettings
     ) -> None:
-        self._camera, self._settings = camera, settings
+        self._camera, self._gap_m = camera, _GAP_STEPS * settings.step_height_m
         self._height_m = mount.height_m
         border = _floor_on_border(camera, mount)
         bearing = np.arctan2(border[:, 1], border[:, 0])
@@ -125,7 +127,7 @@ class FloorScanner:
         # that has crept up a blank wall.
         reached = grey_closing(self._reached(seen, seen_by_both), size=(_DIP_BEARINGS,))
         reached = np.minimum(grey_opening(reached, size=(_DIP_BEARINGS,)), limit)
-        near = np.maximum(self._settings.scan_gap_m, _SPREAD * upright_m)
+        near = np.maximum(self._gap_m, _SPREAD * upright_m)
         near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
             touches = (reached > 0) & (reached >= upright_m - near)
@@ -157,7 +159,7 @@ class FloorScanner:
 
     def _tolerance(self, range_m: Array) -> Array:
         """Return how long a gap in the floor may be at a range."""
-        return np.maximum(self._settings.scan_gap_m, _GAP_ROWS * self._row_m(range_m))
+        return np.maximum(self._gap_m, _GAP_ROWS * self._row_m(range_m))
 
     def _row_m(self, range_m: Array) -> Array:
         """Return how much floor one image row shows at a range."""

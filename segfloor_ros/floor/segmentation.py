@@ -262,7 +262,7 @@ class FloorSegmentation:
         self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
     ) -> VDisparity:
         most = self._matcher.num_disparities
-        return filtered_v_disparity(view, disparity, textured, most, BINS_PER_PX, self._settings)
+        return filtered_v_disparity(view, disparity, textured, most, BINS_PER_PX)
 
     def _fill(
         self,
@@ -277,17 +277,14 @@ class FloorSegmentation:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice.
         """
-        settings = self._settings
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
         left = np.ascontiguousarray(left_rows[:, :: view.step])
         for _ in range(2):
             barred = beside | odd
-            mask = fill_regions(
-                view, mask, left_rows, disparity, compared, textured, barred, settings.fill_support
-            )
+            mask = fill_regions(view, mask, left_rows, disparity, compared, textured, barred)
             may_be = compared.consistent & ~compared.denied & ~barred
-            mask = fill_gaps(view, profile, mask, may_be, settings.fill_gap_m)
+            mask = fill_gaps(view, profile, mask, may_be)
             odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
         return drop_islands(mask)
 

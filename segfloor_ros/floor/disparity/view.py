@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
-from segfloor_ros.floor.observation import FloorSegmentationSettings, VDisparity
+from segfloor_ros.floor.observation import VDisparity
 
 _WIDE_PX = 480
 """Of wider images every other column is used: neighbours say the same."""
@@ -25,6 +25,8 @@ _FAR_M = 1000.0
 _ROWS_PER_PX = 16
 """Steps per pixel of disparity at which the profile is tabulated."""
 
+_OBSTACLE_M = 0.2
+"""An upright surface of this height is taken out before the profile is fitted."""
 _RISE_PX = 1.0
 """Disparities are compared over as many rows as it takes a floor to rise by this."""
 _RISE_TOLERANCE = 0.75
@@ -179,7 +181,6 @@ def filtered_v_disparity(
     textured: NDArray[np.bool_],
     num_disparities: int,
     bins_per_px: int,
-    settings: FloorSegmentationSettings,
 ) -> VDisparity:
     """Return the v-disparity of what is textured and not upright."""
     camera = view.camera
@@ -192,7 +193,7 @@ def filtered_v_disparity(
     num = num_disparities + 1
     limit = obstacle_rows(
         np.arange(num),
-        settings.obstacle_height_m,
+        _OBSTACLE_M,
         camera.fy / (camera.fx * camera.baseline_m),
         1 / view.line.slope,
     )

@@ -24,6 +24,10 @@ from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 _STEP_PX = 2
 """Regions are found at this part of the resolution."""
 _MIN_REGION_PX = 15
+_MIN_COLUMNS = 0.3
+"""Part of the columns of a region that must show floor for it to be filled."""
+_GAP_M = 0.5
+"""Gaps of this size between floor pixels are filled where nothing speaks against it."""
 _THREAD_PX = 3
 _ISLAND_SHARE = 0.05
 """Patches of floor smaller than this share of the largest are dropped."""
@@ -63,14 +67,13 @@ def fill_regions(
     compared: Comparison,
     textured: NDArray[np.bool_],
     barred: NDArray[np.bool_],
-    min_share: float,
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
     image: whole image rows (R, image width). barred: (R, W), where no region goes on. A region is
     bounded by edges of the image stronger than most of the floor's own; floor by evidence must be
-    in `min_share` of its columns. In it a pixel becomes floor below floor, the next evidence up its
+    in a share of its columns. In it a pixel becomes floor below floor, the next evidence up its
     column; or between floor on its left and right; or, if it is not blank, nearer than any of its
     floor.
     """
@@ -86,7 +89,7 @@ def fill_regions(
     alike = (small != NOT_FLOOR) & agreed & (slope < limit)
     core = cv2.erode(alike.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, region = cv2.connectedComponents(core, connectivity=4)
-    top = _top_of_supported(region, count, floor, min_share)
+    top = _top_of_supported(region, count, floor)
     highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
     not_blank = cv2.erode(
         textured[part].astype(np.uint8),
@@ -113,7 +116,7 @@ def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _top_of_supported(
-    region: NDArray[np.int32], count: int, floor: NDArray[np.bool_], min_share: float
+    region: NDArray[np.int32], count: int, floor: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
     """Return the topmost row (count,) with floor of each region, the number of rows where it has
     too little.
@@ -134,7 +137,7 @@ def _top_of_supported(
     extent = columns_of(
         number[region].reshape(-1), np.tile(np.arange(width, dtype=np.int32), height)
     )
-    wide = columns_of(owner, columns) >= min_share * extent
+    wide = columns_of(owner, columns) >= _MIN_COLUMNS * extent
     first = np.full(len(large) + 1, height, np.intp)
     first[owner[::-1]] = rows[::-1]  # the topmost comes last
     top = np.full(count, height, np.intp)
@@ -190,14 +193,13 @@ def fill_gaps(
     profile: FloorProfile,
     mask: NDArray[np.uint8],
     consistent: NDArray[np.bool_],
-    gap_m: float,
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
-    are at most `gap_m` apart, where the images do not contradict the floor (`consistent`).
+    are near enough to each other, where the images do not contradict the floor (`consistent`).
     """
     height, width = mask.shape
     disparity = np.nan_to_num(profile.at_rows(np.arange(height) + view.first_row))
-    longest = gap_m * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
+    longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
     gaps = Runs.of(mask == NO_EVIDENCE)
     # The matcher leaves out some columns at the right border.
     at_border = (gaps.stop == width) & (width - gaps.first <= _BORDER_PX // view.step)

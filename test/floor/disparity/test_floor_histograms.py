@@ -12,7 +12,6 @@ from segfloor_ros.floor.disparity.view import (
     u_disparity,
     v_disparity,
 )
-from segfloor_ros.floor.observation import FloorSegmentationSettings
 
 
 def test_u_disparity_counts_per_column_and_ignores_no_match():
@@ -44,14 +43,13 @@ def test_only_what_rises_as_a_floor_does_is_kept():
     assert rising(steps, slope)[2:-2].mean() < 0.3
 
 
-@pytest.mark.parametrize(('obstacle_height_m', 'share'), [(0.02, 0.0), (0.2, 0.93)])
-def test_what_covers_as_many_rows_as_an_obstacle_is_not_counted(obstacle_height_m, share):
-    # Four steps one above the other, each rising as the floor does: a disparity covers four times
-    # the 2.5 rows of the floor, and a thing of 2 cm no more than 7 rows at 20 to 44 px.
+@pytest.mark.parametrize(('period', 'share'), [(12, 0.0), (60, 0.93)])
+def test_what_covers_as_many_rows_as_an_obstacle_is_not_counted(period, share):
+    # Steps one above the other, each rising as the floor does: a disparity covers 20 or 4 times the
+    # 2.5 rows of the floor, and a thing of 20 cm 33 to 41 rows at 20 to 25 px.
     view = FloorView.of(CAMERA, MOUNT, 240)
-    rows = np.arange(240)[:, None] % 60
+    rows = np.arange(240)[:, None] % period
     disparity = np.broadcast_to(20 + view.line.slope * rows, view.derolled.shape)
     textured = np.ones(disparity.shape, bool)
-    settings = FloorSegmentationSettings(obstacle_height_m=obstacle_height_m)
-    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128, 1, settings)
+    seen = filtered_v_disparity(view, disparity.astype(np.float32), textured, 128, 1)
     assert seen.counts.sum() / disparity.size / view.step == pytest.approx(share, abs=0.1)
