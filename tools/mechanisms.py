@@ -106,8 +106,6 @@ SLAM: dict[str, Mechanism] = {
 
 FLOOR: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'slope ahead': Mechanism({'floor.plane.frame_plane._slope_ahead': _none}),
-    'a slope needs texture': Mechanism({'floor.plane.frame_plane._TEXTURED_SHARE': 0.0}),
     'a bend needs a measurement': Mechanism({'floor.disparity.profile._LINE_ITERATIONS': -1}),
     'level expectation': Mechanism(
         {
@@ -171,7 +169,6 @@ GRID: dict[str, Mechanism] = {
 """What makes the map of masks, scans and points."""
 
 RECORDED: dict[str, Mechanism] = {
-    'mirror': Mechanism({'floor.plane.mount.MountEstimator._mirror': _none}),
     'deblocking': SLAM['deblocking'],
 }
 """What changes the images or the mount, and so SLAM as well."""

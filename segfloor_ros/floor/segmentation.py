@@ -26,10 +26,9 @@ from segfloor_ros.floor.disparity.matching import (
     stereo_view,
 )
 from segfloor_ros.floor.disparity.photometric import (
-    MIN_TEXTURE_GREY,
-    NOISE_TEXTURE,
     compare,
     compare_measured,
+    enough_texture,
     noise_grey,
     row_slope,
     texture_grey,
@@ -66,7 +65,7 @@ from segfloor_ros.floor.observation import (
     FloorSegmentationSettings,
     VDisparity,
 )
-from segfloor_ros.floor.plane.frame_plane import expectations, plane_of_frame
+from segfloor_ros.floor.plane.plane import expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.tracking.images import union
@@ -132,7 +131,7 @@ class FloorSegmentation:
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
-            enough = max(MIN_TEXTURE_GREY, NOISE_TEXTURE * noise)
+            enough = enough_texture(noise)
             texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
             if measured is not None:
                 # Depth is measured on plain surfaces, too; a hole in it tells nothing.

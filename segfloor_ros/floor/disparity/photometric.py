@@ -37,9 +37,9 @@ _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
 _SIGMA_PX = 2.0
-MIN_TEXTURE_GREY = 0.2
+_MIN_TEXTURE_GREY = 0.2
 """Below this slope of the image along a row, per pixel, a disparity says nothing."""
-NOISE_TEXTURE = 0.1
+_NOISE_TEXTURE = 0.1
 """Texture per grey level of noise that is surely no noise: its own is 0.04."""
 _LAPLACIAN_GAIN = 6.0
 EDGE_SLOPE = 24
@@ -138,6 +138,11 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     response = cv2.filter2D(part, cv2.CV_32F, kernel)
     return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / _LAPLACIAN_GAIN
+
+
+def enough_texture(noise_grey: float) -> float:
+    """Return the texture, in grey levels per pixel, that is surely no noise."""
+    return max(_MIN_TEXTURE_GREY, _NOISE_TEXTURE * noise_grey)
 
 
 def row_slope(image: NDArray[np.uint8]) -> NDArray[np.int16]:

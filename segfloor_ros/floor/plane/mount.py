@@ -1,6 +1,9 @@
 """The camera's height, pitch and roll, measured from the floor it sees.
 
-Compares the camera's mount in use with the one that the first keyframes show of the floor.
+Two things show a floor: the plane on which what has texture lies, and the base of what stands on
+it. A floor of one colour shows nothing that both cameras see alike, but below the lower edge of a
+textured upright surface there is nothing but blank floor, and the disparity of the surface places
+that edge. Both are samples of one plane, which is known once its covariance says so.
 """
 
 from __future__ import annotations
@@ -8,87 +11,94 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, Up
-from segfloor_ros.floor.plane.mirror import (
-    MIRRORED_SHARE,
-    MirrorView,
-    mirror_candidates,
-    mirrored_share,
+from segfloor_ros.floor.disparity.matching import (
+    DisparityMatcher,
+    TwoScaleMatcher,
+    disparity_range,
+    stereo_view,
 )
-from segfloor_ros.floor.plane.mount_view import MountViewer, PlaneSearch
-from segfloor_ros.floor.plane.plane_fit import (
+from segfloor_ros.floor.disparity.photometric import (
+    EDGE_SLOPE,
+    enough_texture,
+    noise_grey,
+    row_slope,
+    texture_grey,
+)
+from segfloor_ros.floor.disparity.profile import pixels_where
+from segfloor_ros.floor.plane.plane import (
+    LEVEL_SIGMA,
+    SAMPLES,
     PlaneFit,
     Samples,
     angles_height_of,
     plane_of,
     plausible,
+    preference,
+    propose,
+    refine,
+    scores,
     shares,
+    texture_weight,
 )
 from segfloor_ros.geometry import Array, invert
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""
 _MAX_FRAMES = 12
-_PROPOSALS_OF_FIRST, _PROPOSALS = 600, 200
-_PLAIN_SUPPORT = 0.3
-_WEAK_SUPPORT, _LITTLE_SUPPORT = 0.08, 0.2
-_MAX_VIOLATIONS = 0.05
-_REST = 5
-"""So many keyframes in a row must agree where the floor is not plain to see."""
-_LEAST_FEET, _ENOUGH_FEET = 20, 150
-"""Feet of one keyframe that are worth a look, and those that a floor needs."""
-_FEET_SUPPORT = 0.4
-_FEET_REST, _AGAIN = 3, 3
-_SAME = (0.03, math.radians(1.0), math.radians(2.0))
-"""Planes whose height, as a share, pitch and roll differ by less are the same."""
-_CONTRADICTED = 0.3
-"""A plane below which such a share of the feet stands is no floor."""
-_SIGMAS, _FEET_SIGMAS = (0.015, math.radians(0.2)), (0.025, math.radians(0.4))
-"""How well height, as a share of it, and tilt must be known, one sigma."""
-_PATIENCE, _FAIR_SIGMA = 20, 0.03
-"""After so many keyframes the best plane so far will do, if its height is known to such a share:
-a map that is off by some per cent is better than none.
-"""
-_HEIGHT_TOLERANCE = 0.05
-_TILT_TOLERANCE_DEG = 1.0
+_PROPOSALS, _KEPT = 200, 60
+"""Guesses by the newest frame, and those that are kept for the next."""
+_COMPARED = 6000
+"""So many samples of all frames together are compared with a plane: neighbours err together."""
+_LEAST_SAMPLES = 20
+_LEAST_SUPPORT, _MAX_VIOLATIONS = 0.08, 0.05
+"""A floor is so much of what is seen where it is visible, and so little is seen below it."""
+_SIGMA = np.array([math.radians(0.4), math.radians(1.0), 0.015])
+"""How well pitch, roll and height, as a share of it, must be known."""
+_LOOKS = 4
+"""By so many frames it is seen how much a plane varies."""
+_SURE = 3.0
+"""Sigmas within which nearly all lies: guesses, or what is seen but once, are no surer."""
+_FLOOR_SLOPE = math.radians(1.5)
+"""Floors on which robots start are level, more or less."""
 _SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
-_MIRROR_FIRST, _MIRROR_EVERY = 3, 4
-"""A mirror is looked for in so many keyframes, and then in every so-manyth until one is found."""
-_NEARER = 0.8
-"""A mirror at so much of the height of what looks like the floor lies clearly above it."""
-
+_HEIGHT_TOLERANCE = 0.05
+_TILT_TOLERANCE_DEG = 1.0
 MAX_KEYFRAMES = 20
 """Where so many do not show the floor well enough, nothing is said."""
 
-
-def disagreement(used: Mount, seen: Mount) -> str | None:
-    """Return in words how the mount in use differs from the one that the floor shows, or None
-    where they agree.
-    """
-    parts = []
-    if abs(used.height_m - seen.height_m) > _HEIGHT_TOLERANCE * seen.height_m:
-        parts.append(f'height {used.height_m:.3f} m, the floor shows {seen.height_m:.3f} m')
-    for name in ('pitch', 'roll'):
-        given = math.degrees(getattr(used, f'{name}_rad'))
-        measured = math.degrees(getattr(seen, f'{name}_rad'))
-        if abs(given - measured) > _TILT_TOLERANCE_DEG:
-            parts.append(f'{name} {given:.1f} deg, the floor shows {measured:.1f} deg')
-    return 'camera mount: ' + '; '.join(parts) if parts else None
+_LEAST_HALVED_PX = 480
+"""Images less wide than this are never matched at half the resolution alone."""
+_ENOUGH_GREY = 0.3
+"""Gradient along the row, per pixel, that is no noise."""
+_TEXTURE_WINDOW_PX = 11
+_COLUMN_STEP_PX = 2
+"""Every other column is searched for the base of things."""
+_BASE_WEIGHT = 8.0
+"""All of the surface above places a base: it counts as so many samples."""
+_AROUND_ROWS = 15
+"""An edge is the strongest of so many rows."""
+_BLANK_GAP, _BLANK_ROWS = 7, 12
+"""Below an edge, beyond what borrows its texture, so many rows are blank."""
+_UPRIGHT_GAP, _UPRIGHT_ROWS, _UPRIGHT_COLUMNS = 3, 12, 5
+"""Above an edge, beyond where the matcher mixes both surfaces, so much is upright."""
+_UPRIGHT_SHARE = 0.8
+_UPRIGHT_SPREAD_PX = 0.6
+"""On floor of that many rows disparities spread more."""
 
 
 class MountEstimator:
     """Measures the mount over the first keyframes, in SLAM's own frame.
 
-    Two searches run side by side: for the plane on which what has texture lies, and for the one on
-    which upright things stand: of a floor of one colour their feet are all there is to see. known
-    values are kept and only the others measured; NaN where not known. Deterministic: the same
-    frames give the same mount.
+    known values are kept and only the others measured; NaN where not known. Deterministic: the
+    same frames give the same mount.
     """
 
     def __init__(
@@ -107,28 +117,16 @@ class MountEstimator:
 
     def reset(self) -> None:
         """Forget all frames: the next ones are of another world."""
-        self._views: list[MirrorView] = []
-        self._feet: list[Samples] = []
-        self._rotations: list[Array] = []
-        self._positions: list[Array] = []
-        self._mirror_rng = np.random.default_rng(1)
-        self._on_surfaces, self._on_feet = PlaneSearch(self._known), PlaneSearch(self._known)
-        self._fits: list[PlaneFit] = []
-        self._feet_fits: list[PlaneFit] = []
-        self._fair: list[PlaneFit] = []
-        self._settled: PlaneFit | None = None
-
-    @property
-    def mount(self) -> Mount | None:
-        """The mount of the first camera pose, None until the evidence suffices."""
-        return None if self._settled is None else self._mount_of(self._settled.angles_height)
+        self._surfaces, self._bases = PlaneSearch(self._known), PlaneSearch(self._known)
+        self._poses: list[Array] = []
+        self.mount: Mount | None = None
 
     @property
     def provisional(self) -> Mount:
         """The mount as it seems so far, at first a level camera at a usual height."""
-        for fit in (*self._feet_fits[-1:], *self._fits[-1:]):
-            if self._is_possible(fit):
-                return self._mount_of(fit.angles_height)
+        for search in (self._bases, self._surfaces):
+            if search.fits and self._is_possible(search.fits[-1]):
+                return self._mount_of(search.fits[-1].angles_height)
         return self._mount_of(np.where(np.isnan(self._known), _USUAL, self._known))
 
     def _mount_of(self, angles_height: Array) -> Mount:
@@ -147,118 +145,23 @@ class MountEstimator:
         T_world_left: pose (4, 4) of the camera in a frame whose origin is the first camera's.
         up_world: where an accelerometer has up in that frame.
         """
-        if self._settled is not None:
+        if self.mount is not None:
             return
-        for search in (self._on_surfaces, self._on_feet):
-            search.expect(up_world)
-        self._rotations.append(T_world_left[:3, :3])
-        self._positions.append(T_world_left[:3, 3])
-        view = self._viewer.view(left, right, T_world_left)
-        samples = view.surfaces.samples
-        if len(samples.weight) < 50 or samples.weight.sum() < 1:
-            return
-        self._views = [*self._views, view.surfaces][-_MAX_FRAMES:]
-        if len(view.feet.weight) >= _LEAST_FEET:
-            self._feet = [*self._feet, view.feet][-_MAX_FRAMES:]
-        proposals = _PROPOSALS if self._fits else _PROPOSALS_OF_FIRST
-        fit = self._on_surfaces.find(self._frames, self._travel(), proposals, [])
-        if fit is None:
-            return
-        if self._may_mirror():
-            fit = self._mirror(fit) or fit
-        self._fits.append(fit)
-        if self._is_plain(fit):
-            self._settled = fit
-        else:
-            self._settled = self._at_rest(fit) or self._stood_on(fit) or self._best_so_far()
+        self._poses.append(T_world_left)
+        right, measured = stereo_view(left, right)
+        disparity = self._viewer.disparity(left, right) if measured is None else measured
+        surfaces = self._viewer.surfaces(left, disparity, measured is not None, T_world_left)
+        prior = level_prior(up_world)
+        if not self._settles(self._surfaces, self._surfaces.add(surfaces, prior, [])):
+            bases = self._viewer.bases(left, disparity, T_world_left)
+            fit = self._bases.add(bases, prior, self._surfaces.frames)
+            self._settles(self._bases, fit)
 
-    @property
-    def _frames(self) -> list[Samples]:
-        return [view.samples for view in self._views]
-
-    def _may_mirror(self) -> bool:
-        """Tell whether to look for a mirror: that is slow, and most floors are none. Below the feet
-        of things a mirror shows these things, not a blank floor.
-        """
-        if len(self._fits) < _MIRROR_FIRST:
-            return not self._feet or not self._fits
-        found = any(fit.is_mirror for fit in self._fits)
-        return not self._feet and (found or len(self._fits) % _MIRROR_EVERY == 0)
-
-    def _mirror(self, ordinary: PlaneFit) -> PlaneFit | None:
-        """Return the plane that best mirrors what stands on it: of what is seen below it none
-        speaks against it. It lies above the ordinary one, unless much is seen below that, too.
-        """
-        highest_m = _NEARER * ordinary.angles_height[2]
-        starts = [*mirror_candidates(self._views, self._mirror_rng, self._known, self._travel())]
-        if self._fits and self._fits[-1].is_mirror:
-            starts.append(self._fits[-1].angles_height)
-        if ordinary.violations > _MAX_VIOLATIONS:
-            starts.append(ordinary.angles_height)
-            highest_m = math.inf
-        best, best_share = None, MIRRORED_SHARE
-        for start in starts:
-            fit = self._on_surfaces.refined(self._frames, start, self._travel())
-            if fit.angles_height[2] > highest_m:
-                continue
-            share = mirrored_share(self._views, fit.angles_height)
-            if share > best_share:
-                best, best_share = fit, share
-        if best is None:
-            return None
-        seen = best.support / max(1 - best.violations, 1e-6)
-        return replace(best, support=seen, violations=0.0, is_mirror=True)
-
-    def _travel(self) -> Array:
-        positions = np.array([frame.position_m for frame in self._frames])
-        steps = positions[1:] - positions[:1]
-        return steps[np.linalg.norm(steps, axis=1) > 0.05]
-
-    def _is_plain(self, fit: PlaneFit) -> bool:
-        """Tell whether the floor is plain to see, and seen again where it was not at once."""
-        plain = fit.support > _PLAIN_SUPPORT and _is_certain(fit, *_SIGMAS)
-        plain &= self._is_possible(fit) and fit.violations <= _MAX_VIOLATIONS
-        again = len(self._fits) == 1 or _rests(self._fits, _AGAIN, *_SAME)
-        return plain and again
-
-    def _stood_on(self, textured: PlaneFit) -> PlaneFit | None:
-        """Return the plane on which things stand, once it has come to rest, where the floor itself
-        has no texture by which to measure it.
-        """
-        if not self._feet or textured.support > _LITTLE_SUPPORT:
-            return None
-        fit = self._on_feet.find(self._feet, self._travel(), _PROPOSALS, self._frames)
-        if fit is None:
-            return None
-        self._feet_fits.append(fit)
-        enough = fit.support * sum(len(feet.weight) for feet in self._feet) > _ENOUGH_FEET
-        if not enough or fit.support < _FEET_SUPPORT or not _is_certain(fit, *_FEET_SIGMAS):
-            return None
-        below = max(fit.violations, shares(self._frames, fit.angles_height)[1])
-        if below > _MAX_VIOLATIONS or not self._is_possible(fit):
-            return None
-        rests = _rests(self._feet_fits, _FEET_REST, 0.02, math.radians(0.5), math.radians(1.0))
-        return fit if rests else None
-
-    def _at_rest(self, fit: PlaneFit) -> PlaneFit | None:
-        """Return the plane of a floor of weak texture, once it has come to rest."""
-        if fit.support < _WEAK_SUPPORT or fit.violations > _MAX_VIOLATIONS:
-            return None
-        if not _is_certain(fit, _FAIR_SIGMA, math.inf) or not self._is_possible(fit):
-            return None
-        if self._feet and shares(self._feet, fit.angles_height)[1] > _CONTRADICTED:
-            return None
-        if not _rests(self._fits, _REST, 0.03, math.radians(1.0), math.radians(4.0)):
-            return None
-        self._fair.append(fit)
-        return fit if _is_certain(fit, _SIGMAS[0], math.inf) else None
-
-    def _best_so_far(self) -> PlaneFit | None:
-        """Return the plane that is known best of those that came to rest, after a while."""
-        if len(self._fits) < _PATIENCE or not self._fair:
-            return None
-        best = min(self._fair, key=lambda fit: fit.sigma[2] / fit.angles_height[2])
-        return best if self._is_possible(best) else None
+    def _settles(self, search: PlaneSearch, fit: PlaneFit | None) -> bool:
+        """Take over the plane of a search where it is known, and one that a robot can drive on."""
+        if fit is not None and search.is_known() and self._is_possible(fit):
+            self.mount = self._mount_of(fit.angles_height)
+        return self.mount is not None
 
     def _is_possible(self, fit: PlaneFit) -> bool:
         """Tell whether a robot drove on the plane: on its way the camera keeps its place above it.
@@ -268,27 +171,107 @@ class MountEstimator:
             return False
         height_m = float(fit.angles_height[2])
         normal = plane_of(fit.angles_height) * height_m
-        rotations, positions = np.array(self._rotations), np.array(self._positions)
-        heights_m = height_m + positions @ normal
-        seen = angles_height_of((normal @ rotations) / heights_m[:, None])
+        poses = np.array(self._poses)
+        heights_m = height_m + poses[:, :3, 3] @ normal
+        seen = angles_height_of((normal @ poses[:, :3, :3]) / heights_m[:, None])
         spread = seen.std(axis=0) / (1.0, 1.0, height_m)
         return bool(heights_m.min() > 0 and (spread < _SWAY).all())
 
 
-def _is_certain(fit: PlaneFit, height: float, tilt_rad: float) -> bool:
-    """Tell whether a plane is known so well, one sigma, the height within a share of it."""
-    height_sigma = float(fit.sigma[2] / fit.angles_height[2])
-    return height_sigma < height and float(fit.sigma[:2].max()) < tilt_rad
+def level_prior(up: Up | None) -> tuple[Array, Array]:
+    """Return what pitch, roll and height (3,) are expected, and their standard deviations: a floor
+    is level as an accelerometer has it.
+    """
+    if up is None:
+        return np.zeros(3), LEVEL_SIGMA
+    sigma = math.hypot(up.sigma_rad, _FLOOR_SLOPE)
+    return angles_height_of(up.direction), np.array([sigma, sigma, math.inf])
 
 
-def _rests(
-    fits: list[PlaneFit], count: int, height: float, pitch_rad: float, roll_rad: float
-) -> bool:
-    """Tell whether the last so many planes are the same, the height within a share of it."""
-    recent = np.array([fit.angles_height for fit in fits[-count:]])
-    spread = np.ptp(recent, axis=0)
-    limits = (pitch_rad, roll_rad, height * recent[-1, 2])
-    return len(recent) == count and bool((spread < limits).all())
+class PlaneSearch:
+    """Finds the plane that the samples of the last frames lie on, anew with each frame; the best
+    guesses of earlier frames compete with those of the newest one.
+    """
+
+    def __init__(self, known: Array) -> None:
+        self._known = known
+        self._rng = np.random.default_rng(0)
+        self._guesses = np.zeros((0, 3))
+        self.frames: list[Samples] = []
+        self.fits: list[PlaneFit] = []
+
+    def add(
+        self, samples: Samples, prior: tuple[Array, Array], contrary: list[Samples]
+    ) -> PlaneFit | None:
+        """Take in the samples of a frame and return the plane, None where none is plausible.
+
+        prior: pitch, roll and height (3,) that are expected, and their standard deviations.
+        contrary: further samples, which can but speak against a plane, by lying below it.
+        """
+        if len(samples.weight) < _LEAST_SAMPLES or samples.weight.sum() < 1:
+            return None
+        frames = self.frames = [*self.frames, samples][-_MAX_FRAMES:]
+        mean, sigma = prior
+        positions = np.array([frame.position_m for frame in frames])
+        travel = positions[1:] - positions[:1]
+        travel = travel[np.linalg.norm(travel, axis=1) > 0.05]
+        fresh = propose(samples, _PROPOSALS, self._rng, self._known)
+        guesses = np.concatenate([self._guesses, fresh])
+        if len(guesses) == 0:
+            return None
+        some = _thinned(frames)
+        total = np.sum([scores(few, guesses) for few in some], axis=0)
+        for few in _thinned(contrary):
+            total += np.minimum(scores(few, guesses), 0)
+        total = np.maximum(total, 0) * preference(guesses, travel, mean, _SURE * sigma)
+        order = np.argsort(-total, kind='stable')[:_KEPT]
+        # Frames that show the same err together: the prior counts once per frame, too.
+        sigma = sigma / math.sqrt(len(frames))
+        fit = refine(some, guesses[order[0]], self._known, travel, mean, sigma)
+        if contrary:
+            below = max(fit.violations, shares(contrary, fit.angles_height)[1])
+            fit = replace(fit, violations=below)
+        self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
+        self._guesses = self._guesses[plausible(self._guesses)]
+        self.fits.append(fit)
+        return fit
+
+    def is_known(self) -> bool:
+        """Tell whether the last plane is known: by its own covariance and by how much it varies
+        from frame to frame, as what is wrong in all frames of a scene is in no covariance. One look
+        is enough where that of a single one is much smaller. In the end a plane that is off by some
+        per cent is better than none.
+        """
+        fit, count = self.fits[-1], len(self.fits)
+        sigma = fit.sigma / (1.0, 1.0, fit.angles_height[2])
+        if count > 1 or (_SURE * sigma > _SIGMA).any():
+            recent = np.array([one.angles_height for one in self.fits[-_LOOKS:]])
+            sigma = np.hypot(sigma, recent.std(axis=0) / (1.0, 1.0, fit.angles_height[2]))
+            if count < _LOOKS:
+                return False
+        limit = _SIGMA * (2 if count >= MAX_KEYFRAMES else 1)
+        seen = fit.support > _LEAST_SUPPORT and fit.violations < _MAX_VIOLATIONS
+        return seen and bool((sigma < limit).all())
+
+
+def _thinned(frames: list[Samples]) -> list[Samples]:
+    step = math.ceil(sum(len(frame.weight) for frame in frames) / _COMPARED)
+    return [frame.every(max(1, step)) for frame in frames]
+
+
+def disagreement(used: Mount, seen: Mount) -> str | None:
+    """Return in words how the mount in use differs from the one that the floor shows, or None
+    where they agree.
+    """
+    parts = []
+    if abs(used.height_m - seen.height_m) > _HEIGHT_TOLERANCE * seen.height_m:
+        parts.append(f'height {used.height_m:.3f} m, the floor shows {seen.height_m:.3f} m')
+    for name in ('pitch', 'roll'):
+        given = math.degrees(getattr(used, f'{name}_rad'))
+        measured = math.degrees(getattr(seen, f'{name}_rad'))
+        if abs(given - measured) > _TILT_TOLERANCE_DEG:
+            parts.append(f'{name} {given:.1f} deg, the floor shows {measured:.1f} deg')
+    return 'camera mount: ' + '; '.join(parts) if parts else None
 
 
 class MountCheck:
@@ -315,3 +298,102 @@ class MountCheck:
         seen = self._estimator.mount
         self.is_done = seen is not None or self._keyframes >= MAX_KEYFRAMES
         return None if seen is None else disagreement(self._mount, seen)
+
+
+class MountViewer:
+    """Looks at the rectified pairs of one camera; only the first is matched in full."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        searched = disparity_range(camera, None)
+        self._first: DisparityMatcher | None = DisparityMatcher(searched)
+        self._matcher = TwoScaleMatcher(searched)
+        self._fine_rows = 0 if camera.width >= _LEAST_HALVED_PX else camera.height
+
+    def disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the disparities (H, W) of a pair, 0 where there is no match."""
+        first, self._first = self._first, None
+        if first is not None:
+            return first.compute(left, right)
+        return self._matcher.compute(left, right, self._fine_rows)
+
+    def surfaces(
+        self,
+        left: NDArray[np.uint8],
+        disparity: NDArray[np.float32],
+        is_measured: bool,
+        T_world_left: Array,
+    ) -> Samples:
+        """Return samples of all that has texture; a depth camera needs none."""
+        step = max(2, round(math.sqrt(left.size / 2 / SAMPLES)))
+        part = np.s_[step // 2 :: step, step // 2 :: step]
+        rows, columns = pixels_where(disparity[part] >= 1)
+        weight: Array = np.ones(len(rows))
+        if not is_measured:
+            smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
+            gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
+            texture = cv2.blur(gradient, (9, 9))[part][rows, columns]
+            weight = texture_weight(texture, _ENOUGH_GREY)
+        rows, columns = (step // 2 + step * index for index in (rows, columns))
+        return self._placed(rows, columns, disparity[rows, columns], weight, T_world_left)
+
+    def bases(
+        self, left: NDArray[np.uint8], disparity: NDArray[np.float32], T_world_left: Array
+    ) -> Samples:
+        """Return samples of where upright things stand on blank floor."""
+        rows, columns, found_px = find_bases(left, disparity)
+        weight = np.full(len(rows), _BASE_WEIGHT)
+        return self._placed(rows, columns, found_px, weight, T_world_left)
+
+    def _placed(
+        self,
+        rows: NDArray[np.integer],
+        columns: NDArray[np.integer],
+        disparity_px: NDArray[np.floating],
+        weight: Array,
+        T_world_left: Array,
+    ) -> Samples:
+        uv_px = np.stack([columns, rows], axis=1).astype(np.float64)
+        found_px = disparity_px.astype(np.float64)
+        return Samples.of(self._camera, uv_px, found_px, weight, T_world_left)
+
+
+def find_bases(
+    left: NDArray[np.uint8], disparity_px: NDArray[np.float32]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.floating]]:
+    """Return rows, columns (N,) and disparities (N,) of where upright things stand on blank floor
+    in an image (H, W) of known disparities (H, W), 0 for none.
+    """
+    image, disparity = left[:, ::_COLUMN_STEP_PX], disparity_px[:, ::_COLUMN_STEP_PX]
+    enough = enough_texture(noise_grey(left))
+    texture = texture_grey(left, _TEXTURE_WINDOW_PX)[:, ::_COLUMN_STEP_PX]
+    slope = row_slope(image)
+    strongest = cv2.dilate(slope, np.ones((_AROUND_ROWS, 1), np.uint8))
+    base = (slope == strongest) & (slope >= EDGE_SLOPE)
+    base &= _below((texture < 1.5 * enough).astype(np.float32))
+    counted = ((disparity >= 1) & (texture > 2 * enough)).astype(np.float32)
+    share = _mean_above(counted)
+    safe = np.maximum(share, np.float32(1e-6))
+    mean = _mean_above(counted * disparity) / safe
+    variance = _mean_above(counted * disparity**2) / safe - mean**2
+    base &= (share > _UPRIGHT_SHARE) & (variance < _UPRIGHT_SPREAD_PX**2)
+    base[-_BLANK_GAP - _BLANK_ROWS :] = False
+    rows, columns = np.nonzero(base)
+    return rows, _COLUMN_STEP_PX * columns, mean[rows, columns]
+
+
+def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell of each pixel whether what is below it is blank (H, W)."""
+    mean = cv2.blur(blank, (1, _BLANK_ROWS), anchor=(0, 0))
+    below = np.zeros(blank.shape, np.bool_)
+    below[:-_BLANK_GAP] = mean[_BLANK_GAP:] > 0.95
+    return below
+
+
+def _mean_above(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean of the values (H, W) in the window above each pixel."""
+    anchor = (_UPRIGHT_COLUMNS // 2, _UPRIGHT_ROWS - 1)
+    mean = cv2.blur(values, (_UPRIGHT_COLUMNS, _UPRIGHT_ROWS), anchor=anchor)
+    above = np.zeros_like(mean)
+    above[_UPRIGHT_GAP:] = mean[:-_UPRIGHT_GAP]
+    return above

@@ -9,6 +9,7 @@ from floor_scenes import SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
+from segfloor_ros.floor.plane.plane import mean_climb
 from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.settings import StereoSlamSettings
 
@@ -174,6 +175,63 @@ def test_posters_on_a_blank_wall_are_not_the_floor():
     blank = wall(3.0, grey=175.0, contrast=0.0)
     scene = Scene([floor, blank, *poster], mount=Mount(0.35, np.radians(8.0)), noise_grey=1.0)
     assert mounts_on_the_way(scene, 8) == [None] * 8
+
+
+@pytest.mark.parametrize(
+    ('height_m', 'pitch_deg', 'reflectance', 'contrast', 'seed'),
+    [
+        (0.5, 12.0, 0.4, 12.0, 51),
+        (0.21, 3.0, 0.4, 12.0, 41),
+        (0.3, 7.0, 0.4, 12.0, 1),
+        (0.3, 7.0, 0.7, 5.0, 1),
+    ],
+)
+def test_what_a_polished_floor_mirrors_is_not_the_floor(
+    height_m, pitch_deg, reflectance, contrast, seed
+):
+    """What it mirrors lies below it, and speaks against it: nothing is known of it then."""
+    left = Patch((-1, 1.5, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=seed + 2)
+    right = Patch((-1, -1.8, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=8.0, seed=seed + 3)
+    patches = [floor_patch(grey=70.0, contrast=contrast, seed=seed), left, right]
+    patches += [wall(contrast=8.0, seed=2), *box(1.8, 0.5, 0.4, 0.6, contrast=45.0)]
+    scene = Scene(
+        patches,
+        mount=Mount(height_m, np.radians(pitch_deg)),
+        noise_grey=1.0,
+        reflectance=reflectance,
+    )
+    left_image, right_image, _, _ = scene.render()
+    estimator = MountEstimator(scene.camera)
+    for _ in range(6):
+        estimator.add(left_image, right_image, np.eye(4))
+    mount = estimator.mount
+    assert mount is None or mount.height_m == pytest.approx(height_m, rel=0.03)
+
+
+def test_a_level_path_leaves_a_plane_that_dips():
+    level = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]])
+    planes = np.array([[0.0, 0.0, 0.3], [np.radians(2.0), 0.0, 0.3], [np.radians(19.0), 0.0, 2.3]])
+    still, slope, dip = mean_climb(planes, level)
+    assert still == 0.0
+    assert slope < 1.0
+    assert dip > 3.0
+    assert (mean_climb(planes, np.zeros((0, 3))) == 0).all()
+
+
+@pytest.mark.parametrize(('path_deg', 'settles'), [(0.0, True), (25.0, False)])
+def test_a_floor_that_the_robot_drives_into_is_none(path_deg, settles):
+    scene = Scene([floor_patch(), wall()])
+    estimator = MountEstimator(scene.camera)
+    bare_left, bare_right, _, _ = Scene([wall(1.0)], mount=scene.mount).render()
+    estimator.add(bare_left, bare_right, np.eye(4))
+    assert estimator.mount is None
+    moved = np.eye(4)
+    into_floor = scene.mount.pitch_rad - np.radians(path_deg)
+    moved[:3, 3] = 0.6 * np.array([0.0, -np.sin(into_floor), np.cos(into_floor)])
+    left, right, _, _ = scene.render()
+    for _ in range(4):
+        estimator.add(left, right, moved)
+    assert (estimator.mount is not None) is settles
 
 
 def test_disagreement_names_both_numbers():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import MOUNT, SMALL_CAMERA
 
-from segfloor_ros.floor.plane.frame_plane import expectations, likeliest, plane_of_frame
+from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame
 
 
 def pitched(pitch_deg: float):

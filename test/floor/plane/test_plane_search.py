@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from segfloor_ros.camera.model import Up
-from segfloor_ros.floor.plane.mount_view import PlaneSearch
-from segfloor_ros.floor.plane.plane_fit import Samples, plane_of
+from segfloor_ros.floor.plane.mount import PlaneSearch, level_prior
+from segfloor_ros.floor.plane.plane import Samples, plane_of
 
 UNKNOWN = np.full(3, np.nan)
 DISPARITY_M = 40.0
-TRUE = np.array([0.1, 0.0, 0.5])
+TRUE = np.array([0.3, 0.0, 0.5])
 """Pitch, roll and height of the camera."""
 
 
@@ -27,14 +27,18 @@ def little_floor(seed: int) -> Samples:
     return Samples(rays, np.zeros(3), disparity, np.ones(80), DISPARITY_M)
 
 
+def found(frames: list[Samples], up: Up | None) -> np.ndarray:
+    """Return pitch, roll and height by all frames."""
+    search = PlaneSearch(UNKNOWN)
+    fits = [search.add(frame, level_prior(up), []) for frame in frames]
+    assert fits[-1] is not None
+    return fits[-1].angles_height
+
+
 def test_with_little_floor_in_view_up_tells_pitch_and_roll() -> None:
     frames = [little_floor(seed) for seed in range(6)]
-    search = PlaneSearch(UNKNOWN)
-    alone = search.refined(frames, TRUE, np.zeros((0, 3))).angles_height
-    up = plane_of(np.array([*TRUE[:2], 1.0]))
-    search.expect(Up(up, math.radians(0.5)))
-    level = search.refined(frames, TRUE, np.zeros((0, 3))).angles_height
-    error, error_alone = np.abs(level - TRUE), np.abs(alone - TRUE)
+    up = Up(plane_of(np.array([*TRUE[:2], 1.0])), math.radians(0.5))
+    error, error_alone = np.abs(found(frames, up) - TRUE), np.abs(found(frames, None) - TRUE)
     assert (error[:2] < 0.8 * error_alone[:2]).all()
     assert np.degrees(error[:2]).max() < 1.0
 
@@ -45,9 +49,7 @@ def test_a_floor_that_is_plain_to_see_counts_more_than_what_was_felt() -> None:
     rays = np.stack([u, v, np.ones(3000)], axis=1)
     disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
     frame = Samples(rays, np.zeros(3), disparity, np.ones(3000), DISPARITY_M)
-    search = PlaneSearch(UNKNOWN)
     # The robot starts on a ramp of 4 degrees.
     ramp = plane_of(np.array([TRUE[0] + math.radians(4.0), 0.0, 1.0]))
-    search.expect(Up(ramp, math.radians(0.5)))
-    found = search.refined([frame] * 4, TRUE, np.zeros((0, 3))).angles_height
-    assert np.degrees(found[:2]) == pytest.approx(np.degrees(TRUE[:2]), abs=0.2)
+    angles = found([frame] * 4, Up(ramp, math.radians(0.5)))
+    assert np.degrees(angles[:2]) == pytest.approx(np.degrees(TRUE[:2]), abs=0.2)

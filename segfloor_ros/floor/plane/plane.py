@@ -1,0 +1,358 @@
+"""The plane of the floor in the disparities of one or more frames.
+
+A plane is written as m = n / h, with n its unit normal pointing up and h the height of the first
+camera above it, both in the world frame, which is the first left optical frame. The point X is on
+the plane where m . X + 1 = 0, so the ray q from a camera at t meets it at the inverse depth
+-(m . q) / (1 + m . t): in a rectified pair a plane's disparity is linear in the pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity.matching import NOISE_PX
+from segfloor_ros.floor.disparity.profile import (
+    HEIGHT_SIGMA,
+    PITCH_SIGMA_RAD,
+    FloorLine,
+    pixels_where,
+)
+from segfloor_ros.floor.disparity.view import column_step, rising
+from segfloor_ros.geometry import Array
+
+MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])
+HEIGHT_RANGE_M = (0.04, 4.0)
+"""What mounts are."""
+LEVEL_SIGMA = np.array([math.radians(7.0), math.radians(2.0), math.inf])
+"""Cameras look roughly ahead and hardly roll, one sigma of pitch and roll; height is not known."""
+SAMPLES = 4000
+"""So many pixels of an image are looked at: their neighbours say the same."""
+_INLIER_PX = 1.0
+"""Disparities this near to a plane's support it; where its own is smaller nothing is known of it.
+"""
+_BEND = 0.05
+"""A floor bends, and its disparity differs from the plane's, by this share."""
+_VIOLATION_WEIGHT = 1.5
+_CORRELATED_SAMPLES = 12.0
+"""Neighbouring samples err together: so many count as one."""
+_SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+"""Of the biweight with which a plane is refined, one per step."""
+_CLIMB, _SWAY_M = 0.03, 0.03
+"""How far from parallel to the floor a camera travels: a slope, and what it sways."""
+_FAITH = 2.0
+"""So much more must speak for another expectation than for the camera as it is mounted."""
+_NOISE_SHARE = 0.01
+"""What so little of all that is seen speaks for is noise: the camera is as it is mounted."""
+_SWING_RAD = math.radians(3.0)
+"""So far robots swing on their wheels; what the map says beyond that is drift."""
+_FLAT_WEIGHT = 0.1
+"""Of samples whose disparity does not rise down the image as a floor's does."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Disparities of one frame: rays (N, 3) turned into the world, the camera's position (3,) in
+    the world in metres, disparities (N,) in pixels, weights (N,). disparity_m: fx * baseline.
+    """
+
+    rays: Array
+    position_m: Array
+    disparity_px: Array
+    weight: Array
+    disparity_m: float
+
+    @classmethod
+    def of(
+        cls,
+        camera: StereoCamera,
+        uv_px: Array,
+        disparity_px: Array,
+        weight: Array,
+        T_world_left: Array,
+    ) -> Samples:
+        """Return the samples at pixels (N, 2), seen from a pose (4, 4)."""
+        rays = camera.back_project(uv_px, np.ones(len(uv_px))) @ T_world_left[:3, :3].T
+        position_m = T_world_left[:3, 3].astype(np.float64)
+        return cls(rays, position_m, disparity_px, weight, camera.disparity_times_depth)
+
+    def every(self, step: int) -> Samples:
+        """Return only one of every so many, which weighs as much as these."""
+        rays, disparity_px = self.rays[::step], self.disparity_px[::step]
+        weight = self.weight[::step] * step
+        return Samples(rays, self.position_m, disparity_px, weight, self.disparity_m)
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the first camera;
+    sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
+    that lies on it; violations: share that lies below it.
+    """
+
+    angles_height: Array
+    sigma: Array
+    support: float
+    violations: float
+
+
+def plane_of(angles_height: Array) -> Array:
+    """Return planes m (..., 3) of pitch, roll and height (..., 3)."""
+    pitch, roll, height = np.moveaxis(angles_height, -1, 0)
+    normal = np.stack(
+        [-np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll), -np.sin(pitch)], axis=-1
+    )
+    return normal / height[..., None]
+
+
+def angles_height_of(planes: Array) -> Array:
+    """Return pitch, roll and height (..., 3) of planes m (..., 3)."""
+    height = 1 / np.linalg.norm(planes, axis=-1)
+    normal = planes * height[..., None]
+    pitch = np.arcsin(np.clip(-normal[..., 2], -1, 1))
+    roll = np.arctan2(-normal[..., 0], -normal[..., 1])
+    return np.stack([pitch, roll, height], axis=-1)
+
+
+def plausible(angles_height: Array) -> NDArray[np.bool_]:
+    """Tell which of pitch, roll and height (..., 3) a floor can have."""
+    pitch, roll, height = np.moveaxis(angles_height, -1, 0)
+    level = (np.abs(pitch) < MAX_PITCH_RAD) & (np.abs(roll) < MAX_ROLL_RAD)
+    return level & (height > HEIGHT_RANGE_M[0]) & (height < HEIGHT_RANGE_M[1])
+
+
+def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
+    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
+
+    Half of them go through three samples, half through two, without roll. known: (3,), values
+    that are given, NaN where not.
+    """
+    probability = samples.weight / samples.weight.sum()
+    chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
+    q = samples.rays[chosen]
+    inverse_depth = samples.disparity_px[chosen] / samples.disparity_m
+    # m . (q + inverse_depth * t) = -inverse_depth
+    rows = q + inverse_depth[..., None] * samples.position_m
+    half = count // 2
+    rows[half:, 2] = (1.0, 0.0, 0.0)
+    inverse_depth[half:, 2] = 0.0
+    regular = np.abs(np.linalg.det(rows)) > 1e-6
+    planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
+    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
+    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
+    return guesses[plausible(guesses)]
+
+
+def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
+    how much less than that lies clearly below the plane, and whether it is visible there at all,
+    each (N, M).
+    """
+    along = 1 + planes @ samples.position_m
+    expected = samples.rays @ planes.T
+    # In place: thousands of samples times hundreds of planes take most of a process's memory.
+    expected *= -samples.disparity_m / np.where(np.abs(along) < 1e-6, 1e-6, along)
+    visible = expected > _INLIER_PX
+    error = samples.disparity_px[:, None] - expected
+    expected *= -_BEND
+    expected -= 2 * _INLIER_PX
+    return error, expected, visible
+
+
+def scores(samples: Samples, angles_height: Array) -> Array:
+    """Return how much of the samples' weight speaks for each plane (M, 3), less what speaks
+    against it.
+
+    The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
+    """
+    planes = plane_of(angles_height)
+    error, limit, visible = _seen(samples, planes)
+    below = visible & (error < limit)
+    on = np.divide(error, _INLIER_PX, out=error)
+    np.multiply(on, on, out=on)
+    np.subtract(1, on, out=on)
+    np.maximum(on, 0, out=on)
+    on[~visible] = 0
+    on -= _VIOLATION_WEIGHT * below
+    above_camera = 1 + planes @ samples.position_m < 0.2
+    return np.where(above_camera, -np.inf, samples.weight @ on)
+
+
+def shares(frames: list[Samples], angles_height: Array) -> tuple[float, float]:
+    """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
+    and which below it.
+    """
+    on = below = total = 0.0
+    for samples in frames:
+        error, limit, visible = _seen(samples, plane_of(angles_height)[None])
+        weight = np.where(visible[:, 0], samples.weight, 0)
+        total += float(weight.sum())
+        on += float(weight[np.abs(error[:, 0]) < _INLIER_PX].sum())
+        below += float(weight[error[:, 0] < limit[:, 0]].sum())
+    return (on / total, below / total) if total > 0 else (0.0, 1.0)
+
+
+def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
+    """Return how far each plane (M, 3) is what one expects, in (0, 1]: pitch, roll and height (3,)
+    with their standard deviations, and a camera that travels (T, 3), in metres, parallel to it.
+    """
+    squares = (((angles_height - mean) / sigma) ** 2).sum(axis=1)
+    squares += mean_climb(angles_height, travel) ** 2
+    return np.exp(-0.5 * squares)
+
+
+def mean_climb(angles_height: Array, travel: Array) -> Array:
+    """Return how far travel (T, 3) leaves each plane (M, 3), in sigmas of what slopes and swaying
+    explain.
+    """
+    if len(travel) == 0:
+        return np.zeros(len(angles_height))
+    unit = plane_of(angles_height) * angles_height[:, 2:]
+    climb = (unit @ travel.T) / _climb_sigma_m(travel)
+    return np.sqrt(np.mean(climb**2, axis=1))
+
+
+def _climb_sigma_m(travel: Array) -> Array:
+    return _CLIMB * np.linalg.norm(travel, axis=1) + _SWAY_M
+
+
+def refine(
+    frames: list[Samples],
+    start: Array,
+    known: Array,
+    travel: Array,
+    mean: Array,
+    sigma: Array,
+) -> PlaneFit:
+    """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
+
+    known: (3,), values that are given, NaN where not. travel: (T, 3) displacements of the camera in
+    metres, along which the floor runs. mean, sigma: (3,) what is expected, and how surely.
+    """
+    state = start.copy()
+    free = np.isnan(known)
+    information: Array = np.eye(3)
+    prior = np.diag(sigma**-2.0)
+    for scale in _SCALES_PX:
+        information, gradient = _normal_equations(frames, state, scale)
+        _add_travel(information, gradient, state, travel)
+        information += prior
+        gradient += prior @ (mean - state)
+        step = np.zeros(3)
+        step[free] = np.linalg.solve(
+            information[np.ix_(free, free)] + 1e-9 * np.eye(int(free.sum())), gradient[free]
+        )
+        state = state + np.clip(step, -0.1, 0.1)
+    error = np.zeros(3)
+    covariance = np.linalg.pinv(information[np.ix_(free, free)])
+    error[free] = np.sqrt(np.maximum(np.diag(covariance), 0))
+    return PlaneFit(state, error, *shares(frames, state))
+
+
+def _jacobian(angles_height: Array) -> Array:
+    """Return dm / d(pitch, roll, height) (3, 3)."""
+    pitch, roll, height = (float(value) for value in angles_height)
+    (sp, cp), (sr, cr) = ((math.sin(angle), math.cos(angle)) for angle in (pitch, roll))
+    by_angles = np.array(
+        [[sp * sr, -cp * cr, cp * sr / height], [sp * cr, cp * sr, cp * cr / height]]
+    )
+    by_angles = np.vstack([by_angles, [-cp, 0.0, sp / height]])
+    return by_angles / height
+
+
+def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tuple[Array, Array]:
+    information, gradient = np.zeros((3, 3)), np.zeros(3)
+    plane, by_state = plane_of(state), _jacobian(state)
+    for samples in frames:
+        along = 1 + float(plane @ samples.position_m)
+        toward = samples.rays @ plane
+        expected = -samples.disparity_m * toward / along
+        error = samples.disparity_px - expected
+        weight = samples.weight * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
+        weight = np.where(expected > _INLIER_PX, weight, 0)
+        weight /= _CORRELATED_SAMPLES * NOISE_PX**2
+        jacobian = samples.rays @ by_state
+        jacobian -= (toward / along)[:, None] * (samples.position_m @ by_state)
+        jacobian *= -samples.disparity_m / along
+        information += jacobian.T @ (jacobian * weight[:, None])
+        gradient += jacobian.T @ (weight * error)
+    return information, gradient
+
+
+def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
+    """Add that the camera travels parallel to the floor: all displacements count as one."""
+    unit = np.array([*state[:2], 1.0])
+    scaled = travel / (_climb_sigma_m(travel) * math.sqrt(max(1, len(travel))))[:, None]
+    rows = scaled @ _jacobian(unit)[:, :2]
+    information[:2, :2] += rows.T @ rows
+    gradient[:2] -= rows.T @ (scaled @ plane_of(unit))
+
+
+def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
+    """Return how much disparities count where the image has some texture, in [0, 1]. enough: what
+    is no noise; clearly more is needed for a plane.
+    """
+    grey = texture.astype(np.float64) / (4 * enough)
+    grey *= grey
+    grey *= grey
+    weight: Array = grey / (grey + 1)
+    return weight
+
+
+def expectations(mount: Mount, T_map_base: Array | None) -> Array:
+    """Return what pitch, roll and height to expect of a frame, (P, 3), the likeliest first.
+
+    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map;
+    or, of a camera in a hand, as high as it is in the map.
+    """
+    mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
+    if T_map_base is None:
+        return mounted[None]
+    T_map_left = T_map_base @ mount.T_base_left
+    # A height that nothing can have is none.
+    heights_m = np.maximum((mount.height_m, T_map_left[2, 3]), HEIGHT_RANGE_M[0])
+    return np.stack([mounted, *angles_height_of(T_map_left[2, :3] / heights_m[:, None])])
+
+
+def plane_of_frame(
+    camera: StereoCamera,
+    first_row: int,
+    disparity: NDArray[np.float32],
+    texture: NDArray[np.float32],
+    enough: float,
+    expected: Array,
+) -> PlaneFit:
+    """Return the plane of the floor in a frame, in its own camera's axes.
+
+    disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
+    that is no noise. expected: (P, 3), as of `expectations`.
+    """
+    step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
+    part = disparity[::step, ::step]
+    rows, columns = pixels_where(part > 0)
+    across = step * column_step(camera)
+    slope = FloorLine.of(camera, Mount(height_m=expected[0, 2], pitch_rad=expected[0, 0])).slope
+    inclined = rising(disparity[:, ::step], slope)[::step][rows, columns]
+    weight = texture_weight(texture[::step, ::step][rows, columns], enough)
+    weight *= np.where(inclined, 1.0, _FLAT_WEIGHT)
+    uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
+    found_px = part[rows, columns].astype(np.float64)
+    samples = Samples.of(camera, uv_px, found_px, weight, np.eye(4))
+    share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
+    start = expected[likeliest(share, expected)]
+    sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
+    return refine([samples], start, np.full(3, np.nan), np.zeros((0, 3)), start, sigma)
+
+
+def likeliest(share: Array, expected: Array) -> int:
+    """Return which expectation, of pitch, roll and height (P, 3), to start from, by the share (P,)
+    of all that is seen that speaks for each, less what speaks against it.
+    """
+    swing = np.hypot(*(expected - expected[0])[:, :2].T)
+    likelihood = share * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
+    likelihood[0] = max(_FAITH * share[0], _NOISE_SHARE)
+    return int(np.argmax(likelihood))
