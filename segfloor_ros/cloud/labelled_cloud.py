@@ -46,9 +46,8 @@ _COLUMNS: dict[str, tuple[type, float]] = {
 is told of it. judged_z_m: where the point was when that was decided, in frame `map`.
 """
 
-UNKNOWN = 0
-FLOOR = 1
-OBSTACLE = 2
+UNKNOWN, FLOOR, OBSTACLE = range(3)
+"""Labels of a point."""
 
 VERTEX = np.dtype(
     [

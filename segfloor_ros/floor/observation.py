@@ -14,6 +14,8 @@ FLOOR = 255
 NO_EVIDENCE = 127
 NOT_FLOOR = 0
 RANGE_MAX_ERROR_M = 0.3
+SAME_SURFACE_SHARE = 0.06
+"""Ranges, or disparities, that differ by more than this share are those of two surfaces."""
 
 MARGIN_M = 0.05
 """A ray ends so far before what stands up, so that it does not clear the cell of that."""

@@ -16,9 +16,21 @@ from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.depth import shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.matching import NOISE_PX, SPECKLE_PX, DisparityMatcher
+from segfloor_ros.floor.disparity.matching import (
+    COARSE_BLOCK_PX,
+    MEAN_NOISE,
+    NOISE_PX,
+    SPECKLE_PX,
+    STEP,
+    DisparityMatcher,
+)
 from segfloor_ros.floor.disparity.photometric import texture_grey
-from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan, FloorSegmentationSettings
+from segfloor_ros.floor.observation import (
+    RANGE_MAX_ERROR_M,
+    SAME_SURFACE_SHARE,
+    FloorScan,
+    FloorSegmentationSettings,
+)
 from segfloor_ros.geometry import Array, transform_points
 
 RANGE_STEP_M = 0.025
@@ -35,24 +47,17 @@ _FADING_ROWS = 1.5
 _DIP_BEARINGS = 5
 _NARROW_M, _GAP_BEARINGS = 0.2, (5, 9, 17, 33)
 """Gaps between things are closed up to this width, in these numbers of bearings."""
-_SPREAD = 0.06
-"""What stands upright is measured within this share of its range."""
 _UPRIGHT_M = 0.08
 """So much of an upright surface must be seen to end the scan."""
 _LOG_STEP = 0.01
-_SPREAD_BINS = round(_SPREAD / _LOG_STEP)
+_SPREAD_BINS = round(SAME_SURFACE_SHARE / _LOG_STEP)
 _NEAREST_M = 0.1
 _MEDIAN_ROUNDS = 3
-_MEDIAN_NOISE = 0.35
-"""Error of the median of the disparities on one bearing, as a share of that of one disparity."""
 
 _SCALE = 2
-_STEP = 16
 _SEEN_BEFORE_M = 0.5
 """What is nearer than this has been seen before."""
 _MIN_ROWS = 16
-_BLOCK_PX = 3
-_SAME_SURFACE_SHARE = 0.06
 _TEXTURE_WINDOW_PX = 7
 _BOARD_SHARE = 0.04
 """So much of a board must have texture of its own: its ends have."""
@@ -73,7 +78,7 @@ class FloorScanner:
         first = np.floor(bearing.min() / step) if len(border) else 0.0
         self._angle_min = float(np.float32(first * step))
         self._count = int(np.ceil(bearing.max() / step) - first) + 1 if len(border) else 1
-        noise_px = _MEDIAN_NOISE * NOISE_PX
+        noise_px = MEAN_NOISE * NOISE_PX
         # Depth from disparity: an error of the disparity d grows to Z^2 / (f b) times as much.
         range_max_m = math.sqrt(RANGE_MAX_ERROR_M * camera.disparity_times_depth / noise_px)
         self._range_max_m = float(np.float32(range_max_m))
@@ -118,7 +123,7 @@ class FloorScanner:
         upright_m = self._upright(self._polar_counts(upright_xy), density)
         feet_m = self._feet(feet_xy)
         # Both measure the same face equally well.
-        same = np.abs(upright_m - feet_m) < _SPREAD * feet_m
+        same = np.abs(upright_m - feet_m) < SAME_SURFACE_SHARE * feet_m
         upright_m = np.where(same, 0.5 * (upright_m + feet_m), np.fmin(upright_m, feet_m))
         middle = self._middle
         limit = self._limit(upright_m)
@@ -127,7 +132,7 @@ class FloorScanner:
         # that has crept up a blank wall.
         reached = grey_closing(self._reached(seen, seen_by_both), size=(_DIP_BEARINGS,))
         reached = np.minimum(grey_opening(reached, size=(_DIP_BEARINGS,)), limit)
-        near = np.maximum(self._gap_m, _SPREAD * upright_m)
+        near = np.maximum(self._gap_m, SAME_SURFACE_SHARE * upright_m)
         near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
             touches = (reached > 0) & (reached >= upright_m - near)
@@ -268,8 +273,8 @@ class OverheadMatcher:
     ) -> None:
         self._camera, self._settings = camera, settings
         nearest_px = min(num_disparities, camera.disparity_times_depth / _SEEN_BEFORE_M)
-        searched = math.ceil(nearest_px / (_SCALE * _STEP)) * _STEP
-        self._matcher = DisparityMatcher(searched, _BLOCK_PX, SPECKLE_PX // _SCALE**2)
+        searched = math.ceil(nearest_px / (_SCALE * STEP)) * STEP
+        self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // _SCALE**2)
 
     def positions(
         self,
@@ -335,13 +340,13 @@ def _with_boards(
     The edge and the grain of a board run along the rows and match anywhere. Its ends do not, and
     the matching carries their disparity along the board.
     """
-    near = disparity * np.float32(1 - _SAME_SURFACE_SHARE)
+    near = disparity * np.float32(1 - SAME_SURFACE_SHARE)
     farther = np.where(disparity > 0, disparity, np.float32(np.inf))
     board = known & (np.minimum.accumulate(farther, axis=0) < near)
     board &= np.minimum.accumulate(farther[::-1], axis=0)[::-1] < near
     for axis in (0, 1):
         step = np.abs(np.diff(disparity, axis=axis, prepend=0))
-        board &= step <= _SAME_SURFACE_SHARE * np.maximum(disparity, 1)
+        board &= step <= SAME_SURFACE_SHARE * np.maximum(disparity, 1)
     count, label = cv2.connectedComponents(board.astype(np.uint8), connectivity=4)
     size = np.bincount(label[board], minlength=count)
     share = np.bincount(label[board & telling], minlength=count) / np.maximum(size, 1)
@@ -355,4 +360,4 @@ def _fringes(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
     """
     known = np.where(disparity > 0, disparity, np.float32(np.inf))
     farthest = cv2.erode(known, np.ones((1, 3), np.uint8))
-    return farthest < disparity * np.float32(1 - _SAME_SURFACE_SHARE)
+    return farthest < disparity * np.float32(1 - SAME_SURFACE_SHARE)

@@ -26,6 +26,7 @@ from segfloor_ros.floor.disparity.matching import (
     stereo_view,
 )
 from segfloor_ros.floor.disparity.photometric import (
+    TEXTURE_WINDOW_PX,
     compare,
     compare_measured,
     enough_texture,
@@ -74,7 +75,6 @@ from segfloor_ros.timing import NoTimes, StageTimes
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
 _ROWS_ABOVE_HORIZON = 16
 """The matcher's paths get a run-up, and the horizon some play."""
-_TEXTURE_WINDOW_PX = 11
 _PLAIN_TO_SEE = 100.0
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
@@ -132,7 +132,7 @@ class FloorSegmentation:
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
             enough = enough_texture(noise)
-            texture = texture_grey(left_rows, _TEXTURE_WINDOW_PX)[:, columns[1]]
+            texture = texture_grey(left_rows, TEXTURE_WINDOW_PX)[:, columns[1]]
             if measured is not None:
                 # Depth is measured on plain surfaces, too; a hole in it tells nothing.
                 plain = np.float32(_PLAIN_TO_SEE * enough)
@@ -189,7 +189,7 @@ class FloorSegmentation:
         most = self._matcher.num_disparities
         table = HeightTable.of(view.line, profile, most, settings, constant)
         evidence = judge(view, profile, below, texture > enough, compared, table, settings)
-        seen = trim_to_edges(evidence.mask, row_slope(left), _TEXTURE_WINDOW_PX // 2 + 3)
+        seen = trim_to_edges(evidence.mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
         floor = seen == FLOOR
         odd = unlike_floor(left, floor)
         seen[floor & odd & evidence.off] = NO_EVIDENCE

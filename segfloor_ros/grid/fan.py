@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.observation import SAME_SURFACE_SHARE
 from segfloor_ros.geometry import Array
 
 SUBPIXEL_BITS = 4
-SAME_SURFACE_SHARE = 0.06
-"""Neighbouring bearings whose ranges differ by more than this share end at different things."""
-TURN = 2 * np.pi
 _SLANT_STEPS = 3
 _MAX_SLANT = 4.0
 
@@ -93,7 +92,7 @@ class Fan:
 
     def _contains(self, x: Array, y: Array, left: Array, right: Array) -> NDArray[np.bool_]:
         """Tell which points (N,), (N,), relative to the centre, lie within their wedge."""
-        bearing = np.remainder(np.arctan2(y, x) - self.first_rad, TURN)
+        bearing = np.remainder(np.arctan2(y, x) - self.first_rad, math.tau)
         index = (bearing * (1 / self.step_rad)).astype(np.intp)
         within = index < left.shape[1]
         index *= within
@@ -151,12 +150,12 @@ def nearest_cells(
     """
     x, y = column + (0.5 - fan.centre[0]), row + (0.5 - fan.centre[1])
     distance: Array = np.sqrt(x * x + y * y)
-    bearing = np.remainder(np.arctan2(y, x) - fan.first_rad, TURN) * (1 / fan.step_rad)
+    bearing = np.remainder(np.arctan2(y, x) - fan.first_rad, math.tau) * (1 / fan.step_rad)
     half_width = (0.5 / fan.step_rad) / np.maximum(distance, 0.5)
     first = np.ceil(bearing - half_width).astype(np.intp)
     count = np.floor(bearing + half_width).astype(np.intp) - first + 1
     start = np.cumsum(count) - count
     index = np.arange(count.sum()) + np.repeat(first - start, count)
-    nearest = np.full(int(np.ceil(TURN / fan.step_rad)), np.inf)
+    nearest = np.full(int(np.ceil(math.tau / fan.step_rad)), np.inf)
     np.minimum.at(nearest, index % len(nearest), np.repeat(distance, count))
     return nearest[: len(fan.lengths)]

@@ -21,6 +21,10 @@ SUBPIXEL = 16
 """Steps per pixel of the matcher's fixed-point disparities."""
 NOISE_PX = 0.5
 """Error of a disparity, one sigma."""
+MEAN_NOISE = 0.35
+"""Error of the mean, or median, of neighbours as a share of that of one: they err together."""
+SIGMAS = 2.0
+"""What differs by more sigmas is something else: one in twenty does by chance."""
 BLOCK_PX = 5
 """Side of the block that is matched."""
 SPECKLE_PX = 60

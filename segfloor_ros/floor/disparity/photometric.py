@@ -13,13 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.disparity.matching import BLOCK_PX, SIGMAS
 from segfloor_ros.floor.disparity.profile import FloorProfile
-from segfloor_ros.floor.disparity.view import FloorView
+from segfloor_ros.floor.disparity.view import STEP_PX, FloorView
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
 
-_STEP_PX = 2
-"""Every so many pixels of the image are compared, in rows and in columns."""
-_WINDOW = 5
 _WIDE_WINDOW = 15
 """What too little texture leaves open in a small window a larger one often tells."""
 _AGAINST_GREY = 1.0
@@ -31,8 +29,6 @@ _WIDE_MARGIN_GREY = 0.05
 _WIDE_SHARE = 0.65
 _MARGIN_PX = 4.0
 """So near to the right image's border interpolation is unsure."""
-_SIGMAS = 2.0
-"""What is measured so far from the floor, in sigmas, contradicts it."""
 _NOISE_SHARE = 2.0
 """Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
 
@@ -42,6 +38,8 @@ _MIN_TEXTURE_GREY = 0.2
 _NOISE_TEXTURE = 0.1
 """Texture per grey level of noise that is surely no noise: its own is 0.04."""
 _LAPLACIAN_GAIN = 6.0
+TEXTURE_WINDOW_PX = 11
+"""Over so wide a square texture is measured."""
 EDGE_SLOPE = 24
 """Sobel response of the weakest edge that counts: 3 grey levels per row."""
 
@@ -59,9 +57,9 @@ def compare(
     left, right: whole image rows (R, image width). Where the right image does not reach,
     nothing speaks against the floor nor for it.
     """
-    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
-    sampled = left[::_STEP_PX, ::_STEP_PX]
-    steps = (np.arange(0, size, _STEP_PX, dtype=np.float32) for size in left.shape)
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    sampled = left[::STEP_PX, ::STEP_PX]
+    steps = (np.arange(0, size, STEP_PX, dtype=np.float32) for size in left.shape)
     rows, columns = np.meshgrid(*steps, indexing='ij')
     floor_px = profile.at_pixels(view.derolled[part])
     matched_px = disparity[part]
@@ -94,16 +92,16 @@ def compare_measured(
     no right image to look at. noise_px: of the disparities, one sigma.
     """
     floor_px = profile.at_pixels(view.derolled)
-    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(_SIGMAS * noise_px))
-    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(SIGMAS * noise_px))
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the local mean absolute difference, free of differences in brightness."""
     difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
-    difference -= cv2.blur(difference, (_WINDOW, _WINDOW))
-    return cv2.blur(np.abs(difference), (_WINDOW, _WINDOW))
+    difference -= cv2.blur(difference, (BLOCK_PX, BLOCK_PX))
+    return cv2.blur(np.abs(difference), (BLOCK_PX, BLOCK_PX))
 
 
 def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -10,20 +10,22 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity.matching import SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.observation import VDisparity
 
 _WIDE_PX = 480
 """Of wider images every other column is used: neighbours say the same."""
 
+STEP_PX = 2
+"""Every so many pixels of the image, in rows and columns, are compared, and filled, alike."""
 _NEAR_M = 0.05
 _FAR_M = 1000.0
-_ROWS_PER_PX = 16
-"""Steps per pixel of disparity at which the profile is tabulated."""
 
 _OBSTACLE_M = 0.2
 """An upright surface of this height is taken out before the profile is fitted."""
@@ -94,9 +96,9 @@ class FloorView:
         camera = self.camera
         disparity = np.float32(camera.disparity_times_depth) / depth
         u = x / depth * np.float32(camera.fx) + np.float32(camera.cx)
-        steps = np.arange(0, int(disparity.max() * _ROWS_PER_PX) + 2)
-        row_of = profile.row_of_disparity(steps / _ROWS_PER_PX).astype(np.float32)
-        derolled = row_of[(disparity * np.float32(_ROWS_PER_PX) + np.float32(0.5)).astype(np.int32)]
+        steps = np.arange(0, int(disparity.max() * SUBPIXEL) + 2)
+        row_of = profile.row_of_disparity(steps / SUBPIXEL).astype(np.float32)
+        derolled = row_of[(disparity * np.float32(SUBPIXEL) + np.float32(0.5)).astype(np.int32)]
         v = derolled - np.float32(self.line.shear) * (u - np.float32(camera.cx)) - self.first_row
         columns = np.rint(u / np.float32(self.step))
         columns[depth > _FAR_M] = -1
@@ -121,6 +123,31 @@ class FloorView:
 def column_step(camera: StereoCamera) -> int:
     """Return which columns of the image are used: every one, or every other."""
     return 2 if camera.width > _WIDE_PX else 1
+
+
+def surface_above(
+    disparity: NDArray[np.float32],
+    counted: NDArray[np.float32],
+    window_px: tuple[int, int],
+    gap_rows: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return mean and variance of the disparities (R, W) of what stands right above each pixel, and
+    the share of it that counts, each (R, W).
+
+    counted: 1 where a disparity counts, else 0. window_px: columns and rows of the surface, which
+    ends `gap_rows` above the pixel: below that the matcher mixes it with what it stands on.
+    """
+    columns, rows = window_px
+
+    def mean_above(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        above = np.zeros_like(values)
+        above[gap_rows:] = cv2.blur(values, window_px, anchor=(columns // 2, rows - 1))[:-gap_rows]
+        return above
+
+    share = mean_above(counted)
+    safe = np.maximum(share, np.float32(1e-6))
+    mean = mean_above(counted * disparity) / safe
+    return mean, mean_above(counted * disparity**2) / safe - mean**2, share
 
 
 def u_disparity(bins: NDArray[np.intp], num_bins: int) -> NDArray[np.intp]:

@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from segfloor_ros.floor.disparity.photometric import EDGE_SLOPE
 from segfloor_ros.floor.disparity.profile import FloorProfile, pixels_where
-from segfloor_ros.floor.disparity.view import FloorView
+from segfloor_ros.floor.disparity.view import STEP_PX, FloorView, surface_above
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
-_STEP_PX = 2
-"""Regions are found at this part of the resolution."""
 _MIN_REGION_PX = 15
 _MIN_COLUMNS = 0.3
 """Part of the columns of a region that must show floor for it to be filled."""
@@ -31,7 +29,6 @@ _GAP_M = 0.5
 _THREAD_PX = 3
 _ISLAND_SHARE = 0.05
 """Patches of floor smaller than this share of the largest are dropped."""
-_BORDER_PX = 12
 _MIN_SLOPE = 1.5
 """Grey levels per pixel at half resolution; weaker edges bound no region."""
 _STRONG_SLOPE = 10.0
@@ -40,7 +37,7 @@ _TEXTURE_MARGIN = 7
 _HOLE_ROWS = 12
 """As high as the window in which texture is measured."""
 _UNMATCHED_PX = 12
-"""So wide a strip at the border of what both cameras see may be without matches."""
+"""So wide a strip at the border of what is matched may be without matches."""
 
 _ROWS, _COLUMNS = 5, 7
 """Size of the window above the contact in which the upright surface is measured."""
@@ -77,7 +74,7 @@ def fill_regions(
     column; or between floor on its left and right; or, if it is not blank, nearer than any of its
     floor.
     """
-    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
     floor = small == FLOOR
     if np.count_nonzero(floor) < _MIN_REGION_PX:
@@ -108,7 +105,7 @@ def fill_regions(
 
 
 def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    smooth = cv2.blur(image, (5, 5))[::_STEP_PX, ::_STEP_PX]
+    smooth = cv2.blur(image, (5, 5))[::STEP_PX, ::STEP_PX]
     return cv2.magnitude(
         cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
         cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8),
@@ -202,7 +199,7 @@ def fill_gaps(
     longest = _GAP_M * view.camera.fx / view.camera.disparity_times_depth * disparity / view.step
     gaps = Runs.of(mask == NO_EVIDENCE)
     # The matcher leaves out some columns at the right border.
-    at_border = (gaps.stop == width) & (width - gaps.first <= _BORDER_PX // view.step)
+    at_border = (gaps.stop == width) & (width - gaps.first <= _UNMATCHED_PX // view.step)
     between = gaps.before(mask, NO_EVIDENCE) == FLOOR
     between &= (gaps.after(mask, NO_EVIDENCE) == FLOOR) | at_border
     across = np.minimum(gaps.stop, width - 1) - gaps.first + 1
@@ -211,7 +208,7 @@ def fill_gaps(
 
 def drop_islands(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the mask without patches of floor smaller than a share of the largest."""
-    step = _STEP_PX
+    step = STEP_PX
     small = (mask[::step, ::step] == FLOOR).astype(np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
     if count < 3:
@@ -266,7 +263,7 @@ def fill_to_contact(
     what looks like floor at half the resolution in both directions of the image, the shape of the
     result.
     """
-    part = np.s_[::_STEP_PX, :: _STEP_PX // view.step]
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
     open_ = alike & (small == NO_EVIDENCE)
     if not open_.any():
@@ -290,19 +287,7 @@ def _upright_above(
 ) -> NDArray[np.float32]:
     """Return the disparity of the upright surface right above each pixel, NaN where none is."""
     counted = (contrary & (disparity > 0)).astype(np.float32)
-    window = (_COLUMNS, _ROWS)
-    # The window ends some rows above the pixel, where the matcher does not mix the two surfaces.
-    anchor = (_COLUMNS // 2, _ROWS - 1)
-
-    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        shifted = np.zeros_like(values)
-        shifted[_GAP_ROWS:] = values[:-_GAP_ROWS]
-        return cv2.blur(shifted, window, anchor=anchor)
-
-    share = mean(counted)
-    safe = np.maximum(share, 1e-6)
-    average = mean(counted * disparity) / safe
-    variance = mean(counted * disparity**2) / safe - average**2
+    average, variance, share = surface_above(disparity, counted, (_COLUMNS, _ROWS), _GAP_ROWS)
     good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
     return np.where(good, average, np.float32(np.nan))
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.depth import measured_sigma_px
-from segfloor_ros.floor.disparity.matching import NOISE_PX, SUBPIXEL
+from segfloor_ros.floor.disparity.matching import MEAN_NOISE, NOISE_PX, SIGMAS, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.disparity.view import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
@@ -30,8 +30,6 @@ _CONTACT_HEIGHT_M = 0.12
 
 _NEIGHBOURS_PX = 9
 """Heights are averaged over so wide a square; ones that are matched err together."""
-_MEAN_SIGMAS = 0.7
-"""Two sigmas of such a mean, which errs by 0.35 of what one height does."""
 _MOST_SIGMAS = np.float32(10)
 _LEAST_KNOWN = 0.2
 
@@ -39,8 +37,6 @@ _WINDOW_SHARE = 0.25
 """Of the image's width: floor so near looks alike. A sun, a lamp and dust change it slowly."""
 _FEW = 0.1
 """Where floor covers less than this share of the window, all floor of the image counts."""
-_SIGMAS = 2.0
-"""One in twenty of the floor's own pixels differs by more."""
 _SMOOTH_PX = 5
 _SHRINK = 4
 _STEP_GREY = 1.0
@@ -99,7 +95,7 @@ class HeightTable:
             scale * row,
             scale,
             np.hypot(settings.step_height_m, noise_m),
-            settings.drop_height_m + 2 * noise_m,
+            settings.drop_height_m + SIGMAS * noise_m,
             noise_m,
         )
         return cls(*(table.astype(np.float32) for table in tables))
@@ -164,7 +160,7 @@ def _off_floor(sigmas: NDArray[np.float32]) -> NDArray[np.bool_]:
     # One that is far off speaks for no more than a few.
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
     mean = cv2.blur(bounded, window)
-    return (np.abs(mean) > np.float32(_MEAN_SIGMAS) * share) & (share > _LEAST_KNOWN)
+    return (np.abs(mean) > np.float32(SIGMAS * MEAN_NOISE) * share) & (share > _LEAST_KNOWN)
 
 
 def _below_contact(
@@ -206,7 +202,7 @@ def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[
         if not counted.any():
             return odd
         mean, variance = _around(grey, counted)
-        odd = (grey - mean) ** 2 > _SIGMAS**2 * (variance + _STEP_GREY**2)
+        odd = (grey - mean) ** 2 > SIGMAS**2 * (variance + _STEP_GREY**2)
     return odd
 
 

@@ -24,12 +24,14 @@ from segfloor_ros.floor.disparity.matching import (
 )
 from segfloor_ros.floor.disparity.photometric import (
     EDGE_SLOPE,
+    TEXTURE_WINDOW_PX,
     enough_texture,
     noise_grey,
     row_slope,
     texture_grey,
 )
 from segfloor_ros.floor.disparity.profile import pixels_where
+from segfloor_ros.floor.disparity.view import surface_above
 from segfloor_ros.floor.plane.plane import (
     LEVEL_SIGMA,
     SAMPLES,
@@ -78,7 +80,6 @@ _LEAST_HALVED_PX = 480
 """Images less wide than this are never matched at half the resolution alone."""
 _ENOUGH_GREY = 0.3
 """Gradient along the row, per pixel, that is no noise."""
-_TEXTURE_WINDOW_PX = 11
 _COLUMN_STEP_PX = 2
 """Every other column is searched for the base of things."""
 _BASE_WEIGHT = 8.0
@@ -366,16 +367,14 @@ def find_bases(
     """
     image, disparity = left[:, ::_COLUMN_STEP_PX], disparity_px[:, ::_COLUMN_STEP_PX]
     enough = enough_texture(noise_grey(left))
-    texture = texture_grey(left, _TEXTURE_WINDOW_PX)[:, ::_COLUMN_STEP_PX]
+    texture = texture_grey(left, TEXTURE_WINDOW_PX)[:, ::_COLUMN_STEP_PX]
     slope = row_slope(image)
     strongest = cv2.dilate(slope, np.ones((_AROUND_ROWS, 1), np.uint8))
     base = (slope == strongest) & (slope >= EDGE_SLOPE)
     base &= _below((texture < 1.5 * enough).astype(np.float32))
     counted = ((disparity >= 1) & (texture > 2 * enough)).astype(np.float32)
-    share = _mean_above(counted)
-    safe = np.maximum(share, np.float32(1e-6))
-    mean = _mean_above(counted * disparity) / safe
-    variance = _mean_above(counted * disparity**2) / safe - mean**2
+    window = (_UPRIGHT_COLUMNS, _UPRIGHT_ROWS)
+    mean, variance, share = surface_above(disparity, counted, window, _UPRIGHT_GAP)
     base &= (share > _UPRIGHT_SHARE) & (variance < _UPRIGHT_SPREAD_PX**2)
     base[-_BLANK_GAP - _BLANK_ROWS :] = False
     rows, columns = np.nonzero(base)
@@ -388,12 +387,3 @@ def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:
     below = np.zeros(blank.shape, np.bool_)
     below[:-_BLANK_GAP] = mean[_BLANK_GAP:] > 0.95
     return below
-
-
-def _mean_above(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the mean of the values (H, W) in the window above each pixel."""
-    anchor = (_UPRIGHT_COLUMNS // 2, _UPRIGHT_ROWS - 1)
-    mean = cv2.blur(values, (_UPRIGHT_COLUMNS, _UPRIGHT_ROWS), anchor=anchor)
-    above = np.zeros_like(mean)
-    above[_UPRIGHT_GAP:] = mean[:-_UPRIGHT_GAP]
-    return above
