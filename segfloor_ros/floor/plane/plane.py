@@ -41,7 +41,8 @@ _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
-"""Of the biweight with which a plane is refined, one per step."""
+_NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
+"""Of the biweight with which a plane is refined, one per step; of one that is nearly known."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
 _FAITH = 2.0
@@ -227,17 +228,19 @@ def refine(
     travel: Array,
     mean: Array,
     sigma: Array,
+    scales_px: tuple[float, ...] = _SCALES_PX,
 ) -> PlaneFit:
     """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
 
     known: (3,), values that are given, NaN where not. travel: (T, 3) displacements of the camera in
     metres, along which the floor runs. mean, sigma: (3,) what is expected, and how surely.
+    scales_px: of the biweight, one per iteration.
     """
     state = start.copy()
     free = np.isnan(known)
     information: Array = np.eye(3)
     prior = np.diag(sigma**-2.0)
-    for scale in _SCALES_PX:
+    for scale in scales_px:
         information, gradient = _normal_equations(frames, state, scale)
         _add_travel(information, gradient, state, travel)
         information += prior
@@ -345,7 +348,8 @@ def plane_of_frame(
     share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
     start = expected[likeliest(share, expected)]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
-    return refine([samples], start, np.full(3, np.nan), np.zeros((0, 3)), start, sigma)
+    unknown, still = np.full(3, np.nan), np.zeros((0, 3))
+    return refine([samples], start, unknown, still, start, sigma, _NEAR_SCALES_PX)
 
 
 def likeliest(share: Array, expected: Array) -> int:
