@@ -17,8 +17,10 @@ RANGE_MAX_ERROR_M = 0.3
 SAME_SURFACE_SHARE = 0.06
 """Ranges, or disparities, that differ by more than this share are those of two surfaces."""
 
-MARGIN_M = 0.05
-"""A ray ends so far before what stands up, so that it does not clear the cell of that."""
+CELL_M = 0.05
+"""Side of a usual cell of a map. A ray ends so far before what stands up, so that it does not clear
+the cell of that.
+"""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def free_ranges(scan: FloorScan) -> NDArray[np.float32]:
     obstacle = scan.obstacle_m
     if obstacle is not None:
         touches = np.isfinite(obstacle) & (ranges > 0)
-        ranges -= np.where(touches, scan.error_per_m * ranges**2 + MARGIN_M, 0.0)
+        ranges -= np.where(touches, scan.error_per_m * ranges**2 + CELL_M, 0.0)
     beyond = scan.ranges_m >= scan.range_max_m
     ranges[beyond] = np.inf
     ranges[scan.ranges_m == 0] = -np.inf

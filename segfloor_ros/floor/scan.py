@@ -20,6 +20,7 @@ from segfloor_ros.floor.disparity.matching import (
     COARSE_BLOCK_PX,
     MEAN_NOISE,
     NOISE_PX,
+    RUN_UP_ROWS,
     SPECKLE_PX,
     STEP,
     DisparityMatcher,
@@ -38,12 +39,12 @@ _INCREMENT_RAD = 0.0087266
 """Half a degree between two bearings."""
 _GAP_STEPS = 5
 """A gap in the floor as long as so many steps are high is no gap to the robot."""
-_GAP_ROWS = 4.0
-"""So many image rows of floor may be missing, however many metres they are."""
 _CONTACT_ROWS = 2.5
 """So many rows may be missing where the floor meets what stands on it."""
 _FADING_ROWS = 1.5
 """So many rows are taken off where nothing shows why the floor ends."""
+_GAP_ROWS = _CONTACT_ROWS + _FADING_ROWS
+"""So many image rows of floor may be missing, however many metres they are."""
 _DIP_BEARINGS = 5
 _NARROW_M, _GAP_BEARINGS = 0.2, (5, 9, 17, 33)
 """Gaps between things are closed up to this width, in these numbers of bearings."""
@@ -57,7 +58,6 @@ _MEDIAN_ROUNDS = 3
 _SCALE = 2
 _SEEN_BEFORE_M = 0.5
 """What is nearer than this has been seen before."""
-_MIN_ROWS = 16
 _TEXTURE_WINDOW_PX = 7
 _BOARD_SHARE = 0.04
 """So much of a board must have texture of its own: its ends have."""
@@ -297,7 +297,7 @@ class OverheadMatcher:
         reach = (self._settings.robot_height_m - mount.height_m) / _SEEN_BEFORE_M * camera.fy
         first = max(0, horizon_row - int(max(reach, 0.0))) // _SCALE * _SCALE
         last = first + (horizon_row - first) // _SCALE * _SCALE
-        if last - first < _MIN_ROWS:
+        if last - first < RUN_UP_ROWS:
             return np.zeros((2, 0), np.float32)
         size = (camera.width // _SCALE, (last - first) // _SCALE)
         halves = [

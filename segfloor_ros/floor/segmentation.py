@@ -21,6 +21,7 @@ from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
     COARSE_ABOVE_PX,
     NOISE_PX,
+    RUN_UP_ROWS,
     TwoScaleMatcher,
     disparity_range,
     stereo_view,
@@ -73,8 +74,6 @@ from segfloor_ros.slam.tracking.images import union
 from segfloor_ros.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
-_ROWS_ABOVE_HORIZON = 16
-"""The matcher's paths get a run-up, and the horizon some play."""
 _PLAIN_TO_SEE = 100.0
 _BORDER_BLOCKS = 2
 """So near to the border of the right image, in blocks that are matched, matches are unsure."""
@@ -240,7 +239,7 @@ class FloorSegmentation:
         camera = self._camera
         line = FloorLine.of(camera, expected)
         shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
-        top = math.floor(line.horizon - shear) - _ROWS_ABOVE_HORIZON
+        top = math.floor(line.horizon - shear) - RUN_UP_ROWS
         return int(np.clip(top, 0, camera.height - 32))
 
     def _disparity(
@@ -252,7 +251,7 @@ class FloorSegmentation:
         line = FloorLine.of(camera, self._mount)
         shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
         last_fine = line.horizon + COARSE_ABOVE_PX / line.slope + shear
-        fine_rows = int(np.clip(last_fine - top, _ROWS_ABOVE_HORIZON, camera.height - top))
+        fine_rows = int(np.clip(last_fine - top, RUN_UP_ROWS, camera.height - top))
         disparity = np.zeros(left.shape, np.float32)
         disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
         return disparity

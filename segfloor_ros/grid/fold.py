@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.observation import CELL_M
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.fan import (
     SUBPIXEL_BITS,
@@ -36,7 +37,6 @@ from segfloor_ros.grid.raster import (
     steps,
 )
 
-_BODY_M = 0.05
 _AROUND = np.ones((3, 3), np.uint8)
 
 _RAY_STEP = 0.25
@@ -78,7 +78,40 @@ class EvidenceFolder:
         """Lay evidence on the raster with the base at `pose`; the base came there from `previous`
         in a straight line.
         """
-        return place(evidence, pose, previous, self._resolution_m, self._radius_m)
+        yaw, scale = pose[2], 1 / self._resolution_m
+        way = np.array([pose[:2], (previous or pose)[:2]]).T * scale
+        lengths = evidence.fan_m.astype(np.float64) * scale
+        first_rad = evidence.first_rad + yaw
+        directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
+        cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
+        positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m.astype(np.float64)
+        rays, faces = evidence.num_rays, evidence.num_rays + evidence.num_contacts
+        x, y = positions[:, faces:]
+        outward = positions[:, faces:] / np.maximum(np.sqrt(x * x + y * y), 1.0)
+        positions += way[:, :1]
+        thickness = np.maximum(evidence.thickness_m.astype(np.float64) * scale, 1.0)
+        margin = self._radius_m * scale + 2
+        body = int(np.ceil(thickness.max(initial=BEHIND_M * scale))) + 1
+        ends = directions * lengths + way[:, :1]
+        touched = np.concatenate([ends, positions, way - margin, way + margin], axis=1)
+        low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - body
+        high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + body + 1
+        positions -= low
+        way -= low
+        return PlacedEvidence(
+            low=(int(low[1, 0]), int(low[0, 0])),
+            high=(int(high[1, 0]), int(high[0, 0])),
+            fan=Fan(
+                way[:, 0], first_rad, evidence.step_rad, directions, lengths, find_jumps(lengths)
+            ),
+            previous=way[:, 1],
+            rays=positions[:, :rays],
+            ends=positions[:, rays:faces],
+            faces=positions[:, faces:],
+            outward=outward,
+            thickness=thickness,
+            sure_range=evidence.sure_range_m * scale,
+        )
 
     def fold(self, cells: NDArray[np.uint8], placed: PlacedEvidence) -> None:
         """Add evidence to the cells from `placed.low` up to, not including, `placed.high`."""
@@ -142,7 +175,7 @@ class EvidenceFolder:
             return None
         column, row = at.reshape(-1, 2).T
         horizon = nearest_cells(column, row, fan)
-        return fan.shadow(in_the_way.shape, horizon + max(2.0, _BODY_M / self._resolution_m))
+        return fan.shadow(in_the_way.shape, horizon + max(2.0, CELL_M / self._resolution_m))
 
     def _draw_near(self, shape: tuple[int, ...], placed: PlacedEvidence) -> NDArray[np.uint8]:
         """Return the cells that are near enough for an obstacle to be placed in one of them, 1."""
@@ -245,45 +278,3 @@ class PlacedEvidence:
     outward: Array
     thickness: Array
     sure_range: float
-
-
-def place(
-    evidence: KeyframeEvidence,
-    pose: Pose2d,
-    previous: Pose2d | None,
-    resolution_m: float,
-    margin_m: float,
-) -> PlacedEvidence:
-    """Lay evidence on the raster with the base at `pose`, and `margin_m` around its way there."""
-    yaw, scale = pose[2], 1 / resolution_m
-    way = np.array([pose[:2], (previous or pose)[:2]]).T * scale
-    lengths = evidence.fan_m.astype(np.float64) * scale
-    first_rad = evidence.first_rad + yaw
-    directions = unit_vectors(first_rad + evidence.step_rad * np.arange(len(lengths)))
-    cos, sin = np.cos(yaw) * scale, np.sin(yaw) * scale
-    positions = np.array([[cos, -sin], [sin, cos]]) @ evidence.positions_m.astype(np.float64)
-    rays, faces = evidence.num_rays, evidence.num_rays + evidence.num_contacts
-    x, y = positions[:, faces:]
-    outward = positions[:, faces:] / np.maximum(np.sqrt(x * x + y * y), 1.0)
-    positions += way[:, :1]
-    thickness = np.maximum(evidence.thickness_m.astype(np.float64) * scale, 1.0)
-    margin = margin_m * scale + 2
-    body = int(np.ceil(thickness.max(initial=BEHIND_M * scale))) + 1
-    ends = directions * lengths + way[:, :1]
-    touched = np.concatenate([ends, positions, way - margin, way + margin], axis=1)
-    low = np.floor(touched.min(axis=1, keepdims=True)).astype(np.intp) - body
-    high = np.floor(touched.max(axis=1, keepdims=True)).astype(np.intp) + body + 1
-    positions -= low
-    way -= low
-    return PlacedEvidence(
-        low=(int(low[1, 0]), int(low[0, 0])),
-        high=(int(high[1, 0]), int(high[0, 0])),
-        fan=Fan(way[:, 0], first_rad, evidence.step_rad, directions, lengths, find_jumps(lengths)),
-        previous=way[:, 1],
-        rays=positions[:, :rays],
-        ends=positions[:, rays:faces],
-        faces=positions[:, faces:],
-        outward=outward,
-        thickness=thickness,
-        sure_range=evidence.sure_range_m * scale,
-    )

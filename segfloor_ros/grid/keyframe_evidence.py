@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.files.saved_map import Arrays, joined, split
-from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.floor.observation import CELL_M, FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.grid.fan import find_jumps, slant, unit_vectors
 from segfloor_ros.grid.map_file import OccupancyGridSettings
@@ -25,8 +25,6 @@ _LEAST_DEEP_M = 0.03
 QUARTILE = 0.675
 """Quartiles of a normal distribution lie this many sigmas from its mean."""
 
-_HIT_ERROR_M = 0.05
-"""An obstacle whose place is less certain than this, and than a cell, marks none."""
 
 _SURE_SHARE = 0.4
 """An obstacle is placed within its cell where this share of a cell's side is one sigma."""
@@ -99,11 +97,13 @@ def gather_evidence(
 
 
 def hit_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
-    """Return up to which distance an obstacle is placed well enough to mark cells."""
+    """Return up to which distance an obstacle is placed well enough, within a cell or a usual one,
+    to mark cells.
+    """
     limit_m = free_range_m(scan, settings)
     if scan.error_per_m == 0:
         return limit_m
-    error_m = max(settings.resolution_m, _HIT_ERROR_M)
+    error_m = max(settings.resolution_m, CELL_M)
     return min(limit_m, math.sqrt(error_m / scan.error_per_m))
 
 

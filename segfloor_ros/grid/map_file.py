@@ -24,9 +24,8 @@ FREE_THRESH = 0.196
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 MODES = ('trinary', 'scale', 'raw')
 
-FREE = 0
-OCCUPIED = 100
-UNKNOWN = -1
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Cells, as nav_msgs/OccupancyGrid has them."""
 
 
 def save_map(grid: OccupancyGrid, path: Path) -> None:

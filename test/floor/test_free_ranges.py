@@ -9,7 +9,7 @@ from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_po
 
 from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.floor.observation import (
-    MARGIN_M,
+    CELL_M,
     FloorScan,
     FloorSegmentationSettings,
     free_ranges,
@@ -27,7 +27,7 @@ def test_ranges_are_as_rep_117_has_them() -> None:
         range_max_m=4.0,
     )  # fmt: skip
     sigma_m = 0.3 * (2.0 / 4.0) ** 2
-    expected = [2.0, 2.0 - sigma_m - MARGIN_M, -INF, NAN, INF, -INF]
+    expected = [2.0, 2.0 - sigma_m - CELL_M, -INF, NAN, INF, -INF]
     np.testing.assert_allclose(free_ranges(scan), expected, rtol=1e-6)
 
 

@@ -46,6 +46,8 @@ COARSE_ABOVE_PX = 28.0
 """Where the floor has a larger disparity, images are matched at half the resolution."""
 _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
+RUN_UP_ROWS = 16
+"""The matcher's paths get a run-up, and the horizon some play."""
 _RUN_OUT_ROWS = 8
 """The matcher's blocks and paths reach beyond the last fine row."""
 

@@ -37,7 +37,6 @@ _MIN_TEXTURE_GREY = 0.2
 """Below this slope of the image along a row, per pixel, a disparity says nothing."""
 _NOISE_TEXTURE = 0.1
 """Texture per grey level of noise that is surely no noise: its own is 0.04."""
-_LAPLACIAN_GAIN = 6.0
 TEXTURE_WINDOW_PX = 11
 """Over so wide a square texture is measured."""
 EDGE_SLOPE = 24
@@ -135,7 +134,7 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     part = image[::2]
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     response = cv2.filter2D(part, cv2.CV_32F, kernel)
-    return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / _LAPLACIAN_GAIN
+    return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / float(np.linalg.norm(kernel))
 
 
 def enough_texture(noise_grey: float) -> float:
