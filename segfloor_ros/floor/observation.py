@@ -76,7 +76,6 @@ class FloorObservation:
     mask: NDArray[np.uint8]
     profile_px: NDArray[np.float64]
     scan: FloorScan
-    min_disparity_px: float
     max_disparity_px: float
     v_disparity: VDisparity
 

@@ -144,7 +144,8 @@ class FloorSegmentation:
             fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
-            counted = self._v_disparity(view, below, texture > 2 * enough)
+            most = self._matcher.num_disparities
+            counted = filtered_v_disparity(view, below, texture > 2 * enough, most, BINS_PER_PX)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
             if measured is None:
@@ -187,13 +188,11 @@ class FloorSegmentation:
         constant = self._camera.disparity_times_depth if measured else None
         most = self._matcher.num_disparities
         table = HeightTable.of(view.line, profile, most, settings, constant)
-        evidence = judge(view, profile, below, texture > enough, compared, table, settings)
-        seen = trim_to_edges(evidence.mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
-        floor = seen == FLOOR
-        odd = unlike_floor(left, floor)
-        seen[floor & odd & evidence.off] = NO_EVIDENCE
-        above = evidence.above & (texture >= _LEAST_SHARE * enough)
-        return Evidence(seen, above, evidence.off, odd)
+        mask, above, off = judge(view, profile, below, texture > enough, compared, table, settings)
+        seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
+        odd = unlike_floor(left, seen == FLOOR)
+        seen[(seen == FLOOR) & odd & off] = NO_EVIDENCE
+        return Evidence(seen, above & (texture >= _LEAST_SHARE * enough), off, odd)
 
     def _observation(
         self,
@@ -212,7 +211,6 @@ class FloorSegmentation:
             mask=whole,
             profile_px=profile.at_rows(rows).astype(np.float64),
             scan=scan,
-            min_disparity_px=0.0,
             max_disparity_px=max(float(self._matcher.num_disparities), float(disparity.max())),
             v_disparity=counted,
         )
@@ -255,12 +253,6 @@ class FloorSegmentation:
         disparity = np.zeros(left.shape, np.float32)
         disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
         return disparity
-
-    def _v_disparity(
-        self, view: FloorView, disparity: NDArray[np.float32], textured: NDArray[np.bool_]
-    ) -> VDisparity:
-        most = self._matcher.num_disparities
-        return filtered_v_disparity(view, disparity, textured, most, BINS_PER_PX)
 
     def _fill(
         self,

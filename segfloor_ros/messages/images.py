@@ -121,7 +121,7 @@ def disparity_message(
         image=image_message(stamp_ns, frame_id, floor.disparity_px, '32FC1'),
         f=float(camera.fx),
         t=float(camera.baseline_m),
-        min_disparity=float(floor.min_disparity_px),
+        min_disparity=0.0,
         max_disparity=float(floor.max_disparity_px),
         delta_d=1.0 / 16.0,
     )

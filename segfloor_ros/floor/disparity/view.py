@@ -130,7 +130,7 @@ def surface_above(
     counted: NDArray[np.float32],
     window_px: tuple[int, int],
     gap_rows: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Return mean and variance of the disparities (R, W) of what stands right above each pixel, and
     the share of it that counts, each (R, W).
 

@@ -122,8 +122,8 @@ def judge(
     compared: Comparison,
     table: HeightTable,
     settings: FloorSegmentationSettings,
-) -> Evidence:
-    """Return what the pixels (R, W) of the view say by themselves.
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return what the pixels (R, W) of the view say by themselves: mask, above, off of `Evidence`.
 
     textured: where a disparity means something; compared: what the images say of the floor. A
     disparity makes floor only where the images agree, and denies it only where they do.
@@ -148,8 +148,7 @@ def judge(
     low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    nothing = np.zeros_like(above)
-    return Evidence(mask, height > 0, _off_floor(height / table.noise.take(index)), nothing)
+    return mask, height > 0, _off_floor(height / table.noise.take(index))
 
 
 def _off_floor(sigmas: NDArray[np.float32]) -> NDArray[np.bool_]:
