@@ -201,9 +201,8 @@ def test_a_ramp_is_floor(slope_deg, least_recall, floor_kind):
 
 
 @pytest.mark.parametrize('floor_kind', FLOORS)
-@pytest.mark.parametrize('slope_deg', [8.0, 15.0])
-def test_a_ramp_is_floor_when_nothing_else_is_in_sight(slope_deg, floor_kind):
-    slope_rad = np.radians(slope_deg)
+def test_a_ramp_is_floor_when_nothing_else_is_in_sight(floor_kind):
+    slope_rad = np.radians(8.0)
     scene = Scene([floor_patch(far_m=0.25, **floor_kind), ramp(0.25, slope_rad, **floor_kind)])
     observation, floor, depth = segment(scene)
     precision, _ = shares(observation, floor, depth)

@@ -314,7 +314,7 @@ def test_the_disparity_image_gives_depth() -> None:
     disparity = np.array([[0, 2, 4, 0]] * 3, np.float32)
     counted = VDisparity(np.zeros((3, 128), np.intp), 0, 2)
     mask, scan = np.zeros((3, 4), np.uint8), FloorScan(0, 1, disparity[0])
-    seen = FloorObservation(disparity, mask, np.zeros(3), scan, 0.0, 64.0, counted)
+    seen = FloorObservation(disparity, mask, np.zeros(3), scan, 64.0, counted)
     message = over_the_wire(floor.disparity_message(0, 'eye', _camera(), seen))
     pixels = np.frombuffer(message.image.data, np.float32).reshape(3, 4)
     np.testing.assert_array_equal(pixels, disparity)
