@@ -19,15 +19,13 @@ CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
 RNG = np.random.default_rng(3)
 
 SCENES = {
-    # A wall at 2 m, and a point that seems to lie in front of it, at 1.2 m.
-    'wall': (
-        np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.6, -0.1, 0.5, 0.9)]),
-        25.0,
+    # A wall at 2 m.
+    'wall': np.array(
+        [[x, y, 2.0] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.6, -0.3, -0.1, 0.2, 0.5, 0.9)]
     ),
-    # The floor 0.4 m below the camera, and a point that seems to lie behind it, at 6 m.
-    'floor': (
-        np.stack([RNG.uniform(-1, 1, 16), np.full(16, 0.4), np.linspace(1.0, 3.4, 16)], axis=1),
-        5.0,
+    # The floor 0.4 m below the camera.
+    'floor': np.stack(
+        [RNG.uniform(-1, 1, 24), np.full(24, 0.4), np.linspace(1.0, 3.4, 24)], axis=1
     ),
 }
 

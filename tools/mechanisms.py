@@ -72,9 +72,6 @@ SLAM: dict[str, Mechanism] = {
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
     'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
     'disparity offset': Mechanism({'slam.rig.EXPECTED_SIGMA_PX': 0.0}),
-    'depth check of matches': Mechanism(
-        {'slam.mapping.keyframe_mapping.LocalMapper._contradicted': _no_rows}
-    ),
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
     'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),

@@ -28,15 +28,12 @@ if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
     from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 UNKNOWN_COVARIANCE = 1e6
-
 NO_POINT = -1
 """Id of a feature that has no map point."""
 
-MIN_SHARED = 15
-"""Fewest points that two keyframes must share, or agree on; fewer may be chance."""
-
-MIN_TRACKED = 20
-"""Fewest points that must agree for a pose to be believed; chance gives five or six."""
+ENOUGH = 20
+"""Fewest points that must agree for a pose, or for two views of one place, to be believed; half as
+many for a first guess. Chance gives five or six."""
 
 SAME = 0.5, 0.3
 """Two poses further apart than this, in m and rad, are two places."""

@@ -13,9 +13,11 @@ of the error of (u, v), and smaller; (u, v, u_right) would not have that propert
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.geometry import Array
@@ -39,16 +41,20 @@ MEMORY_SIGMA_PX = 0.01
 MAX_OFFSET_PX = 0.5
 """More is not an imperfect rectification but a wrong calibration, px."""
 
-CHI2_95 = {2: 5.991, 3: 7.815, 6: 12.59}
-"""95 % quantiles of the chi-squared distribution by degrees of freedom."""
+FITTING = 0.95
+"""Probability with which a measurement that is right is taken for one."""
 
-CHI2_50 = {2: 1.386, 3: 2.366}
-"""Medians of the chi-squared distribution by degrees of freedom."""
-
-CHI2_999 = {3: 16.27, 6: 22.46}
-"""99.9 % quantiles of the chi-squared distribution by degrees of freedom."""
+GATE = 0.999
+"""Probability with which what agrees is taken to agree, where a false alarm costs more."""
 
 MIN_DEPTH_M = 0.05
+
+SMALLEST = 1e-12
+"""Variance or pivot: what is not observed must not look exact, nor end in a division by zero."""
+
+SAME_PX = 4
+"""Pixels, and disparities, that differ by no more may show the same point where a pose, or a
+disparity, is known roughly."""
 
 
 @dataclass(frozen=True)
@@ -147,19 +153,25 @@ class Observations:
     @property
     def chi2_median(self) -> Array:
         """The median (N,) of the squared, normalised residual of each feature when all is well."""
-        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_50[3], CHI2_50[2])
+        return np.where(np.isfinite(self.uvd_px[:, 2]), chi2_limit(3, 0.5), chi2_limit(2, 0.5))
 
     @property
     def chi2_limit(self) -> Array:
         """The 95 % bound (N,) on the squared, normalised residual of each feature."""
-        return np.where(np.isfinite(self.uvd_px[:, 2]), CHI2_95[3], CHI2_95[2])
+        return np.where(np.isfinite(self.uvd_px[:, 2]), chi2_limit(3), chi2_limit(2))
+
+
+@cache
+def chi2_limit(dimensions: int, probability: float = FITTING) -> float:
+    """Return the quantile of the chi-squared distribution with so many degrees of freedom."""
+    return float(chdtri(dimensions, 1.0 - probability))
 
 
 def is_gated(error: Array, covariance: Array) -> bool:
     """Whether an error (D,) is no larger than its covariance (D, D) allows, with a probability of
     99.9 % (Mahalanobis distance).
     """
-    return float(error @ np.linalg.solve(covariance, error)) <= CHI2_999[len(error)]
+    return float(error @ np.linalg.solve(covariance, error)) <= chi2_limit(len(error), GATE)
 
 
 def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:

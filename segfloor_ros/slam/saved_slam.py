@@ -28,12 +28,10 @@ if TYPE_CHECKING:  # which uses this module
     from segfloor_ros.slam.stereo_slam import StereoSlam
 
 PART = 'slam'
-
 BEFORE_ALL_NS = -1_000_000_000
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
-
 LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
 
 LOST_IDS = 1_000_000

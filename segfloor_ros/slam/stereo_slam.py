@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig_check import RigCheck
 from segfloor_ros.files.saved_map import Arrays
-from segfloor_ros.geometry import Array, adjoint, invert
+from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
-from segfloor_ros.slam.moving.moving_regions import MotionSearch, Searched
+from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
 from segfloor_ros.slam.results import (
     UNKNOWN_COVARIANCE,
     FrameResult,
@@ -90,7 +90,7 @@ class StereoSlam:
         self.front_end = FrontEnd(settings, self.map, self.sensors)
         self.back_end = BackEnd(settings, self.map, self.front_end, background)
         self._held = HeldResults()
-        self._moving = MotionSearch(camera) if settings.detect_moving else None
+        self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
         self._patience_ns = LOST_NS
         self._began_unsure: tuple[Array, Array] | None = None
@@ -258,7 +258,7 @@ class StereoSlam:
             self.front_end.motion.reset()
             self.sensors.reset_world()
         self.front_end.reset()
-        self._moving = self._moving and MotionSearch(self._camera)
+        self._moving = self._moving and MovingRegions(self._camera)
 
     def _drop_submap(self) -> None:
         """Look for the camera in the known map again; what was mapped beside it is lost."""
@@ -266,7 +266,7 @@ class StereoSlam:
         self._take_adjustment(wait=True)
         self.back_end.drop_submap()
         self.front_end.reset()
-        self._moving = self._moving and MotionSearch(self._camera)
+        self._moving = self._moving and MovingRegions(self._camera)
         self._held.change(_lost)
 
     def _add_keyframe(
@@ -293,16 +293,16 @@ class StereoSlam:
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self.back_end.mapper.insert(keyframe, patches)
         if self._moving is not None and searched is not None:
-            self._moving.remember(keyframe, searched)
-            gone = self._moving.seen_through(
-                searched, self.map, self.front_end.local.point_ids, keyframe
-            )
+            self._moving.remember(keyframe, searched.disparity)
+            ids = np.setdiff1d(self.front_end.local.point_ids, keyframe.point_id)
+            points = transform_points(keyframe.T_camera_world, self.map.xyz_world[ids])
+            gone = ids[self._moving.seen_through(searched.disparity, points)]
             self.map.points.note_seen_through(gone)
         up = self.sensors.gravity.up_world
         self._follow_map(partial(self.back_end.take_in, keyframe, images, up))
         if self.map.keyframes[-1] is not keyframe:  # it was merged into the known map
             keyframe = self.map.keyframes[-1]
-            self._moving = self._moving and MotionSearch(self._camera)
+            self._moving = self._moving and MovingRegions(self._camera)
             self.sensors.reset_world()
             self._began_unsure = None
             self._held.change(in_merged_map(self.map, self.front_end.motion.T_world_odom))

@@ -10,7 +10,7 @@ the keyframes it hangs on (Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017, sect
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from segfloor_ros.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.slam.results import MIN_SHARED
+from segfloor_ros.slam.results import ENOUGH
 from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
     NO_OFFSET,
@@ -49,6 +49,7 @@ POINTS_PER_KEYFRAME = 300
 """Points of a keyframe that most others see: they hold the map together, the rest moves along."""
 
 STEPS = 6
+"""An adjustment mostly converges in three."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class BundleResult:
 def adjust(
     camera: StereoCamera,
     problem: BundleProblem,
-    iterations: int,
+    iterations: int = STEPS,
     is_wanted: Callable[[], bool] = lambda: True,
 ) -> BundleResult:
     """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
@@ -257,7 +258,7 @@ def solve_global(
     a map of one view.
     """
     keyframe, point, row = _known_best(copied)
-    enough = np.bincount(keyframe, minlength=len(copied.records)) >= MIN_SHARED
+    enough = np.bincount(keyframe, minlength=len(copied.records)) >= ENOUGH
     enough[0] = True
     kept = enough[keyframe]
     kept &= np.bincount(point[kept], minlength=len(copied.stable_ids))[point] > 1
@@ -275,11 +276,11 @@ def solve_global(
         copied.xyz_world[ids],
         slot[keyframe],
         np.searchsorted(ids, point),
-        _gather(copied, keyframe, row),
+        gather(copied.features, keyframe, row),
         OffsetEstimate(copied.offset.value_px, NO_OFFSET.information),
         factors_of(copied.records, slot, copied.up_world),
     )
-    adjusted = adjust(camera, problem, STEPS, is_wanted)
+    adjusted = adjust(camera, problem, is_wanted=is_wanted)
     return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])
 
 
@@ -296,16 +297,18 @@ def _known_best(copied: MapCopy) -> tuple[NDArray[np.int32], NDArray[np.int32], 
     return keyframe[chosen], point[chosen], row[chosen]
 
 
-def _gather(copied: MapCopy, keyframe: NDArray[np.int32], row: NDArray[np.int32]) -> Observations:
-    """Return the observations (N,) of features `row` of keyframes in ascending order."""
-    starts = np.flatnonzero(np.diff(keyframe, prepend=-1))
-    taken = [
-        copied.features[keyframe[start]].take(rows)
-        for start, rows in zip(starts, np.split(row, starts[1:]), strict=True)
-    ]
-    return Observations(
-        np.concatenate([t.uvd_px for t in taken]), np.concatenate([t.sigma_px for t in taken])
-    )
+def gather(
+    observations: Sequence[Observations], keyframe: NDArray[np.int32], row: NDArray[np.int32]
+) -> Observations:
+    """Return the observations (N,) of features `row` (N,) of keyframes (N,), of which each has
+    observations.
+    """
+    uvd, sigma = np.empty((len(row), 3)), np.empty((len(row), 3))
+    for k in np.unique(keyframe):
+        mine = keyframe == k
+        taken = observations[k].take(row[mine])
+        uvd[mine], sigma[mine] = taken.uvd_px, taken.sigma_px
+    return Observations(uvd, sigma)
 
 
 def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:

@@ -21,54 +21,36 @@ from segfloor_ros.camera.model import StereoFrame, Up
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust
+from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust, gather
 from segfloor_ros.slam.mapping.normal_equations import factors_of
-from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MIN_SHARED, NO_POINT, PROOF
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations
+from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MAJORITY, NO_POINT, PROOF
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX, Observations
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX, Images
 from segfloor_ros.slam.tracking.map_tracking import predict_points
-from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
-
-DISPARITY_REACH_PX = 4
+from segfloor_ros.slam.tracking.patch_alignment import ALIGNED_PX, SIDE_PX, measure_disparity
 
 MIN_DISPARITY_PX = 1.0
+"""Less is known too badly, as a share of it, for a new point."""
 
-CONTRADICTED_SHARE = 0.1
-"""A feature whose disparity differs by more than this share from that of the point it was matched
-with, and by more than `DISPARITY_REACH_PX`, shows something else: what moves, or what looks alike.
-"""
-
-SETTLING_KEYFRAMES = 2
-
-MIN_FOUND_RATIO = 0.25
-
-BUNDLE_STEPS = 5
-"""Steps of a local adjustment; it mostly converges in three."""
-
-WIDTH_PX = 320
-"""Images are shrunk to about this width."""
+SETTLING_KEYFRAMES, MIN_FOUND_RATIO = 2, 0.25
+"""Within so many keyframes others must see a new point too, and in this share of the frames that
+should show it a point must be found (Mur-Artal et al., ORB-SLAM, 2015, section VI-B)."""
 
 MAX_DISPARITY_SHARE = 0.5
 """Largest disparity, as a share of the image's width."""
 
-BLOCK_PX = 11
-
 MIN_TEXTURE = 5
-
 STEP = 16
 """OpenCV's disparities are in 1/16 px, and their number is a multiple of 16."""
 
-MAX_APART_PX = 2.0
-"""Distance of two projections, in u, v and disparity, of what may be one point."""
-
-MAX_OCTAVES_APART = 2.5
-
-CANDIDATES = 4
-
-Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
+MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
+"""Levels of the pyramid between two views of what may be one point, and points tried for each."""
 
 REDUNDANT_SHARE = 0.9
+"""Share of a keyframe's points that others must see as well for it to be retired (section VI-E)."""
+
+Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -111,13 +93,12 @@ class LocalMapper:
         if not images.depth_scale:
             guess = guess_disparity(frame.left, frame.right, uv_px)
         found = np.isfinite(guess)
-        measure_disparity(images, observations, missing[found], guess[found], DISPARITY_REACH_PX)
+        measure_disparity(images, observations, missing[found], guess[found], SAME_PX)
 
     def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
         """Add a keyframe and new points from its stereo features; points that turn out to be known
         are fused with the older ones.
         """
-        keyframe.point_id[self._contradicted(keyframe)] = NO_POINT
         rows, points = self._new_points(keyframe)
         self._map.add_keyframe(keyframe, patches, rows, points)
         fuse_duplicates(self._map, keyframe)
@@ -129,22 +110,10 @@ class LocalMapper:
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)
-        enough = max(MIN_SHARED, CHANCE_SHARE * len(own))
+        enough = max(ENOUGH, CHANCE_SHARE * len(own))
         near = order[(shared >= enough) & (order != keyframe.index)]
         before = [keyframe.index - 1] if keyframe.index > 0 else []
         return tuple(int(k) for k in (near[:LOCAL_KEYFRAMES] if len(near) else before))
-
-    def _contradicted(self, keyframe: KeyframeRecord) -> NDArray[np.intp]:
-        """Return the features (N,) that were matched with a point at another depth: their pixels
-        fit it, but their disparity does not.
-        """
-        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-        points = self._map.xyz_world[keyframe.point_id[rows]]
-        depth = np.maximum(transform_points(keyframe.T_camera_world, points)[:, 2], MIN_DEPTH_M)
-        expected = self._camera.disparity_times_depth / depth
-        measured = keyframe.observations.uvd_px[rows, 2] - self._rig.offset.value_px
-        limit = np.maximum(DISPARITY_REACH_PX, CONTRADICTED_SHARE * expected)
-        return rows[np.abs(measured - expected) > limit]
 
     def _new_points(self, keyframe: KeyframeRecord) -> tuple[NDArray[np.intp], Array]:
         """Return features (N,) that are measured but belong to no point yet, and where they are."""
@@ -185,7 +154,7 @@ class LocalMapper:
             self._map.xyz_world[ids],
             slot[edge_keyframe],
             np.searchsorted(ids, edge_point),
-            _gather(self._map, edge_keyframe, edge_row),
+            gather([k.observations for k in self._map.keyframes], edge_keyframe, edge_row),
             self._rig.offset.estimate,
             factors_of(self._map.keyframes, slot, up_world),
         )
@@ -193,7 +162,7 @@ class LocalMapper:
 
     def solve(self, adjustment: Adjustment) -> BundleResult:
         """Adjust the copy; safe on another thread, since it shares nothing with the map."""
-        return adjust(self._camera, adjustment.problem, BUNDLE_STEPS)
+        return adjust(self._camera, adjustment.problem)
 
     def apply(self, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
@@ -219,7 +188,7 @@ class LocalMapper:
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)
-        near = order[(shared >= MIN_SHARED) & (order != keyframe.index)]
+        near = order[(shared >= ENOUGH) & (order != keyframe.index)]
         near = np.concatenate([near, np.setdiff1d(_linked(self._map, keyframe), near)[::-1]])
         free = np.append(keyframe.index, near[: LOCAL_KEYFRAMES - 1])
         free = free[free != 0]
@@ -263,26 +232,14 @@ def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]
     return np.array(linked[::-1], np.intp)
 
 
-def _gather(
-    sparse_map: SparseMap, edge_keyframe: NDArray[np.int32], edge_row: NDArray[np.int32]
-) -> Observations:
-    uvd: Array = np.empty((len(edge_row), 3))
-    sigma: Array = np.empty((len(edge_row), 3))
-    for k in np.unique(edge_keyframe):
-        mine = edge_keyframe == k
-        taken = sparse_map.keyframes[k].observations.take(edge_row[mine])
-        uvd[mine], sigma[mine] = taken.uvd_px, taken.sigma_px
-    return Observations(uvd, sigma)
-
-
 def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Array) -> Array:
     """Return about the disparity (N,) px at pixels (N, 2) of the left image; NaN where none is
     found. left, right: rectified grey images (H, W).
     """
-    factor = max(1, round(left.shape[1] / WIDTH_PX))
+    factor = max(1, round(left.shape[1] / SMALL_WIDTH_PX))
     size = (left.shape[1] // factor, left.shape[0] // factor)
     count = -(-round(MAX_DISPARITY_SHARE * size[0]) // STEP) * STEP
-    matcher = cv2.StereoBM_create(count, BLOCK_PX)
+    matcher = cv2.StereoBM_create(count, SIDE_PX)
     matcher.setTextureThreshold(MIN_TEXTURE)
     matcher.setUniquenessRatio(0)
     # Without a margin the matcher leaves the leftmost columns empty.
@@ -319,7 +276,7 @@ def find_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Pairs:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     neighbours = [k + 1 for k in range(min(CANDIDATES, len(here.ids)))]
     reach, near = cKDTree(here.uvd_px).query(
-        there.uvd_px, neighbours, distance_upper_bound=MAX_APART_PX
+        there.uvd_px, neighbours, distance_upper_bound=ALIGNED_PX
     )
     j, column = np.nonzero(np.isfinite(reach))
     i = np.asarray(near)[j, column]

@@ -4,8 +4,8 @@ cameras (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section 6.1
 The last axis of the arrays here is the observation or the point: NumPy works on long rows many
 times faster than on many small matrices.
 
-Of many keyframes, most of which share no point, the complement is a sparse matrix (Konolige, Sparse
-Sparse Bundle Adjustment, BMVC 2010).
+Most keyframes share no point: the complement is a sparse matrix (Konolige, Sparse Sparse Bundle
+Adjustment, BMVC 2010).
 
 What wheels and an accelerometer measure of keyframes is added. With e = log(T_now T_before^-1 Z^-1)
 for a measured motion Z, twists of both poses change it, to first order, by d_now - Ad(T_now
@@ -29,13 +29,15 @@ from scipy.sparse.linalg import splu
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.rig import CHI2_95, huber_cost, huber_weights, weighted_jacobian, with_moment
+from segfloor_ros.slam.rig import (
+    SMALLEST,
+    chi2_limit,
+    huber_cost,
+    huber_weights,
+    weighted_jacobian,
+    with_moment,
+)
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-
-SMALLEST_PIVOT = 1e-12
-
-DENSE_KEYFRAMES = 60
-"""More of them, most of which share no point, are solved as a sparse system."""
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
@@ -84,39 +86,13 @@ class System:
         )
 
     def solve(self, damping: float) -> Step:
-        """Solve the damped system by the Schur complement on the cameras.
+        """Solve the damped system by the Schur complement on the cameras, which is sparse: most
+        keyframes of a large map share no point.
 
-        With V = L L^T by blocks and Y = W L^-T, the complement is U - Y Y^T: one dense matrix,
-        which is multiplied with itself.
+        With V = L L^T by blocks and Y = W L^-T, the complement is U - Y Y^T.
         """
         diagonal = np.einsum('aap->ap', self.V)
-        V = self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9)
-        L_inverse = inverse_cholesky(V)
-        if len(self.U) > DENSE_KEYFRAMES:
-            return self._solve_sparse(damping, L_inverse)
-        Y = self._reduced(L_inverse)
-        y_offset = _times_lower(L_inverse, self.offset_point).ravel()
-        y_rhs = _times_lower(L_inverse, self.point_rhs).ravel()
-        size = len(Y)
-        S = np.empty((size + 1, size + 1))
-        S[:-1, :-1] = -(Y @ Y.T)
-        for k, U in enumerate(self.U):
-            own = slice(6 * k, 6 * k + 6)
-            S[own, own] += U + np.diag(damping * np.diag(U) + 1e-9)
-        for j, k, block in self.between:
-            S[6 * j : 6 * j + 6, 6 * k : 6 * k + 6] += block
-            S[6 * k : 6 * k + 6, 6 * j : 6 * j + 6] += block.T
-        S[-1, :-1] = S[:-1, -1] = self.offset_camera.ravel() - Y @ y_offset
-        S[-1, -1] = self.offset_offset - y_offset @ y_offset
-        rhs = np.append(self.camera_rhs.ravel() - Y @ y_rhs, self.offset_rhs - y_offset @ y_rhs)
-        unit = np.append(np.zeros(size), 1.0)
-        solution, variances = np.linalg.solve(S, np.stack([rhs, unit], axis=1)).T
-        back = (y_rhs - solution[:-1] @ Y - y_offset * solution[-1]).reshape(3, -1)
-        shifts = np.einsum('bap,bp->pa', L_inverse, back)
-        twists = solution[:-1].reshape(-1, 6)
-        return Step(twists, shifts, float(solution[-1]), 1.0 / float(variances[-1]))
-
-    def _solve_sparse(self, damping: float, L_inverse: Array) -> Step:
+        L_inverse = inverse_cholesky(self.V + np.eye(3)[:, :, None] * (damping * diagonal + 1e-9))
         diagonal = np.einsum('kaa->ka', self.U)
         U = self.U + np.eye(6) * (damping * diagonal + 1e-9)[:, None]
         y = [_times_lower(L_inverse, of_point) for of_point in (self.point_rhs, self.offset_point)]
@@ -142,15 +118,6 @@ class System:
         blocks = _times_lower(of_observation[:, :, None], np.swapaxes(self.W, 0, 1))
         return np.swapaxes(blocks, 0, 1)
 
-    def _reduced(self, L_inverse: Array) -> Array:
-        """Return Y (6 K, 3 P), zero where a camera does not see a point."""
-        Y = np.zeros((len(self.U), 6, 3, self.V.shape[2]))
-        blocks = self._blocks(L_inverse)
-        for k, rows in enumerate(Y):
-            mine = slice(self.starts[k], self.starts[k + 1])
-            rows[:, :, self.point[mine]] = blocks[:, :, mine]
-        return Y.reshape(6 * len(self.U), -1)
-
     def predicted_decrease(self, step: Step, damping: float) -> float:
         """Return how much the cost falls by the quadratic model."""
         diagonal_U = np.einsum('kaa->ka', self.U)
@@ -167,11 +134,11 @@ def inverse_cholesky(A: Array) -> Array:
     (3, 3, N).
     """
     inverse = np.zeros_like(A)
-    a = 1.0 / np.sqrt(np.maximum(A[0, 0], SMALLEST_PIVOT))
+    a = 1.0 / np.sqrt(np.maximum(A[0, 0], SMALLEST))
     l10, l20 = A[1, 0] * a, A[2, 0] * a
-    b = 1.0 / np.sqrt(np.maximum(A[1, 1] - l10**2, SMALLEST_PIVOT))
+    b = 1.0 / np.sqrt(np.maximum(A[1, 1] - l10**2, SMALLEST))
     l21 = (A[2, 1] - l20 * l10) * b
-    c = 1.0 / np.sqrt(np.maximum(A[2, 2] - l20**2 - l21**2, SMALLEST_PIVOT))
+    c = 1.0 / np.sqrt(np.maximum(A[2, 2] - l20**2 - l21**2, SMALLEST))
     inverse[0, 0], inverse[1, 1], inverse[2, 2] = a, b, c
     inverse[1, 0] = -l10 * a * b
     inverse[2, 1] = -l21 * b * c
@@ -299,7 +266,7 @@ def solve_complement(
         columns = (6 * k[:, None, None] + np.zeros((6, 1), int) + np.arange(6)).ravel()
         off = sparse.coo_array((tied.ravel(), (rows, columns)), shape=S.shape)
         S = S + off + off.T
-    flat = y.reshape(3 * size, -1)
+    flat = y.reshape(3 * size, y.shape[-1])
     reduced = rhs.reshape(6 * count, -1) - blocks @ flat
     x = splu(S.tocsc()).solve(reduced)
     return x, reduced, (flat - blocks.T @ x).reshape(y.shape)
@@ -395,7 +362,7 @@ def chi2(factor: Factor, T_camera_world: Array) -> float:
 
 def cost(factor: Factor, T_camera_world: Array) -> float:
     """Return the Huber cost of the error."""
-    return huber_cost(np.array([chi2(factor, T_camera_world)]), np.array([CHI2_95[6]]))
+    return huber_cost(np.array([chi2(factor, T_camera_world)]), np.array([chi2_limit(6)]))
 
 
 def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor]) -> System:
@@ -408,7 +375,7 @@ def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor
     for factor in factors:
         error = factor.error(T_camera_world)
         squared = np.array(chi2(factor, T_camera_world))
-        weighted = factor.information * float(huber_weights(squared, np.array(CHI2_95[6])))
+        weighted = factor.information * float(huber_weights(squared, np.array(chi2_limit(6))))
         terms = [(k, J) for k, J in factor.jacobians(T_camera_world) if k < len(U)]
         for k, J in terms:
             U[k] += J.T @ weighted @ J

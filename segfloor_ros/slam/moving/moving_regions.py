@@ -9,6 +9,7 @@ seen now is carried into an earlier keyframe, and moves if that keyframe saw wha
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,6 @@ from segfloor_ros.camera.depth import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.moving.scene_flow import (
     TOLERANCE_PX,
     Disparity,
@@ -37,23 +37,17 @@ from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.images import Region
 
 DISPARITIES = 64
-
 BLOCK_PX = 5
-
 P1, P2 = 100, 400
 """Of semi-global matching (Hirschmueller 2008), for the sum of differences over a block."""
 
 SPECKLE_PX = 40
-
 MAX_PARALLAX_RAD = float(np.radians(30.0))
-
 FAR_PERCENT = 80
 """What is farther than most of the image stands behind what moves."""
 
 COMPARED_VIEWS = 5
-
 KEPT_VIEWS = 30
-
 MIN_HEIGHT_M = 0.05
 """What is lower may be floor, whose disparities repeat and mirror."""
 
@@ -70,12 +64,10 @@ REACH_M = 0.4
 """From corners of someone who walks to hands and feet."""
 
 NOISE_GREY = 1.0
-
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
 
 MIN_AREA_PX = BLOCK_PX**2
-
 SHARE_OF_REGION = 0.1
 """So much of a region must have been seen through for all of it to move."""
 
@@ -84,14 +76,16 @@ SEARCH_EVERY = 3
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A frame as it is searched. left: shrunk image (h, w). disparity: (h, w) px of it, 0 where
-    none was found. moving: what moves in it, (h, w), 255.
+class Searched:
+    """What a search found. disparity: (h, w) px of the shrunk image, 0 where none was found.
+    moving: what moves in it, (h, w), 255. region: the same in the image, None for nothing. points:
+    of what moves, in the world.
     """
 
-    left: NDArray[np.uint8]
     disparity: Disparity
     moving: NDArray[np.uint8]
+    region: Region | None
+    points: MovingPoints
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,7 @@ class DepthView:
 
 
 class MovingRegions:
-    """Finds what moves in the images of keyframes."""
+    """Finds what moves in keyframes, and in some of the frames between."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera, self._small = camera, SmallCamera(camera)
@@ -128,19 +122,30 @@ class MovingRegions:
         self._pair: tuple[NDArray[np.uint8], NDArray[np.uint8] | None]
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
         self._found: NDArray[np.uint8] | None = None
+        self._meter = MovingPointMeter()
+        self._frames_since = 0
+
+    def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
+        """Whether to search a frame."""
+        self._frames_since += 1
+        return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
 
     def search(
         self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
-    ) -> Scene:
+    ) -> Searched:
         """Find what moves in a frame whose pose is known."""
+        self._frames_since = 0
         disparity = self.measure(frame.left, frame.right)
-        view = FlowView(frame.stamp_ns, self._pair[0], disparity, T_odom_camera)
+        left = self._pair[0]
+        view = FlowView(frame.stamp_ns, left, disparity, T_odom_camera)
         found = self.find(disparity, T_camera_world, mount, self._flow.votes(view))
         moving, self._found = self._held(found, disparity), found
         self._flow.remember(replace(view, moving=moving))
-        return Scene(self._pair[0], disparity, moving)
+        look = Look(frame.stamp_ns, left, self._positions(disparity, T_camera_world))
+        points = self._meter.measure(look, moving)
+        return Searched(disparity, moving, self._enlarged(moving), points)
 
-    def positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
+    def _positions(self, disparity: Disparity, T_camera_world: Array) -> Array:
         """Return where each pixel is, (h, w, 3) in the world, NaN where there is no disparity."""
         depth_m = np.where(
             disparity > 0, self._small.disparity_m / np.maximum(disparity, 1e-3), np.nan
@@ -152,18 +157,11 @@ class MovingRegions:
         """Return at which points (N, 3) of the left optical frame nothing is: the image shows what
         lies behind them, and nothing as near around them.
         """
-        around = cv2.dilate(disparity, np.ones((5, 5), np.uint8))
-        depth = np.maximum(points[:, 2], MIN_DEPTH_M)
-        uv = np.rint(self._small.focal * points[:, :2] / depth[:, None] + self._small.centre)
-        inside = (
-            (points[:, 2] > MIN_DEPTH_M)
-            & (uv >= 0).all(axis=1)
-            & (uv < self._small.size).all(axis=1)
-        )
-        u, v = np.where(inside[:, None], uv, 0).astype(np.intp).T
-        expected = self._small.disparity_m / depth
-        behind = around[v, u] < expected - 2 * TOLERANCE_PX
-        return np.asarray(inside & behind & (disparity[v, u] > 0))
+        expected = self._small.project(points)
+        uv, expected_px = expected[:, :2], expected[:, 2]
+        around = self._small.at(cv2.dilate(disparity, np.ones((5, 5), np.uint8)), uv)
+        behind = around < expected_px - 2 * TOLERANCE_PX
+        return np.asarray((expected_px > 0) & behind & (self._small.at(disparity, uv) > 0))
 
     def measure(self, left: NDArray[np.uint8], right: NDArray[Any]) -> Disparity:
         """Return the disparity (h, w) of the shrunk pair, 0 where there is none."""
@@ -223,7 +221,7 @@ class MovingRegions:
         low[rows] = height_m < SHIN_M
         return self._with_feet(moving, disparity, low.reshape(disparity.shape))
 
-    def enlarged(self, region: NDArray[np.uint8]) -> Region | None:
+    def _enlarged(self, region: NDArray[np.uint8]) -> Region | None:
         """Return a region of the shrunk image in that of the camera (H, W), None for none."""
         if not region.any():
             return None
@@ -241,14 +239,8 @@ class MovingRegions:
         held = np.zeros_like(found)
         if self._found is None:
             return held
-        count, labels = cv2.connectedComponents(found)
-        for label in range(1, count):
-            own = labels == label
-            known = disparity[own & (disparity > 0)]
-            if len(known) == 0:
-                continue
-            depth_m = self._small.disparity_m / float(np.median(known))
-            reach = max(1, round(self._small.focal[0] * REACH_M / depth_m))
+        for own, depth_m in self._things(found, disparity):
+            reach = self._pixels(REACH_M, depth_m)
             around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
             if self._found[cv2.dilate(own.astype(np.uint8), around) > 0].any():
                 held[own] = 255
@@ -333,7 +325,7 @@ class MovingRegions:
         for label in np.flatnonzero(moves[1:]) + 1:
             seed = ((labels == label) & (found > 0)).astype(np.uint8)
             depth_m = self._small.disparity_m / np.median(disparity[seed > 0])
-            reach = max(1, round(self._small.focal[0] * REACH_M / depth_m))
+            reach = self._pixels(REACH_M, depth_m)
             around = cv2.dilate(seed, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
             nearest = self._small.disparity_m / max(depth_m - REACH_M, MIN_DEPTH_M)
             farthest = self._small.disparity_m / (depth_m + REACH_M)
@@ -376,59 +368,23 @@ class MovingRegions:
                 result[below > 0] = 255
         return result
 
+    def _things(
+        self, region: NDArray[np.uint8], disparity: Disparity
+    ) -> Iterator[tuple[NDArray[np.bool_], float]]:
+        """Yield the connected things (h, w) of a region and how far away each is, in metres."""
+        count, labels = cv2.connectedComponents(region)
+        for label in range(1, count):
+            own = labels == label
+            known = disparity[own & (disparity > 0)]
+            if len(known):
+                yield own, self._small.disparity_m / float(np.median(known))
+
+    def _pixels(self, length_m: float, depth_m: float) -> int:
+        """Return how many pixels, at least one, a length takes at a distance."""
+        return max(1, round(self._small.focal[0] * length_m / depth_m))
+
 
 def _edges(disparity: Disparity) -> NDArray[np.bool_]:
     """Return where (h, w) something nearer begins."""
     nearest = cv2.dilate(disparity, np.ones((3, 3), np.uint8))
     return np.asarray(nearest - disparity > 2 * TOLERANCE_PX)
-
-
-@dataclass(frozen=True)
-class Searched:
-    """What a search found. disparity: (h, w) of the shrunk image. region: what moves, None for
-    nothing. points: of what moves, in the world.
-    """
-
-    disparity: Disparity
-    region: Region | None
-    points: MovingPoints
-
-
-class MotionSearch:
-    """Searches keyframes, and some of the frames between, for what moves."""
-
-    def __init__(self, camera: StereoCamera) -> None:
-        self._regions = MovingRegions(camera)
-        self._meter = MovingPointMeter()
-        self._frames_since = 0
-
-    def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
-        """Whether to search a frame."""
-        self._frames_since += 1
-        return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
-
-    def search(
-        self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
-    ) -> Searched:
-        """Find what moves in a frame whose pose is known."""
-        self._frames_since = 0
-        scene = self._regions.search(frame, T_camera_world, T_odom_camera, mount)
-        xyz_world = self._regions.positions(scene.disparity, T_camera_world)
-        points = self._meter.measure(Look(frame.stamp_ns, scene.left, xyz_world), scene.moving)
-        return Searched(scene.disparity, self._regions.enlarged(scene.moving), points)
-
-    def remember(self, keyframe: KeyframeRecord, searched: Searched) -> None:
-        """Compare later frames with this keyframe."""
-        self._regions.remember(keyframe, searched.disparity)
-
-    def seen_through(
-        self,
-        searched: Searched,
-        sparse_map: SparseMap,
-        ids: NDArray[np.int32],
-        keyframe: KeyframeRecord,
-    ) -> NDArray[np.int32]:
-        """Return those of the points (N,) that a keyframe does not observe but sees through."""
-        ids = np.setdiff1d(ids, keyframe.point_id)
-        points = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])
-        return ids[self._regions.seen_through(searched.disparity, points)]

@@ -20,9 +20,12 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.slam.map.sparse_map import MAX_PATCH_ZOOM
 from segfloor_ros.slam.results import MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.tracking.features import spread
+from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, SMALL_WIDTH_PX, follow_pixels
 
 AGES_NS = (300_000_000, 900_000_000)
 """How long ago an image was that corners are followed back to: in the first someone who walks has
@@ -33,56 +36,40 @@ CORNERS, CELL_PX = 300, 10
 floor, which shows that it stands still, needs its own."""
 
 APART_PX = 3
+"""Corners are at least so far from each other, and speak for as much around them."""
 
 MIN_CORNER, SURE_CORNER = 3e-4, 1e-3
 """Smaller eigenvalue of a corner, as OpenCV scales it. Between the two a corner may say that it
 stands still, which it hardly does by chance, but not that it moves."""
 
-WINDOW, LEVELS = (9, 9), 3
+WINDOW_PX, STEPS = 9, (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+"""Window and end of the search of optical flow: finer than for tracking, as images are small."""
 
 MAX_RETURN_PX = 0.5
 """Distance up to which a corner that is followed back and forth comes to where it was."""
 
-MAX_ZOOM, MAX_SHIFT_PX = 1.3, 20.0
-"""What stands still and changes its size by more, or its place in the image, is not compared."""
-
-FLOW_TOLERANCE_PX = 1.0
+MAX_SHIFT_PX = 20.0
+"""What stands still and changes its place in the image by more is not compared."""
 
 STATIC_SIGMAS, QUARTER_SIGMAS = 3.0, 0.319
 """What moves differs by more than so many sigmas, of which a quarter of normal errors is below the
 second."""
 
 NEIGHBOUR_PX = 15.0
-
 MIN_MOVING = 3
 """Fewest corners of a thing that moves."""
 
 MAX_MOVING_SHARE = 0.8
 """Where more of all corners seem to move the pose is in doubt: what moved before still does."""
 
-DISC_PX = 3
-
-WIDTH_PX = 160
-"""Images are shrunk to about this width: a person 4 m away is still eight pixels wide."""
-
 TOLERANCE_PX = 0.6
 """Disparities of the shrunk images that differ by more do not show the same thing."""
 
+MAX_SPEED_M_S = 20.0
+"""More is a wrong match."""
+
 Disparity = NDArray[np.float32]
 """Disparities (h, w) in px of the shrunk image, 0 where none was found."""
-
-MAX_POINTS = 300
-
-MAX_INTERVAL_S = 1.0
-
-MAX_SPEED_M_S = 20.0
-
-METER_WINDOW_PX = 9
-
-METER_LEVELS = 3
-
-MIN_FOLLOWED = 5
-"""Points of a thing that must be followed for its velocity to be known."""
 
 
 @dataclass(frozen=True)
@@ -179,18 +166,21 @@ class SceneFlow:
             self._camera.carried(uv, np.maximum(disparity + step, 0.1), T_then_now)
             for step in (0.0, -TOLERANCE_PX, TOLERANCE_PX)
         )
-        back, returned = _follow(now.left, then.left, uv, nominal[:, :2])
-        followed = np.hypot(*(returned - uv).T) < MAX_RETURN_PX
+        back, there_too = _follow(now.left, then.left, uv, nominal[:, :2])
+        returned, again = _follow(then.left, now.left, back, uv)
+        followed = there_too & again & (np.hypot(*(returned - uv).T) < MAX_RETURN_PX)
         moved_then = np.zeros(len(uv), bool)
         if then.moving is not None:
             moved_then = followed & (self._camera.at(then.moving, back) > 0)
         found = followed & (nominal[:, 2] > 0)
         found &= self._camera.contains(back) & self._camera.contains(nominal[:, :2])
-        found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(MAX_ZOOM)
+        found &= np.abs(np.log(np.maximum(nominal[:, 2], 0.01) / disparity)) < np.log(
+            MAX_PATCH_ZOOM
+        )
         found &= np.hypot(*(nominal[:, :2] - uv).T) < MAX_SHIFT_PX
         there = self._camera.at(then.disparity, back)
         tolerance = TOLERANCE_PX * (1 + (nominal[:, 2] / np.maximum(disparity, 0.1)) ** 2)
-        ratio = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) / FLOW_TOLERANCE_PX
+        ratio = _distance_to_segment(back, farther[:, :2], nearer[:, :2]) / SIGMA_FLOW_PX
         off = np.where(there > 0, np.abs(there - nominal[:, 2]) / tolerance, 0.0)
         return found, np.maximum(ratio, off), moved_then
 
@@ -207,16 +197,9 @@ def static_scale(ratios: Array) -> float:
 
 def _follow(
     now: NDArray[np.uint8], then: NDArray[np.uint8], uv: Array, guess: Array
-) -> tuple[Array, Array]:
-    """Return where corners (N, 2) are in another image, and where they come to from there in the
-    first one.
-    """
-    start, target = (a.astype(np.float32).reshape(-1, 1, 2) for a in (uv, guess))
-    how = {'winSize': WINDOW, 'maxLevel': LEVELS, 'flags': cv2.OPTFLOW_USE_INITIAL_FLOW}
-    back, ok, _ = cv2.calcOpticalFlowPyrLK(now, then, start, target.copy(), **how)
-    again, ok_again, _ = cv2.calcOpticalFlowPyrLK(then, now, back, start.copy(), **how)
-    again[(ok.ravel() == 0) | (ok_again.ravel() == 0)] = np.inf
-    return back.reshape(-1, 2).astype(np.float64), again.reshape(-1, 2).astype(np.float64)
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return where corners (N, 2) are in another image, and which of them (N,) are found."""
+    return follow_pixels(now, then, now.shape[1], uv, guess, WINDOW_PX, STEPS)
 
 
 def _distance_to_segment(p: Array, a: Array, b: Array) -> Array:
@@ -246,8 +229,8 @@ def _discs(disparity: Disparity, uv: Array, of_corner: Array) -> NDArray[np.uint
     height, width = disparity.shape
     mask = np.zeros(disparity.shape, np.uint8)
     for (u, v), d in zip(np.rint(uv).astype(int), of_corner, strict=True):
-        rows = slice(max(0, v - DISC_PX), min(height, v + DISC_PX + 1))
-        columns = slice(max(0, u - DISC_PX), min(width, u + DISC_PX + 1))
+        rows = slice(max(0, v - APART_PX), min(height, v + APART_PX + 1))
+        columns = slice(max(0, u - APART_PX), min(width, u + APART_PX + 1))
         mask[rows, columns] |= np.abs(disparity[rows, columns] - d) < 2 * TOLERANCE_PX
     return mask
 
@@ -260,7 +243,7 @@ class SmallCamera:
     """
 
     def __init__(self, camera: StereoCamera) -> None:
-        self.factor = factor = max(1, round(camera.width / WIDTH_PX))
+        self.factor = factor = max(1, round(2 * camera.width / SMALL_WIDTH_PX))
         self.size = (camera.width // factor, camera.height // factor)
         self.disparity_m = camera.disparity_times_depth / factor
         self.focal = np.array([camera.fx, camera.fy]) / factor
@@ -287,10 +270,15 @@ class SmallCamera:
         """
         depth = self.disparity_m / disparity
         points = np.column_stack([(uv - self.centre) / self.focal * depth[:, None], depth])
-        there = transform_points(T_then_now, points)
-        front = there[:, 2] > MIN_DEPTH_M
-        z = np.where(front, there[:, 2], 1.0)
-        pixel = self.focal * there[:, :2] / z[:, None] + self.centre
+        return self.project(transform_points(T_then_now, points))
+
+    def project(self, points: Array) -> Array:
+        """Return pixel and disparity (N, 3) of points (N, 3) of the left optical frame; disparity
+        0 behind the camera.
+        """
+        front = points[:, 2] > MIN_DEPTH_M
+        z = np.where(front, points[:, 2], 1.0)
+        pixel = self.focal * points[:, :2] / z[:, None] + self.centre
         return np.column_stack([pixel, np.where(front, self.disparity_m / z, 0.0)])
 
 
@@ -318,36 +306,33 @@ class MovingPointMeter:
         known = (moving > 0) & np.isfinite(look.xyz_world[..., 0])
         _, label = cv2.connectedComponents(moving)
         v, u = np.nonzero(known)
-        step = -(-len(u) // MAX_POINTS) if len(u) else 1
+        step = -(-len(u) // CORNERS) if len(u) else 1
         v, u = v[::step], u[::step]
         xyz = look.xyz_world[v, u]
         velocity = np.full(xyz.shape, np.nan)
         last, self._last = self._last, look
         if last is None or len(u) == 0:
             return MovingPoints(xyz, velocity)
-        interval_s = (look.stamp_ns - last.stamp_ns) * 1e-9
-        if not 0 < interval_s < MAX_INTERVAL_S:
+        if not 0 < look.stamp_ns - last.stamp_ns < MOMENT_NS:
             return MovingPoints(xyz, velocity)
+        interval_s = (look.stamp_ns - last.stamp_ns) * 1e-9
         own = (xyz - _positions_then(look, last, u, v)) / interval_s
         own[np.linalg.norm(own, axis=1) > MAX_SPEED_M_S] = np.nan
         of = label[v, u]
         for thing in np.unique(of):
             followed = (of == thing) & np.isfinite(own[:, 0])
-            if followed.sum() >= MIN_FOLLOWED:
+            if followed.sum() >= MIN_MOVING:
                 velocity[of == thing] = np.median(own[followed], axis=0)
         return MovingPoints(xyz, velocity)
 
 
 def _positions_then(look: Look, last: Look, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
     """Return where pixels (N,) were at the last look, (N, 3); NaN where they are not found."""
-    start = np.stack([u, v], axis=1).astype(np.float32).reshape(-1, 1, 2)
-    window = (METER_WINDOW_PX, METER_WINDOW_PX)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        look.left, last.left, start, np.empty_like(start), winSize=window, maxLevel=METER_LEVELS
-    )
-    at = np.rint(np.asarray(found).reshape(-1, 2)).astype(np.intp)
+    uv = np.stack([u, v], axis=1).astype(np.float64)
+    found, followed = _follow(look.left, last.left, uv, uv)
+    at = np.rint(found).astype(np.intp)
     height, width = last.left.shape
-    inside = (np.asarray(status).ravel() > 0) & (at >= 0).all(axis=1)
+    inside = followed & (at >= 0).all(axis=1)
     inside &= (at[:, 0] < width) & (at[:, 1] < height)
     then = np.full((len(u), 3), np.nan)
     then[inside] = last.xyz_world[at[inside, 1], at[inside, 0]]

@@ -37,10 +37,11 @@ from segfloor_ros.slam.places.loops import (
 )
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import CHI2_95, LOCAL_KEYFRAMES, NEIGHBOURS
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.pose import CONVERGED
 
 LINK_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
 """Error, m and rad, of the motion between two keyframes that share points; only the ratio to that
@@ -53,11 +54,6 @@ MIN_LOOP_WEIGHT = 0.25
 """A loop that switches an earlier one off contradicts it, and is not closed."""
 
 STEPS = 20
-
-CONVERGED = 1e-4
-
-LOOP_KERNEL = CHI2_95[6]
-"""Squared error of a loop at which it begins to lose weight."""
 
 TIMES_A_LOOP = 2
 """No drift limits where the known map can be: so many times the sightings of a loop are asked for.
@@ -204,7 +200,7 @@ def _errors(graph: PoseGraph, poses: Array) -> Array:
 def _robust(graph: PoseGraph, error: Array, poses: Array) -> tuple[Array, float]:
     """Return the weights (M,) of the edges and the cost (Geman-McClure for the robust ones)."""
     chi2 = (error**2).sum(axis=1)
-    share = LOOP_KERNEL / (LOOP_KERNEL + chi2)
+    share = chi2_limit(6) / (chi2_limit(6) + chi2)
     weight = np.where(graph.is_robust, share**2, 1.0)
     cost = float(np.where(graph.is_robust, share * chi2, chi2).sum())
     return weight, cost

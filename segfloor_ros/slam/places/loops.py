@@ -20,15 +20,18 @@ from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import RECENT, views_near
-from segfloor_ros.slam.places.place_recognition import PlaceRecognition, greatest_speed_mps
-from segfloor_ros.slam.results import MIN_SHARED, MOST, NO_POINT, PROOF, SAME, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M
+from segfloor_ros.slam.places.place_recognition import (
+    BEST_GROUPS,
+    PlaceRecognition,
+    greatest_speed_mps,
+)
+from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
+from segfloor_ros.slam.rig import MIN_DEPTH_M, SAME_PX
 from segfloor_ros.slam.tracking.images import Images
 
 MIN_SHARED_SHARE = 0.25
 """Keyframes that share so many points are linked already; fewer are shared by chance."""
 
-CANDIDATES = 2
 MAX_MISSES = 1
 REMEMBERED = 1000
 
@@ -47,16 +50,8 @@ MAX_TILT_RAD = 0.2
 """Where a robot stands on the same floor again, its camera is about as high and as level as before:
 floors slope, and carts shake."""
 
-MAX_BACK_PX = 4.0
-"""The points of the keyframe must be where the place's own view shows what they are."""
-
-BESIDE_PX = 5.0
-"""Points so near to each other in an image lie on about the same ray."""
-
-IN_FRONT_PX = 3.0
 IN_FRONT_SHARE = 0.1
-"""A point is in front of another on its ray where its disparity is larger by so much, and by this
-share."""
+"""A point is in front of another on its ray where its disparity is larger by this share."""
 
 MAX_SEEN_THROUGH = 0.2
 """Share of points that the other side may see through: edges hide what is behind by a few pixels.
@@ -69,8 +64,6 @@ place differs from the next."""
 AGREE = 0.05, 0.02
 """Keyframes in a row must show the same drift up to this, in m and rad, at the depth of the view.
 """
-
-NEAREST_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -149,7 +142,7 @@ class LoopDetector:
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         linked, shared = self._map.covisible(own)
         near = np.arange(len(keyframes)) > keyframe.index - RECENT
-        near[linked[shared > max(MIN_SHARED, MIN_SHARED_SHARE * len(own))]] = True
+        near[linked[shared > max(ENOUGH, MIN_SHARED_SHARE * len(own))]] = True
         retired = np.array([k.retired is not None for k in keyframes])
         return near, ~near & ~retired & self._within_drift(keyframe, lengths)
 
@@ -173,7 +166,7 @@ class LoopDetector:
     ) -> Match | None:
         """Look for a place by its look."""
         score = self._places.score(keyframe.features) * far
-        for group in self._places.groups(score, CANDIDATES):
+        for group in self._places.groups(score, BEST_GROUPS):
             ids = np.setdiff1d(self._map.points_of(group), known).astype(np.int32)
             track = self._places.locate(images, keyframe.features, ids)
             if track is not None:
@@ -286,14 +279,14 @@ class LoopChecks:
         slot = np.argsort(match.ids)[slot]
         measured = own[slot] != NO_POINT
         slot, row = slot[measured], row[of_place][measured]
-        if len(slot) < MIN_SHARED:
+        if len(slot) < ENOUGH:
             return False
         place = self._known.keyframes[match.place]
         T_place_world = place.T_camera_world @ invert(match.T_camera_world)
         local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
         uv, _ = self._project(transform_points(T_place_world, local))
         gap = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
-        return float((gap < MAX_BACK_PX).mean()) >= MOST
+        return float((gap < SAME_PX).mean()) >= MOST
 
     def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
         """Return the larger share of the points of one side that the other sees through, were both
@@ -322,12 +315,12 @@ class LoopChecks:
         visible = np.isfinite(uv_seen).all(axis=1)
         if not valid.any() or not visible.any():
             return 0.0
-        gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=BESIDE_PX)
+        gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=SAME_PX)
         beside = np.isfinite(gap)
-        if beside.sum() < MIN_SHARED:
+        if beside.sum() < ENOUGH:
             return 0.0
         behind = disparity_seen[visible][np.asarray(near)[beside]]
-        margin = np.maximum(IN_FRONT_PX, IN_FRONT_SHARE * behind)
+        margin = np.maximum(SAME_PX, IN_FRONT_SHARE * behind)
         return float((disparity[valid][beside] - behind > margin).mean())
 
     def _project(self, points: Array) -> tuple[Array, NDArray[np.float64]]:
@@ -370,4 +363,4 @@ def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
     """Return the median depth of what a keyframe sees."""
     ids = keyframe.point_id[keyframe.point_id != NO_POINT]
     depth = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])[:, 2]
-    return max(float(np.median(depth)), NEAREST_M) if len(ids) else NEAREST_M
+    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M

@@ -30,16 +30,13 @@ from segfloor_ros.files.saved_map import Arrays, joined, split
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import CHANCE_SHARE, MOST, SAME, Track
+from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker
 
-MIN_FOUND = 25
 COLUMNS, ROWS = 4, 3
-MIN_EXPECTED = 8
-
 FILE = 'vocabulary.npy'
 BRANCHES = 30
 LEVELS = 3
@@ -63,10 +60,9 @@ shelf that stands twice in a building shows now and then enough for one frame, b
 NARROW_SEARCHES = 100
 """Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
 
-VIEW_REACH_M = 2.0
-"""A view shows a place also from so far before or behind where a keyframe stands."""
-
-MAX_VIEW_TURN_RAD = 1.0
+VIEW_REACH = 2.0, 1.0
+"""A view shows a place also from so far, in m, before or behind where a keyframe stands, and turned
+by so many radians."""
 
 
 class PlaceRecognition:
@@ -159,7 +155,7 @@ class PlaceRecognition:
     def is_same_place(self, track: Track) -> bool:
         """Whether a frame shows enough of what it should, all over the image."""
         found, expected = len(track.point_ids), len(track.visible_ids)
-        if found < MIN_FOUND or found < CHANCE_SHARE * expected:
+        if found < ENOUGH or found < CHANCE_SHARE * expected:
             return False
         return self.agreement(track) >= MOST
 
@@ -171,7 +167,7 @@ class PlaceRecognition:
             self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
             for ids in (track.point_ids, track.visible_ids)
         )
-        full = there >= MIN_EXPECTED
+        full = there >= ENOUGH // 2
         agree = seen - np.sqrt(seen) >= 0.5 * CHANCE_SHARE * there
         return float(agree[full].mean()) if full.any() else 0.0
 
@@ -351,7 +347,7 @@ class Relocaliser:
         poses = np.stack([k.T_world_camera for k in keyframes])
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
-        return (distance < reach_m + VIEW_REACH_M) & (turned < reach_rad + MAX_VIEW_TURN_RAD)
+        return (distance < reach_m + VIEW_REACH[0]) & (turned < reach_rad + VIEW_REACH[1])
 
     def _is_near(self, track: Track) -> bool:
         if self._near is None or self._searches_left == 0:

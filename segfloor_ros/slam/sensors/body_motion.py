@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Measurement, WheelPose, is_sound
-from segfloor_ros.geometry import Array, adjoint, invert, make_transform
-from segfloor_ros.slam.sensors.gyroscope import Gyroscope
+from segfloor_ros.geometry import Array, adjoint, invert, is_within, make_transform
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
     SIGMA_ROOT_M,
@@ -34,11 +34,8 @@ SIGMA_ROOT_TURN_RAD = 0.01
 SLIP_M_S = 0.5
 """Error of a speed measured by wheels that slip."""
 
-SLIP_NS = 1_000_000_000
-"""Wheels that slipped are not believed for so long."""
-
-WINDOW_M, WINDOW_RAD, WINDOW_NS = 0.1, 0.1, 1_000_000_000
-"""A stretch of the drive to learn from ends when one of these is reached."""
+WINDOW = 0.1, 0.1
+"""A stretch of the drive to learn from ends after so many metres or radians, or a moment."""
 
 WINDOWS_TO_JUDGE = 25
 """Stretches after which something is said of the wheels; the slip of a few of them is not it."""
@@ -152,7 +149,7 @@ class BodyMotion:
             R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
         T_before_now = make_transform(R, np.append(way_m, 0.0))
         variance = self._variance(measured, None if turn is None else turn[1])
-        if self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS:
+        if self._slipped_ns is not None and before_ns < self._slipped_ns + MOMENT_NS:
             variance[:2] += (SLIP_M_S * seconds) ** 2
         A = adjoint(invert(self.T_base_left))
         return RelativeMotion(
@@ -185,12 +182,7 @@ class BodyMotion:
             return
         before_ns, T_odom_before = self._window
         T_before_now = invert(T_odom_before) @ T_odom_camera
-        angle = np.linalg.norm(Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec())
-        if (
-            np.linalg.norm(T_before_now[:3, 3]) < WINDOW_M
-            and angle < WINDOW_RAD
-            and stamp_ns - before_ns < WINDOW_NS
-        ):
+        if is_within(T_before_now, WINDOW) and stamp_ns - before_ns < MOMENT_NS:
             return
         self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
         self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
@@ -254,7 +246,7 @@ class BodyMotion:
         window = Window(seen[:2, 3], yaw_of(seen), turning_up_rad_s, measured)
         if not self._calibrator.add(window):
             self.slips += 1
-            in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + SLIP_NS
+            in_a_row = self._slipped_ns is not None and before_ns < self._slipped_ns + MOMENT_NS
             self._slipped_ns = now_ns
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
             if in_a_row:

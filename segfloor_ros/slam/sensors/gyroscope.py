@@ -16,14 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import MAX_LAG_S, ImuSample
 from segfloor_ros.geometry import Array, rotation_angle
+from segfloor_ros.slam.rig import is_gated
 
-HISTORY = 8000
-MAX_GAP_NS = 100_000_000
-MAX_AHEAD_NS = 60_000_000
-"""Messages may be so late; until then the camera is taken to turn on as it did."""
+LATE_NS = 100_000_000
+"""Messages may be so late; until then what is measured is taken to go on as it did."""
 
-RESTART_NS = 1_000_000_000
-"""Stamps that jump back by more begin a new recording."""
+MOMENT_NS = 1_000_000_000
+"""What lies further back belongs to another situation: stamps that jump back by more begin a new
+recording, and wheels that slipped are believed again."""
+
+KEPT_NS = 40 * MOMENT_NS
+"""How long samples are kept."""
 
 SIGMA_ROOT_S = 3e-4
 """Error of an angle, rad per root second: consumer gyroscopes have 0.005 to 0.02 degrees."""
@@ -31,8 +34,7 @@ SIGMA_ROOT_S = 3e-4
 SIGMA_SHARE = 0.005
 """Error of an angle as a share of it: scale and alignment of the axes."""
 
-FIRST_BIAS_SIGMA = 0.02
-BIAS_DRIFT = 1e-4
+FIRST_BIAS_SIGMA, BIAS_DRIFT = 0.02, 1e-4
 """Bias of a cheap gyroscope, rad/s, and its drift, rad/s per root second."""
 
 FIRST_LAG_SIGMA_S, LAG_DRIFT = 0.02, 1e-5
@@ -43,8 +45,6 @@ STEADY_RAD_S = 0.02
 
 SIGMA_SEEN_RAD = 1e-3
 """Error of a turn as the images show it."""
-
-OUTLIER_SIGMAS = 4.0
 
 SAID_S = 0.01
 """A lag that is worth a word; less is what a driver may be off."""
@@ -64,8 +64,8 @@ Sample = TypeVar('Sample', bound=Stamped)
 class TimedSeries(Generic[Sample]):
     """The latest samples of a sensor, in the order of their stamps."""
 
-    def __init__(self, history: int, max_gap_ns: int, max_ahead_ns: int) -> None:
-        self._history, self._max_gap_ns, self._max_ahead_ns = history, max_gap_ns, max_ahead_ns
+    def __init__(self, max_gap_ns: int) -> None:
+        self._max_gap_ns = max_gap_ns
         self._samples: list[Sample] = []
 
     def __iter__(self) -> Iterator[Sample]:
@@ -73,11 +73,12 @@ class TimedSeries(Generic[Sample]):
 
     def add(self, sample: Sample) -> None:
         """Take in a sample; one that comes late is put where it belongs."""
-        if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns - RESTART_NS:
+        if self._samples and sample.stamp_ns < self._samples[-1].stamp_ns - MOMENT_NS:
             self._samples.clear()
         insort(self._samples, sample, key=_stamp)
-        if len(self._samples) > 2 * self._history:
-            del self._samples[: -self._history]
+        kept_ns = self._samples[-1].stamp_ns - KEPT_NS
+        if self._samples[0].stamp_ns < kept_ns - KEPT_NS:
+            del self._samples[: bisect_left(self._samples, kept_ns, key=_stamp)]
 
     def latest(self, count: int) -> list[Sample]:
         """Return so many of the samples."""
@@ -99,7 +100,7 @@ class TimedSeries(Generic[Sample]):
             first = max(min(first, last - 1), 0)
         samples = self._samples[first : last + 1]
         stamps = [before_ns, *(sample.stamp_ns for sample in samples)]
-        if not samples or now_ns - stamps[-1] > self._max_ahead_ns:
+        if not samples or now_ns - stamps[-1] > LATE_NS:
             return []
         gap_ns = max(later - one for one, later in pairwise(stamps))
         return samples if gap_ns <= self._max_gap_ns else []
@@ -172,7 +173,7 @@ class Gyroscope:
         self.bias_rad_s: Array = np.zeros(3)
         self.lag_s = 0.0
         self._covariance: Array = np.diag([FIRST_BIAS_SIGMA**2] * 3 + [FIRST_LAG_SIGMA_S**2])
-        self.samples: TimedSeries[ImuSample] = TimedSeries(HISTORY, MAX_GAP_NS, MAX_AHEAD_NS)
+        self.samples: TimedSeries[ImuSample] = TimedSeries(LATE_NS)
         self._latest: tuple[tuple[int, int], _Path | None] | None = None
 
     def add(self, sample: ImuSample) -> None:
@@ -244,7 +245,7 @@ class Gyroscope:
         H = np.column_stack([seconds * np.eye(3), -speeding_up])
         self._covariance += np.diag([BIAS_DRIFT**2] * 3 + [LAG_DRIFT**2]) * seconds
         S = H @ self._covariance @ H.T + noise**2 * np.eye(3)
-        if (np.abs(excess) > OUTLIER_SIGMAS * np.sqrt(np.diag(S))).any():
+        if not is_gated(excess, S):
             return
         self._latest = None
         gain = self._covariance @ H.T @ np.linalg.inv(S)

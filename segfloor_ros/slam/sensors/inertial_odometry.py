@@ -17,8 +17,9 @@ import numpy as np
 
 from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import Array, rotation_angle
+from segfloor_ros.slam.results import PROOF
 from segfloor_ros.slam.rig import is_gated
-from segfloor_ros.slam.sensors.gyroscope import Gyroscope
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
 
 SIGMA_SEEN_M = 0.003
 """Error of the place of a frame as the images show it."""
@@ -33,7 +34,7 @@ SIGMA_INTEGRATED = 0.01
 FIRST_ERROR_SIGMA_M_S2, ERROR_DRIFT = 0.1, 0.01
 """Error of the acceleration freed of gravity, m/s², and its drift, m/s² per root second."""
 
-STEP_NS, MAX_STEP_NS = 500_000_000, 1_000_000_000
+STEP_NS = 500_000_000
 """Time between two of the poses: errors of millimetres in their place are little then, and little
 is lost where the images fail."""
 
@@ -47,7 +48,6 @@ SIGMA_BIAS_M_S2 = 0.2
 """Bias of a cheap accelerometer."""
 
 SIGMA_ANY_M_S2 = 100.0
-MIN_MEASURED = 3
 GRAVITY_M_S2, MAX_OFF_M_S2 = 9.81, 1.0
 """An accelerometer with another gravity measures something else, or nothing."""
 
@@ -171,7 +171,7 @@ class Gravity:
     @property
     def _is_known(self) -> bool:
         off_m_s2 = abs(float(np.linalg.norm(self._state[:3])) - GRAVITY_M_S2)
-        return self._measured >= MIN_MEASURED and off_m_s2 < MAX_OFF_M_S2
+        return self._measured >= PROOF and off_m_s2 < MAX_OFF_M_S2
 
     def lift(self, R_world_camera: Array) -> Array | None:
         """Return what is measured at rest (3,), in axes of the world; None before enough is
@@ -196,7 +196,7 @@ class Gravity:
         """Take in the pose of a frame that images or wheels show."""
         if self._poses and stamp_ns - self._poses[-1][0] < STEP_NS:
             return
-        if self._poses and stamp_ns - self._poses[-1][0] > MAX_STEP_NS:
+        if self._poses and stamp_ns - self._poses[-1][0] > MOMENT_NS:
             self.reset()
         self._poses.append((stamp_ns, T_odom_camera))
         lift_odom = self._lift()

@@ -9,24 +9,21 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.geometry import Array, between, invert, make_transform
-from segfloor_ros.slam.sensors.gyroscope import TimedSeries, is_late, lag_in_words
+from segfloor_ros.slam.rig import GATE, chi2_limit
+from segfloor_ros.slam.sensors.gyroscope import LATE_NS, TimedSeries, is_late, lag_in_words
 
-HISTORY, NEEDED = 2000, 20
-"""Poses that are kept, and those that a drive needs to go on after it was broken off."""
+NEEDED = 20
+"""Poses that a drive needs to go on after it was broken off."""
 
 MAX_GAP_NS = 500_000_000
-MAX_AHEAD_NS = 100_000_000
-"""Messages may be so late; until then the base is taken to go on as it did."""
-
-SPEED_NS = MAX_AHEAD_NS
-"""Time over which the speed is taken."""
+"""Time between two poses: drivers publish two a second at least."""
 
 
 class WheelOdometry:
     """The latest poses that the wheels measured."""
 
     def __init__(self) -> None:
-        self._poses: TimedSeries[WheelPose] = TimedSeries(HISTORY, MAX_GAP_NS, MAX_AHEAD_NS)
+        self._poses: TimedSeries[WheelPose] = TimedSeries(MAX_GAP_NS)
 
     def add(self, pose: WheelPose) -> None:
         """Take in a pose."""
@@ -47,7 +44,7 @@ class WheelOdometry:
         T_before_now = self.motion(before_ns, now_ns)
         if T_before_now is None:
             return None
-        ends = [self.motion(end_ns - SPEED_NS, end_ns) for end_ns in (before_ns, now_ns)]
+        ends = [self.motion(end_ns - LATE_NS, end_ns) for end_ns in (before_ns, now_ns)]
         before, now = (np.eye(4) if end is None else end for end in ends)
         if any(end is None for end in ends):
             before = now = np.eye(4)
@@ -55,7 +52,7 @@ class WheelOdometry:
         swept = yaw_of(before) * np.array([-y, x])
         sped_up = T_before_now[:2, :2] @ now[:2, 3] - before[:2, 3] - swept
         turned_up = yaw_of(now) - yaw_of(before)
-        return Stretch(T_before_now, sped_up * 1e9 / SPEED_NS, turned_up * 1e9 / SPEED_NS)
+        return Stretch(T_before_now, sped_up * 1e9 / LATE_NS, turned_up * 1e9 / LATE_NS)
 
     def _at(self, stamp_ns: int) -> Array | None:
         poses = self._poses.window(stamp_ns, stamp_ns)
@@ -181,7 +178,6 @@ SIGMA_REST_RAD, SIGMA_ROOT_RAD = 0.003, 0.02
 """Error of the turn: at rest, and per root metre or radian; a floor tilts by as much, and goes up
 as a way errs."""
 
-OUTLIER_CHI2 = 9.0
 ROUNDS = 4
 
 
@@ -203,7 +199,7 @@ class WheelCalibrator:
 
     def add(self, window: Window) -> bool:
         """Take in a stretch; returns whether it agrees with the others: the wheels did not slip."""
-        agrees = self._chi2(window) < OUTLIER_CHI2
+        agrees = self._chi2(window) < chi2_limit(1, GATE)
         self._equations = [*self._equations, _equations(window)][-MAX_WINDOWS:]
         self.current = self._solved()
         return agrees
@@ -265,7 +261,7 @@ def _robust(rows: Array, measured: Array, prior: Array, sigma: Array) -> tuple[A
     information = np.diag(sigma**-2)
     for _ in range(ROUNDS):
         chi2 = (measured - rows @ solution) ** 2
-        weight = 1 / (1 + chi2 / OUTLIER_CHI2) ** 2
+        weight = 1 / (1 + chi2 / chi2_limit(1, GATE)) ** 2
         weighted = rows * weight[:, None]
         H = information + weighted.T @ rows
         solution = np.linalg.solve(H, information @ prior + weighted.T @ measured)

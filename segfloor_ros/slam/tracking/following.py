@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import MAJORITY, MIN_TRACKED, Track
+from segfloor_ros.slam.results import ENOUGH, MAJORITY, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.tracking.features import spread
-from segfloor_ros.slam.tracking.images import Images, Region, follow_pixels, is_inside
+from segfloor_ros.slam.tracking.images import (
+    SIGMA_FLOW_PX,
+    Images,
+    Region,
+    follow_pixels,
+    is_inside,
+)
 from segfloor_ros.slam.tracking.map_tracking import (
     TRACKED_POINTS,
     Prediction,
@@ -27,7 +33,6 @@ from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
 from segfloor_ros.slam.tracking.pose import Agreement, Consensus
 
 MAX_FOLLOWED = 250
-SIGMA_FLOW_PX = 1.0
 MIN_FOUND = 0.15
 """Share of the selected points that must be found and agree, else the frame is searched anew."""
 
@@ -80,7 +85,7 @@ class Follower:
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
         measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
-        if len(rows) < MIN_TRACKED:
+        if len(rows) < ENOUGH:
             return None
         ids = seen.ids[rows]
         measured = observations.take(rows)
@@ -92,20 +97,20 @@ class Follower:
 
     def _by_flow(self, images: Images, T_predicted: Array) -> Agreement | None:
         """Find the pose to about a pixel from where the last frame's points went."""
-        if self._small is None or len(self._ids) < MIN_TRACKED:
+        if self._small is None or len(self._ids) < ENOUGH:
             return None
         step = -(-len(self._ids) // MAX_FOLLOWED)
         ids, uv_last = self._ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
         ids, uv_last, points = ids[front], uv_last[front], points[front]
-        if len(ids) < MIN_TRACKED:
+        if len(ids) < ENOUGH:
             return None
         guess = self._camera.project(points)[:, :2]
         width = self._camera.width
         uv, found = follow_pixels(self._small, images.small, width, uv_last, guess)
         found &= ~is_inside(images.excluded, uv)
-        if found.sum() < MIN_TRACKED:
+        if found.sum() < ENOUGH:
             return None
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
@@ -126,5 +131,5 @@ class Follower:
 
     def _believable(self, found: Agreement, looked_for: int) -> bool:
         """Whether enough points agree: a wrong pose has followers too, but not most."""
-        enough = max(MIN_TRACKED, MIN_FOUND * looked_for)
+        enough = max(ENOUGH, MIN_FOUND * looked_for)
         return found.agreeing >= enough and found.share >= MAJORITY

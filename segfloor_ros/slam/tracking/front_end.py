@@ -18,7 +18,15 @@ from segfloor_ros.slam.places.place_recognition import (
     greatest_speed_mps,
     is_within,
 )
-from segfloor_ros.slam.results import MIN_TRACKED, MOST, NO_POINT, LastPose, ObservedFeatures, Track
+from segfloor_ros.slam.results import (
+    ENOUGH,
+    MOST,
+    NO_POINT,
+    SAME,
+    LastPose,
+    ObservedFeatures,
+    Track,
+)
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
@@ -34,12 +42,7 @@ from segfloor_ros.slam.tracking.images import (
     union,
 )
 from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
-from segfloor_ros.slam.tracking.motion import (
-    MAX_BLIND_SIGMA_M,
-    CameraMotion,
-    TrackingState,
-    sigma_m,
-)
+from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
 from segfloor_ros.slam.tracking.pose import PoseInformation, differ
 
@@ -51,9 +54,9 @@ CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 """Points, and their share of those expected, that must be found where the sensors have the camera
 somewhere else: wheels slip, but a view that begins anew may be of another place."""
 
-FEW_POINTS, RESUMING_POINTS = 50, 60
+FEW_POINTS = 50
 """Wheels measure the pose better than fewer points, spread over the image, that do not slide along
-edges, and an IMU alone better than half as many. A few more end a blind stretch."""
+edges, and an IMU alone better than half as many."""
 
 PLENTY = 100
 """With so many points in view the place is certain enough, whatever they are."""
@@ -162,14 +165,8 @@ class FrontEnd:
         if motion.state.is_lost:
             return motion.is_heading_possible(pose, stamp_ns)
         measured = motion.measured(stamp_ns)
-        few = RESUMING_POINTS if motion.state.is_blind else FEW_POINTS
-        few = (
-            few
-            if motion.prior(stamp_ns)
-            else few // 2
-            if measured and measured.source == 'IMU'
-            else 0
-        )
+        by_imu = measured is not None and measured.source == 'IMU'
+        few = FEW_POINTS if motion.prior(stamp_ns) else FEW_POINTS // 2 if by_imu else 0
         if few and count_firm(images.left, track.uv_px) < few:
             return False
         if motion.is_consistent(pose, track.covariance, stamp_ns):
@@ -241,7 +238,7 @@ class FrontEnd:
             images, features, self.local.point_ids, steady.T_camera_world, steady, is_given=True
         )
         found = None if track is None else replace(track, is_poor=is_poor)
-        if close is None or len(close.point_ids) < MIN_TRACKED:
+        if close is None or len(close.point_ids) < ENOUGH:
             return found
         if found is not None:
             by_images, explained = (
@@ -270,7 +267,7 @@ class FrontEnd:
         motion = self.motion
         state = motion.state
         is_held = state is TrackingState.HELD
-        if not state.is_blind or is_held or sigma_m(motion.covariance) > MAX_BLIND_SIGMA_M:
+        if not state.is_blind or is_held or sigma_m(motion.covariance) > SAME[0]:
             return False
         return self.local.is_new_view(motion.T_camera_world)
 

@@ -33,18 +33,21 @@ from segfloor_ros.geometry import Array, make_transform, transform_points
 
 WINDOW_PX = 11
 LEVELS = 3
-SMALLEST_WIDTH_PX = 300
+SMALL_WIDTH_PX = 320
+"""Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
 
 Region = NDArray[np.uint8]
 """A mask (H, W) uint8 of the left image, 255 where something moves."""
+
+SIGMA_FLOW_PX = 1.0
+"""Error of a pixel that is followed."""
 
 MIN_CONTRAST = 3.0
 MIN_LIVE_ROWS = 0.7
 MIN_EXPECTED_SHIFT = 0.004
 """Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
 
-THUMBNAIL_WIDTH_PX = 80
 MIN_RESPONSE = 0.05
 
 
@@ -77,7 +80,7 @@ def shrink(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the image (H, W) at half its size where it is large: a start for patch alignment
     need not be better than a pixel.
     """
-    if image.shape[1] < 2 * SMALLEST_WIDTH_PX:
+    if image.shape[1] < 2 * SMALL_WIDTH_PX:
         return image
     half = (image.shape[1] // 2, image.shape[0] // 2)
     return np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
@@ -89,10 +92,13 @@ def follow_pixels(
     width_px: int,
     uv_last_px: Array,
     uv_guess_px: Array,
+    window_px: int = WINDOW_PX,
+    steps: tuple[int, int, float] = STEPS,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Find pixels (N, 2) of one image in the next one, starting from a guess (N, 2).
 
-    last, now: shrunk images; width_px: of the full ones, in whose pixels all positions are.
+    last, now: shrunk images; width_px: of the full ones, in whose pixels all positions are. steps:
+    when the search ends, as OpenCV takes it.
     Returns positions (N, 2) and whether each was found (N,).
     """
     scale = last.shape[1] / width_px
@@ -105,9 +111,9 @@ def follow_pixels(
         now,
         start,
         guess,
-        winSize=(WINDOW_PX, WINDOW_PX),
+        winSize=(window_px, window_px),
         maxLevel=LEVELS,
-        criteria=STEPS,
+        criteria=steps,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     uv = (np.asarray(found_uv, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
@@ -195,9 +201,9 @@ class ImageRotation:
     """Compares each image with the one before."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        self._scale = THUMBNAIL_WIDTH_PX / camera.width
+        self._scale = SMALL_WIDTH_PX / 4 / camera.width
         height = max(8, round(camera.height * self._scale))
-        self._size = (THUMBNAIL_WIDTH_PX, height)
+        self._size = (SMALL_WIDTH_PX // 4, height)
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
         self._focal = (camera.fx * self._scale, camera.fy * height / camera.height)
         self._last: NDArray[np.float32] | None = None

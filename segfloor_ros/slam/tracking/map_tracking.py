@@ -24,7 +24,7 @@ from segfloor_ros.slam.places.known_views import (
     view_novelty,
     views_near,
 )
-from segfloor_ros.slam.results import MIN_TRACKED, NO_POINT, ObservedFeatures, Track
+from segfloor_ros.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations
 from segfloor_ros.slam.tracking.features import (
     PYRAMID_LEVELS,
@@ -59,9 +59,6 @@ MATCH_RADIUS_PX = 15.0
 
 WIDE_SEARCH = 3.0
 """Factor on the search radius when the first search finds too little."""
-
-MIN_PNP_INLIERS = MIN_TRACKED // 2
-"""Fewest matches behind a first guess of the pose; chance gives five or six."""
 
 NARROW_SEARCH = 0.4
 """Factor on the search radius once a pose is known from this very frame."""
@@ -128,7 +125,7 @@ class Tracker:
         seen = predict_points(self._map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, seen, NARROW_SEARCH)
-        if len(rows) < (MIN_TRACKED if known is None else 1):
+        if len(rows) < (ENOUGH if known is None else 1):
             return None
         ids = seen.ids[points]
         align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
@@ -184,7 +181,7 @@ class Tracker:
         found = solve_pnp(
             self._map.rig.camera, self._map.xyz_world[ids[points]], features.uv_px[rows]
         )
-        if found is None or found[1].sum() < MIN_PNP_INLIERS:
+        if found is None or found[1].sum() < ENOUGH // 2:
             return None
         seen = predict_points(self._map, ids, found[0])
         points, rows = self._search(features, tree, seen, 1.0)
@@ -198,13 +195,13 @@ class Tracker:
         T_start: Array,
     ) -> PoseEstimate | None:
         """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
-        if len(rows) < MIN_TRACKED:
+        if len(rows) < ENOUGH:
             return None
         found = self.consensus.refine(T_start, ids, observations.take(rows), KNOWN_NOISE)
         return found.estimate if self._agree(found) else None
 
     def _agree(self, found: Agreement) -> bool:
-        return found.agreeing >= MIN_TRACKED and found.share >= MAJORITY
+        return found.agreeing >= ENOUGH and found.share >= MAJORITY
 
     def _search(
         self, features: Features, tree: cKDTree, seen: Prediction, radius_factor: float

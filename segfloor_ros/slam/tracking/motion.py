@@ -31,10 +31,6 @@ MIN_STEP_S = 1e-3
 ACCELERATION = 2.0
 """Of a robot on wheels, m/s² and rad/s²."""
 
-MAX_BLIND_SIGMA_M = 0.5
-"""Uncertainty of the place up to which an IMU alone measures it, and up to which keyframes are made
-of a pose that no image shows."""
-
 
 class TrackingState(Enum):
     """How the latest pose is known; the words are those of the state of a frame."""
@@ -218,7 +214,7 @@ class CameraMotion:
         if measured.source == 'nothing':
             self.covariance, self.state = predicted[1], TrackingState.HELD
             return True
-        if not measured.by_wheels and sigma_m(predicted[1]) > MAX_BLIND_SIGMA_M:
+        if not measured.by_wheels and sigma_m(predicted[1]) > SAME[0]:
             return False
         self.since_keyframe.add(measured)
         self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]

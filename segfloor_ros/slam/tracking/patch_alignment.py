@@ -22,14 +22,14 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.depth import disparity_at
 from segfloor_ros.geometry import Array
+from segfloor_ros.slam.results import MAJORITY
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.tracking.images import Images
 
 HALF_PATCH_PX = 5
-
 SIDE_PX = 2 * HALF_PATCH_PX + 1
-
 STEPS = 4
+"""Gauss-Newton steps; a start within reach converges in three."""
 
 AFFINE_SIGMA = 0.3
 """Prior standard deviation of the affine part, px per px; the floor under a low camera reaches
@@ -39,36 +39,25 @@ AFFINE_SIGMA = 0.3
 GREY_NOISE = 2.0
 """Standard deviation of a grey level that the camera alone explains; a lower residual is luck."""
 
-MAX_UNEXPLAINED = 0.5
-"""Share of a patch's variance that may remain after a fit."""
+ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
+"""From so far away a patch is brought to where it lies, by no more than this in one step."""
 
-MAX_SHIFT_PX = 2.0
-
-MAX_LAST_STEP_PX = 0.1
-
-MAX_SHIFT_STEP_PX = 1.0
-
-
-Patches = NDArray[np.float32]
-
-MIN_SIGMA_PIXEL = 0.15
-
-MIN_SIGMA_DISPARITY = 0.1
+MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
+"""No patch is measured better: lenses, rectification and the shape of things are not perfect."""
 
 MIN_CORRELATION = 0.7
+"""Of the patches of one point in both images."""
 
-MIN_RATIO = 0.15
-"""Smaller over larger eigenvalue of the structure tensor (Harris and Stephens 1988); of corners and
-textures it is more, of an edge with the noise of a camera less."""
-
-CELLS, PER_CELL = 80, 3
-"""Parts into which an image is divided, and points of each that count."""
+Patches = NDArray[np.float32]
 
 NOISE_SLOPE = 0.04
 """Mean square of a slope of noise of unit variance, smoothed by one pixel: 1 / (8 pi)."""
 
 ALIASED = 0.3
 """Share of the slopes across an edge that its sampling in steps of pixels shows along it."""
+
+CELLS, PER_CELL = 80, 3
+"""Parts into which an image is divided, and points of each that count: neighbours err together."""
 
 LEAST_SHIFT = 1e-4
 """Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
@@ -132,9 +121,9 @@ def align_patches(
     sigma = np.zeros((len(template), 2))
     sigma[:, : variance.shape[1]] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
     sound = (
-        (np.abs(offset) < MAX_SHIFT_PX).all(axis=1)
-        & (np.abs(step[:, :, 0]) < MAX_LAST_STEP_PX).all(axis=1)
-        & (noise < MAX_UNEXPLAINED * _variance(target, weight))
+        (np.abs(offset) < ALIGNED_PX).all(axis=1)
+        & (np.abs(step[:, :, 0]) < MIN_SIGMA_DISPARITY).all(axis=1)
+        & (noise < MAJORITY * _variance(target, weight))
     )
     return Alignment(start_uv_px + offset, sigma, sound)
 
@@ -294,29 +283,14 @@ def refine_disparity(
 
 
 def count_firm(image: NDArray[Any], uv_px: Array) -> int:
-    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures; of many
-    in one part of the image some.
+    """Return how many pixels (N, 2) of a grey image (H, W) are on corners or in textures, whose
+    patches determine their shift in both directions; of many in one part of the image some.
     """
-    firm = uv_px[_is_firm(image, uv_px)]
+    known, _ = _known_shift(image, uv_px)
+    firm = uv_px[(known > 0).all(axis=1)]
     cell = (firm // np.sqrt(image.size / CELLS)).astype(np.intp)
     _, counts = np.unique(cell, axis=0, return_counts=True)
     return int(np.minimum(counts, PER_CELL).sum())
-
-
-def _is_firm(image: NDArray[Any], uv_px: Array) -> NDArray[np.bool_]:
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-    height, width = image.shape
-    columns, rows = np.rint(uv_px).astype(np.intp).T
-    steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1)
-    patches = smooth[
-        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
-        np.clip(columns[:, None, None] + steps, 0, width - 1),
-    ].astype(np.float32)
-    by_x = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]
-    by_y = patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]
-    xx, xy, yy = ((a * b).sum(axis=(1, 2)) for a, b in ((by_x, by_x), (by_x, by_y), (by_y, by_y)))
-    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    return np.asarray(middle - spread > MIN_RATIO * (middle + spread))
 
 
 def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observations:
@@ -332,7 +306,16 @@ def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observa
 
 def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:
     """Return the information (N, 2, 2) in 1/px² that patches around pixels (N, 2) give of their
-    shift, freed of what noise alone would show.
+    shift.
+    """
+    known, axes = _known_shift(image, uv_px)
+    return np.asarray((axes * known[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)
+
+
+def _known_shift(image: NDArray[Any], uv_px: Array) -> tuple[Array, Array]:
+    """Return what patches around pixels (N, 2) know of their shift along two axes, in 1/px² (N, 2),
+    freed of what noise alone would show and shared by those that overlap, and the axes (N, 2, 2),
+    one a column.
     """
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     height, width = image.shape
@@ -354,4 +337,4 @@ def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:
         tree = cKDTree(uv_px)
         crowd = tree.query_ball_point(uv_px, HALF_PATCH_PX, return_length=True)
         known /= np.asarray(crowd)[:, None]
-    return np.asarray((axes * known[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)
+    return known, axes

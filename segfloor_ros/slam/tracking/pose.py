@@ -19,9 +19,11 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, make_transform, se3_exp, se3_log, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import MAJORITY, PROOF
+from segfloor_ros.slam.results import ENOUGH, MAJORITY, PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
+    SAME_PX,
+    SMALLEST,
     Observations,
     huber_cost,
     huber_weights,
@@ -34,9 +36,7 @@ from segfloor_ros.slam.rig import (
 from segfloor_ros.slam.tracking.patch_alignment import LEAST_SHIFT, _shift_information
 
 ROUNDS = 3
-
 STEPS_PER_ROUND = 6
-
 CONVERGED = 1e-4
 """Relative decrease of the cost, expected or seen, that ends a round."""
 
@@ -44,11 +44,8 @@ SAME_INLIERS = 0.01
 """Share of the points that changes sides below which another round would change nothing."""
 
 MAX_NOISE_FACTOR = 4.0
-
 RANSAC_ITERATIONS = 1000
 """Enough for a quarter of right matches, five at a time; it ends early when more are right."""
-
-RANSAC_REPROJECTION_PX = 4.0
 
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 """Of a pose before any point is seen, in metres and radians: where no point determines it."""
@@ -56,14 +53,8 @@ FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 FLOOR_M = 0.03
 """What is no higher belongs to the floor, which stands still whenever it was first seen."""
 
-MIN_PROVEN = 12
-"""Fewest points with a record that may speak against the majority."""
-
 USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
 """Where at least this share of what has a record fits, at no more than this noise, all is well."""
-
-LEAST_VARIANCE = 1e-12
-"""Of a pose, m² and rad²: a direction that is not observed must not look exact."""
 
 KNOWN_NOISE = 2.0
 """Corners of an image are worse by no more than this factor than patches of the same image."""
@@ -99,7 +90,7 @@ def solve_pnp(
         camera.K,
         None,
         iterationsCount=RANSAC_ITERATIONS,
-        reprojectionError=RANSAC_REPROJECTION_PX,
+        reprojectionError=SAME_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_EPNP,
     )
@@ -203,7 +194,7 @@ def _covariance(
 ) -> Array:
     points = transform_points(pose, points_world)
     if len(points) < 4:
-        return np.eye(6) * 1e6
+        return np.eye(6) * UNKNOWN_COVARIANCE
     residual = residuals(camera, points, observations)
     information = observations.information
     chi2 = squared_norms(residual, information)
@@ -315,7 +306,7 @@ class Consensus:
         if known is not None and differ(of_most, known):
             return problem.near(known.T_camera_world, max_noise_factor)
         proven = self.proven(ids, T_start)
-        if proven.sum() < MIN_PROVEN or _fits(of_most, proven):
+        if proven.sum() < ENOUGH // 2 or _fits(of_most, proven):
             return problem.of_everyone()
         measured = observations.take(proven)
         of_proven = refine_pose(self._camera, T_start, points[proven], measured, max_noise_factor)
@@ -362,7 +353,7 @@ class _Problem:
         """
         before = self.fitting(self.of_most.T_camera_world, noise_factor)
         after = self.fitting(T_other, noise_factor)
-        enough = max(MIN_PROVEN, MAJORITY * witnesses.sum())
+        enough = max(ENOUGH // 2, MAJORITY * witnesses.sum())
         support = (after & witnesses).sum()
         if support < enough or (before & witnesses).sum() > MAJORITY * support:
             return None
@@ -374,7 +365,7 @@ class _Problem:
         agrees.
         """
         near = self.fitting(T_camera_world, noise_factor)
-        if near.sum() < MIN_PROVEN:
+        if near.sum() < ENOUGH // 2:
             nobody = np.zeros(len(self.points), bool)
             return Agreement(replace(self.of_most, inliers=nobody), near)
         estimate = refine_pose(
@@ -403,5 +394,5 @@ def _fits(estimate: PoseEstimate, proven: NDArray[np.bool_]) -> bool:
 def differ(a: PoseEstimate, b: PoseEstimate) -> bool:
     """Whether two poses differ by more than their joint uncertainty."""
     error = se3_log(a.T_camera_world @ invert(b.T_camera_world))
-    covariance = a.covariance + b.covariance + LEAST_VARIANCE * np.eye(6)
+    covariance = a.covariance + b.covariance + SMALLEST * np.eye(6)
     return not is_gated(error, covariance)

@@ -1,16 +1,19 @@
 """Bundle adjustment on synthetic problems with known answers."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from bundle_problems import CAMERA, disturbed, make_problem
 
 from segfloor_ros.geometry import se3_exp, transform_points
-from segfloor_ros.slam.mapping import normal_equations
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, adjust
-from segfloor_ros.slam.mapping.normal_equations import Link, inverse_cholesky
-from segfloor_ros.slam.rig import Observations
+from segfloor_ros.slam.mapping.normal_equations import (
+    Linearisation,
+    Link,
+    inverse_cholesky,
+    normal_equations,
+    with_factors,
+)
+from segfloor_ros.slam.rig import Observations, residuals
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 
 
@@ -91,20 +94,50 @@ def test_a_step_equals_the_solution_of_the_full_normal_equations():
         raise AssertionError('the first step must lower the cost')
 
 
-def test_the_sparse_solution_is_the_dense_one(monkeypatch):
-    problem = disturbed(make_problem(num_keyframes=8, num_free=6, sigma=0.2))
+def solved_at_once(system, damping):
+    """Return the solution of all unknowns, cameras, points and offset, and how well the latter is
+    known.
+    """
+    cameras, points = len(system.U), system.V.shape[2]
+    size = 6 * cameras + 3 * points + 1
+    H = np.zeros((size, size))
+    for k, U in enumerate(system.U):
+        H[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = U
+        for m in range(system.starts[k], system.starts[k + 1]):
+            column = 6 * cameras + 3 * system.point[m]
+            H[6 * k : 6 * k + 6, column : column + 3] = system.W[:, :, m]
+    for p in range(points):
+        at = 6 * cameras + 3 * p
+        H[at : at + 3, at : at + 3] = system.V[:, :, p]
+    for j, k, block in system.between:
+        H[6 * min(j, k) : 6 * min(j, k) + 6, 6 * max(j, k) : 6 * max(j, k) + 6] += (
+            block if j < k else block.T
+        )
+    H[:-1, -1] = np.concatenate([system.offset_camera.ravel(), system.offset_point.T.ravel()])
+    H = np.triu(H) + np.triu(H, 1).T
+    H[:-1, :-1] += np.diag(damping * np.diag(H)[:-1])
+    H[-1, -1] = system.offset_offset
+    rhs = [system.camera_rhs.ravel(), system.point_rhs.T.ravel(), [system.offset_rhs]]
+    return np.linalg.solve(H, np.concatenate(rhs)), 1 / np.linalg.inv(H)[-1, -1]
+
+
+def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
+    problem = disturbed(make_problem(num_keyframes=8, num_points=40, num_free=6, sigma=0.2))
+    poses, free = problem.T_camera_world, problem.num_free
+    points = np.concatenate([transform_points(T, problem.points_world) for T in poses])
+    at = Linearisation(
+        poses, free, len(problem.points_world), problem.keyframe, problem.point, points,
+        residuals(CAMERA, points, problem.observations), problem.observations.information,
+    )  # fmt: skip
+    untied = normal_equations(CAMERA, at).with_prior(100.0, 0.02)
     motion = RelativeMotion(np.eye(4), 1e-3 * np.eye(6))
-    tied = replace(problem, factors=(Link(1, 2, motion), Link(4, 3, motion), Link(5, 6, motion)))
-    for given in (problem, tied):
-        dense = adjust(CAMERA, given, iterations=3)
-        monkeypatch.setattr(normal_equations, 'DENSE_KEYFRAMES', 0)
-        found = adjust(CAMERA, given, iterations=3)
-        monkeypatch.undo()
-        np.testing.assert_allclose(found.T_camera_world, dense.T_camera_world, atol=1e-9)
-        np.testing.assert_allclose(found.points_world, dense.points_world, atol=1e-8)
-        assert found.cost_after < 0.5 * found.cost_before
-        assert found.offset.value_px == pytest.approx(dense.offset.value_px, abs=1e-9)
-        assert found.offset.information == pytest.approx(dense.offset.information, rel=1e-6)
+    links = (Link(1, 2, motion), Link(4, 3, motion), Link(5, 6, motion))
+    for system in (untied, with_factors(untied, poses, links)):
+        step = system.solve(1e-3)
+        expected, information = solved_at_once(system, 1e-3)
+        found = [step.twists.ravel(), step.shifts.ravel(), [step.offset_px]]
+        np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-7)
+        assert step.offset_information == pytest.approx(information, rel=1e-6)
 
 
 def test_the_inverse_factor_makes_the_inverse_also_where_a_direction_is_hardly_known():

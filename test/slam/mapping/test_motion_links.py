@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import invert, make_transform, se3_exp, se3_log
 from segfloor_ros.slam.mapping.normal_equations import Level, Link, System, chi2, cost, with_factors
-from segfloor_ros.slam.rig import CHI2_95
+from segfloor_ros.slam.rig import chi2_limit
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 
 UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
@@ -67,7 +67,7 @@ def test_a_step_brings_free_poses_where_they_were_measured():
     step = with_factors(empty_system(2), POSES, links).solve(0.0)
     moved = POSES.copy()
     moved[:2] = se3_exp(step.twists) @ moved[:2]
-    assert all(chi2(item, moved) < 1e-3 * CHI2_95[6] for item in links)
+    assert all(chi2(item, moved) < 1e-3 * chi2_limit(6) for item in links)
     # The third pose was held; both others moved.
     for k in range(2):
         assert np.linalg.norm(se3_log(moved[k] @ invert(POSES[k]))) > 1e-3

@@ -15,7 +15,7 @@ from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Observations, Rig
 
 MOUNT = Mount(0.4, 0.15)
-POINTS, _ = SCENES['wall']
+POINTS = SCENES['wall']
 ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
 

@@ -65,7 +65,7 @@ def test_turns_about_changing_axes_are_put_one_after_the_other():
 def test_a_gap_in_the_samples_is_no_turn():
     gyro = gyroscope(lambda t: (0, 0, 1), until=200)
     assert gyro.turn(0, 240 * MS) is not None
-    assert gyro.turn(0, 300 * MS) is None
+    assert gyro.turn(0, 320 * MS) is None
     gyro.add(ImuSample(500 * MS, np.zeros(3), np.zeros(3)))
     assert gyro.turn(0, 450 * MS) is None
 

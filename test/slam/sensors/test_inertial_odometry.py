@@ -9,9 +9,9 @@ from test_gravity import BESIDE, RATE_HZ, imu_sample, pose
 
 from segfloor_ros.camera.model import ImuSample
 from segfloor_ros.geometry import invert, make_transform
+from segfloor_ros.slam.results import SAME
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.motion import (
-    MAX_BLIND_SIGMA_M,
     CameraMotion,
     TrackingState,
     sigma_m,
@@ -52,7 +52,7 @@ def test_an_imu_carries_the_camera_through_seconds_without_images():
     motion, errors_m = blind_drive(SEEN_S + 3.0, has_accel=True)
     assert len(errors_m) == 30 and motion.state is TrackingState.ON_IMU
     assert errors_m.max() < 0.1
-    assert errors_m[-1] < 3 * sigma_m(motion.covariance) < 3 * MAX_BLIND_SIGMA_M
+    assert errors_m[-1] < 3 * sigma_m(motion.covariance) < 3 * SAME[0]
 
 
 def test_the_circle_of_an_imu_beside_the_camera_is_taken_off():

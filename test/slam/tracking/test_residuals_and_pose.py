@@ -37,8 +37,8 @@ def test_residuals_vanish_at_the_truth_and_ignore_missing_disparities():
     seen.uvd_px[2, 2] = np.nan
     np.testing.assert_allclose(residuals(CAMERA, points, seen), 0, atol=1e-9)
     assert seen.information[2, 2] == 0
-    assert seen.chi2_limit[2] == pytest.approx(5.991)
-    assert seen.chi2_limit[0] == pytest.approx(7.815)
+    assert seen.chi2_limit[2] == pytest.approx(5.991, abs=1e-3)
+    assert seen.chi2_limit[0] == pytest.approx(7.815, abs=1e-3)
 
 
 def test_jacobians_equal_numeric_differentiation():
