@@ -15,11 +15,11 @@ from launch import LaunchDescription
 from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from rclpy.time import Time
-from segfloor_ros.messages.grids import grid_arrays
 from tf2_ros import Buffer, TransformListener
 
 import segfloor_ros.simulation
 from segfloor_ros.grid.map_file import save_map
+from segfloor_ros.messages.maps import grid_of
 from segfloor_ros.messages.topics import TOPICS
 
 DRIVE = Path(segfloor_ros.simulation.__file__).parent / 'demo' / 'drive.mcap'
@@ -68,7 +68,7 @@ class TestMap(unittest.TestCase):
         self.assertTrue(self.buffer.can_transform('map', 'base_link', Time()))
         folder = Path(os.environ['MAP_FOLDER'])
         folder.mkdir(parents=True, exist_ok=True)
-        save_map(grid_arrays(self.maps[-1], 'map'), folder / 'map.yaml')
+        save_map(grid_of(self.maps[-1]), folder / 'map.yaml')
 
     def spin(self, patience_s: float, done) -> None:
         """Handle messages until something holds, or for so long."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 from pathlib import Path
@@ -38,6 +39,15 @@ def test_the_launch_test_can_be_read() -> None:
     module = ast.parse((REPOSITORY / '.ci' / 'bag_test.launch.py').read_text())
     names = [node.name for node in module.body if isinstance(node, ast.FunctionDef)]
     assert 'generate_test_description' in names
+    ours = [
+        node
+        for node in module.body
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith('segfloor_ros')
+    ]
+    assert ours
+    for node in ours:
+        there = importlib.import_module(str(node.module))
+        assert all(hasattr(there, alias.name) for alias in node.names), node.module
 
 
 def test_the_suite_of_the_demo_can_be_read() -> None:
