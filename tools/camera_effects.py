@@ -64,7 +64,8 @@ def effects_of(kind: str, depth: bool) -> dict[str, tuple[str, ...]]:
     group = 'sensors.depth' if depth else 'camera'
     found = values['sensors']['depth'] if depth else values['camera']
     words = {name: f'{group}.{name}={value}' for name, value in found.items()}
-    words.pop('max_m', None)
+    for name in ('max_m', 'baseline_m'):
+        words.pop(name, None)
     together = [words.pop('drift_s')] if 'drift_s' in words else []
     alone = {name: (*ideal, *together, word) for name, word in words.items()}
     return {'none': ideal, **alone, 'all': (*ideal, *together, *words.values())}
