@@ -33,11 +33,11 @@ SCAN_RANGE_MAX_M = 8.0
 CORRECTION_EVERY = 100
 CORRECTION_RAD = 0.002
 """Every so many keyframes the whole map turns by so much, as after the closing of a loop."""
-KEYFRAME_PERIOD_NS = 400_000_000
-
 STEP_M = 0.05
 
 FRAME_PERIOD_NS = 100_000_000
+
+KEYFRAME_PERIOD_NS = round(STRIDE_M / STEP_M) * FRAME_PERIOD_NS
 
 SPARE_M = 5.0
 """From the last frame to the end wall, and from the wall behind to the first one."""

@@ -150,7 +150,6 @@ def score_map(
     alignment: Pose2d | None = None,
     plan: RoadMapPlan = RoadMapPlan(),
     range_m: float = DEFAULT_RANGE_M,
-    tolerance_m: float = DEFAULT_TOLERANCE_M,
 ) -> MapScore:
     """Score an estimated map. alignment, range_m: as in `compare`."""
     maps = compare(estimate, truth, alignment, range_m)
@@ -163,7 +162,7 @@ def score_map(
     return MapScore(
         road_maps[0],
         road_maps[1],
-        score_cells(maps, tolerance_m),
+        score_cells(maps),
         plan.nodes_for(area_m2),
         area_m2,
         truth.base_poses is not None,
