@@ -227,9 +227,10 @@ class RigCheck:
 
     def _lag_s(self, seen: Array) -> float:
         """Return by how much the right images are late, in seconds, by points (N, 6); 0 where that
-        is not sure, or no more than what rectification leaves.
+        is not sure, or no more than what rectification leaves: a single look cannot tell that from
+        a lag, for points move as they lie in the image.
         """
-        if len(seen) < MIN_MATCHES:
+        if len(self._looks) < RECENT or len(seen) < MIN_MATCHES:
             return 0.0
         rows_px, moved_px = seen[:, 3], seen[:, 5] * self._frame_s
         A = np.column_stack([np.ones(len(seen)), 1e-3 * seen[:, :2], moved_px])

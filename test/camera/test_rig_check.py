@@ -103,3 +103,10 @@ def test_images_that_show_nothing_have_no_fault(frames) -> None:
     )
     assert faults([blank(f) for f in frames]) == {}
     assert faults([replace(f, right=np.zeros_like(f.right)) for f in frames]) == {}
+
+
+def test_a_lag_is_said_of_five_looks_and_of_no_fewer(frames) -> None:
+    """In few looks points move as they lie in the image, as what rectification leaves does."""
+    lagging = late(frames, 1.0)
+    assert 'not_simultaneous' not in faults(lagging[:40])
+    assert set(faults(lagging[:41])) == {'not_simultaneous'}
