@@ -58,12 +58,7 @@ setup(
     python_requires='>=3.10',
     # colcon does not install these: on a ROS install rosdep brings the distribution's own packages,
     # which those of pip must not shadow.
-    install_requires=[
-        'numpy>=1.26',
-        'scipy>=1.11',
-        'pyyaml>=6.0',
-        'opencv-python-headless>=4.6',
-    ],
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6.0', 'opencv-python-headless>=4.6'],
     extras_require={
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         'cli': [
@@ -94,7 +89,7 @@ setup(
         'console_scripts': [
             'segfloor = segfloor_ros.cli.start:main',
             *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, 'segfloor_pipeline')),
-        ],
+        ]
     },
     zip_safe=True,
 )

@@ -3,11 +3,7 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
-from launch.substitutions import (
-    EnvironmentVariable,
-    LaunchConfiguration,
-    PathJoinSubstitution,
-)
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'segfloor_ros'
@@ -20,10 +16,7 @@ ARGUMENTS = {
     'namespace': ('', 'Namespace of all nodes and topics.'),
     'params_file': (['params', 'default.yaml'], 'Parameter file for all nodes.'),
     'composed': ('false', 'Run all nodes in one process, for small machines: true or false.'),
-    'log_level': (
-        'info',
-        'From which level on the nodes log.',
-    ),
+    'log_level': ('info', 'From which level on the nodes log.'),
     'left_image': ('', 'Topic of the left images, by default left/image_raw or left/image_rect.'),
     'right_image': ('', 'Topic of the right images.'),
     'left_camera_info': ('', 'Topic of the calibration of the left camera.'),
@@ -84,10 +77,7 @@ def player() -> ExecuteProcess:
 def declare(name: str, default: str | list[str], description: str) -> DeclareLaunchArgument:
     """Return an argument."""
     return DeclareLaunchArgument(
-        name,
-        default_value=in_package(default),
-        description=description,
-        choices=CHOICES.get(name),
+        name, default_value=in_package(default), description=description, choices=CHOICES.get(name)
     )
 
 

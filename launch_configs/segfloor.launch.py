@@ -135,10 +135,7 @@ ARGUMENTS = {
         'Take /tf and /tf_static into the namespace, as Nav2 does for several robots: true or '
         'false.',
     ),
-    'log_level': (
-        'info',
-        'From which level on the nodes log.',
-    ),
+    'log_level': ('info', 'From which level on the nodes log.'),
     'rviz': ('false', 'Show the map in RViz: true or false.'),
     'rviz_config': (['launch_configs', 'segfloor.rviz'], 'Layout of RViz.'),
 }
@@ -157,10 +154,7 @@ def generate_launch_description() -> LaunchDescription:
 def declare(name: str, default: str | list[str], description: str) -> DeclareLaunchArgument:
     """Return an argument."""
     return DeclareLaunchArgument(
-        name,
-        default_value=in_package(default),
-        description=description,
-        choices=CHOICES.get(name),
+        name, default_value=in_package(default), description=description, choices=CHOICES.get(name)
     )
 
 

@@ -17,12 +17,7 @@ from segfloor_ros.cli import terminal as options
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import announcing, console, figure_table
 from segfloor_ros.configuration import resolve
-from tools.disparity_choices import (
-    DisparityScore,
-    choices,
-    read_pairs,
-    score,
-)
+from tools.disparity_choices import DisparityScore, choices, read_pairs, score
 from tools.floor_masks import (
     SCENES,
     SceneScore,

@@ -139,12 +139,7 @@ def make_aisles(seed: int) -> Scene:
         for x in (1.0, 3.5, 6.0)
     ]
     top = count * pitch
-    outline = [
-        [-margin, -pitch],
-        [length + margin, -pitch],
-        [length + margin, top],
-        [-margin, top],
-    ]
+    outline = [[-margin, -pitch], [length + margin, -pitch], [length + margin, top], [-margin, top]]
     walls = [{'points': outline, 'closed': True, 'texture': 'concrete'}]
     way = []
     for k in range(count):

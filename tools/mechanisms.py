@@ -85,10 +85,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(
-        {
-            'slam.tracking.pose.differ': lambda a, b: False,
-            'slam.tracking.pose.KNOWN_NOISE': 1e9,
-        }
+        {'slam.tracking.pose.differ': lambda a, b: False, 'slam.tracking.pose.KNOWN_NOISE': 1e9}
     ),
     'motion so far': Mechanism({'slam.tracking.front_end.FrontEnd._carry_on': lambda *a: a[-1]}),
     'images weighed against wheels': Mechanism(
@@ -165,7 +162,5 @@ GRID: dict[str, Mechanism] = {
 }
 """What makes the map of masks, scans and points."""
 
-RECORDED: dict[str, Mechanism] = {
-    'deblocking': SLAM['deblocking'],
-}
+RECORDED: dict[str, Mechanism] = {'deblocking': SLAM['deblocking']}
 """What changes the images or the mount, and so SLAM as well."""

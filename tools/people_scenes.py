@@ -187,10 +187,7 @@ def _scene(rng: np.random.Generator, seed: int, way: Points) -> Scene:
     return {
         'seed': seed,
         'floor': {'texture': str(rng.choice(FLOORS))},
-        'camera': {
-            'height_m': _between(rng, 0.22, 0.45),
-            'pitch_deg': float(rng.integers(3, 10)),
-        },
+        'camera': {'height_m': _between(rng, 0.22, 0.45), 'pitch_deg': float(rng.integers(3, 10))},
         'path': {'waypoints': way, 'speed_m_s': SPEED_M_S},
     }
 
@@ -211,11 +208,7 @@ def _person(rng: np.random.Generator, points: Points, speed_m_s: float, start_s:
 
 
 def _wandering(
-    scene: Scene,
-    drive: Drive,
-    rng: np.random.Generator,
-    start_s: float = 0.0,
-    returns: bool = True,
+    scene: Scene, drive: Drive, rng: np.random.Generator, start_s: float = 0.0, returns: bool = True
 ) -> Scene:
     """Return someone who walks between places of the room and keeps away from the robot."""
     (left, low), (right, high) = _bounds(scene)

@@ -195,12 +195,7 @@ def _in_a_copy(work: Callable[[], tuple[float, float]]) -> tuple[float, float]:
 
 
 def _recover(
-    slam: StereoSlam,
-    frames: list[StereoFrame],
-    times: Array,
-    truth: Array,
-    cut: int,
-    cut_s: float,
+    slam: StereoSlam, frames: list[StereoFrame], times: Array, truth: Array, cut: int, cut_s: float
 ) -> tuple[float, float]:
     """Return how long it took to be tracked after a cut (s), and how far off it was then (m)."""
     assert slam.mount is not None

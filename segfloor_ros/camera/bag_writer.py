@@ -105,10 +105,7 @@ class BagWriter:
     """
 
     def __init__(
-        self,
-        out: Path,
-        calibration: StereoCalibration,
-        coding: ImageCoding = ImageCoding.raw,
+        self, out: Path, calibration: StereoCalibration, coding: ImageCoding = ImageCoding.raw
     ) -> None:
         self._out = out
         self._calibration = calibration
@@ -170,12 +167,7 @@ class BagWriter:
             self._write_image('right', pair.stamp_ns, FRAME_IDS[1], right, pair.right)
 
     def _write_image(
-        self,
-        side: str,
-        stamp_ns: int,
-        frame_id: str,
-        eye: EyeCalibration,
-        image: NDArray[np.uint8],
+        self, side: str, stamp_ns: int, frame_id: str, eye: EyeCalibration, image: NDArray[np.uint8]
     ) -> None:
         info = self._info_message(self.messages.header(stamp_ns, frame_id), eye)
         self.write_message(f'/{side}/camera_info', CAMERA_INFO, stamp_ns, info)

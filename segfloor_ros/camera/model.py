@@ -159,9 +159,7 @@ class StereoCameraSettings(StageSettings):
     frames: int = setting(0, 'Frames that are read; 0: to the end.', within=(0, 10**9))
     every: int = setting(1, 'Read every n-th frame only.', within=(1, 10**6))
     rate_hz: float = setting(
-        0.0,
-        'Frame rate of a recording without time stamps; 0 takes 10 Hz.',
-        within=(0.0, 1000.0),
+        0.0, 'Frame rate of a recording without time stamps; 0 takes 10 Hz.', within=(0.0, 1000.0)
     )
     pairing_tolerance_s: float = setting(
         0.01,

@@ -177,8 +177,7 @@ def simulate(
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
     ] = False,
     supersampling: Annotated[
-        int,
-        typer.Option(callback=within(1, 4), help='Render so many times finer than the image.'),
+        int, typer.Option(callback=within(1, 4), help='Render so many times finer than the image.')
     ] = 1,
 ) -> None:
     """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
@@ -277,8 +276,7 @@ def benchmark(
         int, typer.Option(callback=within(0), help='Of the generated data.')
     ] = DEFAULT.seed,
     threads: Annotated[
-        int,
-        typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.'),
+        int, typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.')
     ] = DEFAULT.threads,
     nodes: Annotated[
         str | None,
@@ -289,12 +287,10 @@ def benchmark(
         ),
     ] = None,
     rate: Annotated[
-        float,
-        typer.Option(callback=within(0.01), help='Speed of --nodes against real time.'),
+        float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
     ] = 1.0,
     json_file: Annotated[
-        Path | None,
-        typer.Option('--json', help='Write all figures of the stages to this file.'),
+        Path | None, typer.Option('--json', help='Write all figures of the stages to this file.')
     ] = None,
     params: terminal.Params = None,
     assignments: terminal.Set = None,

@@ -66,8 +66,7 @@ def evaluate_map(
         ),
     ] = 0,
     min_distance: Annotated[
-        float,
-        typer.Option(callback=within(0.0), help='Between nodes of a road map [m].'),
+        float, typer.Option(callback=within(0.0), help='Between nodes of a road map [m].')
     ] = 0.25,
     repetitions: Annotated[
         int, typer.Option(callback=within(1), help='Road maps to average.')
@@ -80,8 +79,7 @@ def evaluate_map(
     fov: Annotated[
         float | None,
         typer.Option(
-            callback=within(1.0, 360.0),
-            help='Horizontal field of view [deg]; else from the scene.',
+            callback=within(1.0, 360.0), help='Horizontal field of view [deg]; else from the scene.'
         ),
     ] = None,
     as_json: JsonOption = False,

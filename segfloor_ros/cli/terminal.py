@@ -176,8 +176,7 @@ Frames = Annotated[int | None, typer.Option('--frames', help='How many frames ar
 Every = Annotated[int | None, typer.Option('--every', help='Read every n-th frame only.')]
 Out = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
 Params = Annotated[
-    Path | None,
-    typer.Option('--params', help='ROS parameter file (YAML) for all stages.'),
+    Path | None, typer.Option('--params', help='ROS parameter file (YAML) for all stages.')
 ]
 Set = Annotated[
     list[str] | None,
@@ -202,17 +201,13 @@ SaveMap = Annotated[
     Path | None,
     typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
 ]
-LoadMap = Annotated[
-    Path | None,
-    typer.Option('--load-map', help='Saved map to go on mapping in.'),
-]
+LoadMap = Annotated[Path | None, typer.Option('--load-map', help='Saved map to go on mapping in.')]
 Localize = Annotated[
     bool,
     typer.Option('--localize', help='Poses in the map of --load-map only; nothing is added to it.'),
 ]
 Report = Annotated[
-    bool,
-    typer.Option('--report', help='Write report.html: everything about the run on one page.'),
+    bool, typer.Option('--report', help='Write report.html: everything about the run on one page.')
 ]
 
 

@@ -26,16 +26,7 @@ from segfloor_ros.grid.fan import (
 )
 from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 from segfloor_ros.grid.map_file import OccupancyGridSettings
-from segfloor_ros.grid.raster import (
-    HIT,
-    LEAST,
-    MISS,
-    MOST,
-    OCCUPIED_FROM,
-    SURE,
-    ZERO,
-    steps,
-)
+from segfloor_ros.grid.raster import HIT, LEAST, MISS, MOST, OCCUPIED_FROM, SURE, ZERO, steps
 
 _AROUND = np.ones((3, 3), np.uint8)
 

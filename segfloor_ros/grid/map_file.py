@@ -160,11 +160,7 @@ class OccupancyGrid:
 class OccupancyGridSettings(StageSettings):
     """Cells, ranges and evidence of the map."""
 
-    resolution_m: float = setting(
-        0.05,
-        'Side of a cell.',
-        within=(0.01, 0.2),
-    )
+    resolution_m: float = setting(0.05, 'Side of a cell.', within=(0.01, 0.2))
     max_range_m: float = setting(
         0.0,
         'Longest ray that marks free cells; 0 is as far as the camera can tell where floor ends.',

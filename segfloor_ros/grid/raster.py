@@ -176,7 +176,4 @@ class LogOddsRaster:
         self.first_cell, self.cells = (new_first[0], new_first[1]), cells
 
     def _end(self) -> tuple[int, int]:
-        return (
-            self.first_cell[0] + self.cells.shape[0],
-            self.first_cell[1] + self.cells.shape[1],
-        )
+        return (self.first_cell[0] + self.cells.shape[0], self.first_cell[1] + self.cells.shape[1])

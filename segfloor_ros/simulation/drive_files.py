@@ -63,10 +63,7 @@ def record(
 
 
 def _record_into(
-    folder: Path,
-    simulation: Simulation,
-    options: RecordingOptions,
-    on_frame: Callable[[int], None],
+    folder: Path, simulation: Simulation, options: RecordingOptions, on_frame: Callable[[int], None]
 ) -> None:
     write_truth(folder, simulation)
     _write_calibration(folder, simulation)

@@ -62,8 +62,7 @@ def ros1_bag(path: Path, messages: Sequence[Message]) -> Path:
 
 
 @pytest.mark.parametrize(
-    'write',
-    [mcap_folder, mcap_file, mcap_without_metadata, sqlite_folder, sqlite_file, ros1_bag],
+    'write', [mcap_folder, mcap_file, mcap_without_metadata, sqlite_folder, sqlite_file, ros1_bag]
 )
 def test_bags_of_all_formats_give_rectified_pairs(
     tmp_path: Path, write: Callable[[Path, Sequence[Message]], Path]

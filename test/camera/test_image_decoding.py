@@ -34,8 +34,7 @@ def test_grey_rows_end_where_the_padding_begins(encoding: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ('big_endian', 'data'),
-    [(False, [0x02, 0x01, 0x04, 0x03]), (True, [0x01, 0x02, 0x03, 0x04])],
+    ('big_endian', 'data'), [(False, [0x02, 0x01, 0x04, 0x03]), (True, [0x01, 0x02, 0x03, 0x04])]
 )
 @pytest.mark.parametrize('encoding', ['mono16', '16UC1'])
 def test_sixteen_bits_in_both_orders(encoding: str, big_endian: bool, data: list[int]) -> None:

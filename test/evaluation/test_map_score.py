@@ -161,14 +161,7 @@ def test_estimate_turned_by_a_quarter_lands_where_it_belongs():
 
 def test_only_what_is_in_sight_counts():
     truth = grid_of(
-        [
-            '#########',
-            '#.......#',
-            '#...#...#',
-            '#...#...#',
-            '#...#...#',
-            '#########',
-        ],
+        ['#########', '#.......#', '#...#...#', '#...#...#', '#...#...#', '#########'],
         resolution_m=1.0,
     )
     # Low on the left, looking along +x with a narrow view: three cells, then the inner wall.

@@ -80,10 +80,7 @@ class Drive:
         )
 
     def look(
-        self,
-        world: World,
-        pose: tuple[float, float, float],
-        points: LabelledPoints | None = None,
+        self, world: World, pose: tuple[float, float, float], points: LabelledPoints | None = None
     ) -> None:
         """Take one keyframe from a pose; every point of `points` is seen."""
         self.poses.append(pose)

@@ -18,12 +18,7 @@ from segfloor_ros.messages import images, poses
 from segfloor_ros.messages import images as floor
 from segfloor_ros.messages import maps as clouds
 from segfloor_ros.messages import maps as map_files
-from segfloor_ros.messages.diagnostics import (
-    Level,
-    Status,
-    status_message,
-    statuses,
-)
+from segfloor_ros.messages.diagnostics import Level, Status, status_message, statuses
 from segfloor_ros.messages.images import camera_info_message, rectified_calibration
 from segfloor_ros.messages.maps import map_start_message, map_start_ns
 from segfloor_ros.messages.topics import to_ns, to_time

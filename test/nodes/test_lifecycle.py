@@ -7,15 +7,7 @@ import pytest
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from node_makers import MAKERS
-from node_messages import (
-    FEATURES,
-    MASK,
-    POINTS,
-    STAMP_NS,
-    cloud_messages,
-    grid_messages,
-    publish,
-)
+from node_messages import FEATURES, MASK, POINTS, STAMP_NS, cloud_messages, grid_messages, publish
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive, write_kitti
 

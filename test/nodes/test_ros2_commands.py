@@ -7,12 +7,7 @@ from __future__ import annotations
 import pytest
 import yaml
 from lifecycle_msgs.msg import State, Transition, TransitionEvent
-from lifecycle_msgs.srv import (
-    ChangeState,
-    GetAvailableStates,
-    GetAvailableTransitions,
-    GetState,
-)
+from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
 from node_makers import MAKERS
 from node_messages import STAMP_NS, grid_messages, publish
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue

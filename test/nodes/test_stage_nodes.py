@@ -39,16 +39,8 @@ from segfloor_ros.messages.images import (
     image_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.maps import (
-    labelled_arrays,
-    sparse_cloud_arrays,
-)
-from segfloor_ros.messages.poses import (
-    path_arrays,
-    pose_array,
-    transform_array,
-    transform_message,
-)
+from segfloor_ros.messages.maps import labelled_arrays, sparse_cloud_arrays
+from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array, transform_message
 from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode

@@ -88,10 +88,7 @@ def joined_hosts(start):
 
 @pytest.mark.parametrize(
     ('on_robot', 'parameters'),
-    [
-        ((CAMERA, SLAM, FLOOR), {}),
-        ((CAMERA,), {'image_transport': 'compressed'}),
-    ],
+    [((CAMERA, SLAM, FLOOR), {}), ((CAMERA,), {'image_transport': 'compressed'})],
     ids=['keyframes-between', 'compressed-images-between'],
 )
 def test_the_map_of_two_hosts_is_that_of_one(

@@ -163,11 +163,7 @@ def test_pixels_at_edges_fly_between_both_sides():
 TURN = {
     'description': 'a turn on the spot between brick walls',
     'walls': [
-        {
-            'points': [[-2, -2], [2, -2], [2, 2], [-2, 2]],
-            'closed': True,
-            'texture': 'bricks',
-        }
+        {'points': [[-2, -2], [2, -2], [2, 2], [-2, 2]], 'closed': True, 'texture': 'bricks'}
     ],
     'camera': {'width': WIDTH, 'height': HEIGHT, 'rate_hz': 20, 'noise_sigma': 0.0},
     'sensors': {'depth': {'max_m': 9.0, 'noise_px': 1e-4, 'hole_share': 0.0}},

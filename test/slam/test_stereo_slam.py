@@ -126,8 +126,7 @@ def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames
     )
     moved = replace(adjustment, problem=moved)
     slam.back_end._local.submit(
-        partial(slam.back_end.mapper.solve, moved),
-        partial(slam.back_end.mapper.apply, moved),
+        partial(slam.back_end.mapper.solve, moved), partial(slam.back_end.mapper.apply, moved)
     )
     old = last.T_camera_world
     same_view = replace(frames[11], left=frames[11].left ^ 1, index=12, stamp_ns=12 * 100_000_000)

@@ -14,19 +14,8 @@ from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
 from tools.benchmark_floor import benchmark_floor, disparity_table, steps_table
-from tools.disparity_choices import (
-    TruePair,
-    choices,
-    read_pairs,
-    score,
-    visible,
-)
-from tools.floor_steps import (
-    WHOLE,
-    WITHOUT_DISPARITY,
-    generated_keyframes,
-    time_steps,
-)
+from tools.disparity_choices import TruePair, choices, read_pairs, score, visible
+from tools.floor_steps import WHOLE, WITHOUT_DISPARITY, generated_keyframes, time_steps
 
 SHIFT_PX = 16
 
@@ -69,9 +58,7 @@ def test_pixels_that_the_right_camera_does_not_see():
     # Something near (2 px) hides two columns of what is far (1 px) from the right camera.
     left = np.array([[1, 1, 1, 1, 2, 2, 1, 0]], np.float32)
     right = np.array([[1, 1, 2, 2, 0, 1, 1, 1]], np.float32)
-    assert visible(left, right).tolist() == [
-        [False, True, True, True, True, True, True, False],
-    ]
+    assert visible(left, right).tolist() == [[False, True, True, True, True, True, True, False]]
     right[0, 2:4] = 3.5  # too far from 1 and from 2
     assert visible(left, right)[0, 3:6].tolist() == [False, False, False]
 

@@ -114,24 +114,14 @@ def spline_basis(positions: NDArray[np.floating]) -> Array:
     segment = np.minimum(x.astype(np.intp), SEGMENTS - 1)
     t = x - segment
     weights = np.stack(
-        [
-            (1 - t) ** 3,
-            3 * t**3 - 6 * t**2 + 4,
-            -3 * t**3 + 3 * t**2 + 3 * t + 1,
-            t**3,
-        ],
-        axis=1,
+        [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1
     )
     basis = np.zeros((len(x), _CONTROLS))
     basis[np.arange(len(x))[:, None], segment[:, None] + np.arange(4)] = weights / 6
     return basis
 
 
-def fit_profile(
-    v_disparity: VDisparity,
-    line: FloorLine,
-    camera: StereoCamera,
-) -> FloorProfile:
+def fit_profile(v_disparity: VDisparity, line: FloorLine, camera: StereoCamera) -> FloorProfile:
     """Fit the spline to a filtered v-disparity by iteratively reweighted least squares.
 
     Tukey's biweight; first as a line, then as a spline that grows along a floor that bends.
@@ -182,10 +172,7 @@ def _prior_information(prior: Array, line: FloorLine, camera: StereoCamera) -> A
     jacobian[0, ends[0]] = 1.0
     jacobian[1, ends] = (-1.0, 1.0)
     sigma = np.array(
-        [
-            line.slope * camera.fy * PITCH_SIGMA_RAD,
-            HEIGHT_SIGMA * float(prior[-1] - prior[0]),
-        ]
+        [line.slope * camera.fy * PITCH_SIGMA_RAD, HEIGHT_SIGMA * float(prior[-1] - prior[0])]
     )
     scaled = jacobian / sigma[:, None]
     return scaled.T @ scaled

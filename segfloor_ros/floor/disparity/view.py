@@ -178,9 +178,7 @@ def obstacle_rows(
 
 
 def v_disparity(
-    rows: NDArray[np.intp],
-    bins: NDArray[np.intp],
-    shape: tuple[int, int],
+    rows: NDArray[np.intp], bins: NDArray[np.intp], shape: tuple[int, int]
 ) -> NDArray[np.intp]:
     """Return how often each disparity bin occurs per row, `shape` = (rows, bins).
 

@@ -89,8 +89,7 @@ def fill_regions(
     top = _top_of_supported(region, count, floor)
     highest = -cv2.dilate(-top[region].astype(np.float32), np.ones((3, 3), np.uint8))
     not_blank = cv2.erode(
-        textured[part].astype(np.uint8),
-        np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8),
+        textured[part].astype(np.uint8), np.ones((_TEXTURE_MARGIN, _TEXTURE_MARGIN), np.uint8)
     )
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
@@ -186,10 +185,7 @@ def _enlarged(picture: NDArray[np.bool_], mask: NDArray[np.uint8]) -> NDArray[np
 
 
 def fill_gaps(
-    view: FloorView,
-    profile: FloorProfile,
-    mask: NDArray[np.uint8],
-    consistent: NDArray[np.bool_],
+    view: FloorView, profile: FloorProfile, mask: NDArray[np.uint8], consistent: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor along rows, between two floor pixels that
     are near enough to each other, where the images do not contradict the floor (`consistent`).
@@ -293,10 +289,7 @@ def _upright_above(
 
 
 def blank_feet(
-    view: FloorView,
-    mask: NDArray[np.uint8],
-    slope: NDArray[np.int16],
-    textured: NDArray[np.bool_],
+    view: FloorView, mask: NDArray[np.uint8], slope: NDArray[np.int16], textured: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Return rows and columns (N,) of the view where blank faces stand on the floor of a mask
     (R, W). slope: `row_slope` of the image (R, W).

@@ -11,11 +11,7 @@ from segfloor_ros.camera.model import ImuSample
 from segfloor_ros.geometry import invert, make_transform
 from segfloor_ros.slam.results import SAME
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
-from segfloor_ros.slam.tracking.motion import (
-    CameraMotion,
-    TrackingState,
-    sigma_m,
-)
+from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 
 SEEN_S = 8.0
 """So long the images show the pose; then they fail."""
