@@ -168,14 +168,6 @@ def blank_border(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     return np.asarray(whole, np.uint8)
 
 
-def matched_in(region: NDArray[np.uint8], disparity_px: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell which pixels of the left image (H, W) are matched with a region (H, W) of the right."""
-    rows, columns = np.indices(disparity_px.shape, np.float32)
-    at = columns - disparity_px
-    hit = cv2.remap(region, at, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(hit > 0)
-
-
 def stamp_ns(message: Any) -> int:
     """Return the stamp in a message's header in ns."""
     stamp = message.header.stamp

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.depth import is_disparity
-from segfloor_ros.camera.images import blank_border, matched_in
+from segfloor_ros.camera.images import blank_border
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
@@ -126,7 +125,6 @@ class FloorSegmentation:
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
             moving = union(moving, blank_border(left))
-            right_border = None if is_disparity(right) else blank_border(right)
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
@@ -138,7 +136,8 @@ class FloorSegmentation:
                 texture = np.where(measured[columns] > 0, plain, np.float32(0))
         with measure(DISPARITY):
             disparity = self._disparity(first_row, left, right) if measured is None else measured
-            drop_hidden(disparity, moving, right_border)
+            if moving is not None:
+                disparity[moving > 0] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
@@ -322,18 +321,6 @@ def _feet(
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:
     pitch, roll, height = (float(value) for value in angles_height)
     return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
-
-
-def drop_hidden(
-    disparity: NDArray[np.float32],
-    hidden: NDArray[np.uint8] | None,
-    hidden_right: NDArray[np.uint8] | None,
-) -> None:
-    """Set disparities (H, W) to 0 where either image shows nothing that counts."""
-    if hidden is not None:
-        disparity[hidden > 0] = 0
-    if hidden_right is not None:
-        disparity[matched_in(hidden_right, disparity)] = 0
 
 
 def clear_hidden(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segfloor_ros.camera.images import blank_border, matched_in
+from segfloor_ros.camera.images import blank_border
 
 
 def bordered(seed=0):
@@ -29,10 +29,3 @@ def test_images_without_a_border_have_none():
     image = np.maximum(image, 1)
     image[::9, 0] = 0
     assert blank_border(image) is None
-
-
-def test_pixels_that_are_matched_with_the_border_are_told():
-    region = np.zeros((4, 40), np.uint8)
-    region[:, 10:20] = 255
-    disparity = np.full((4, 40), 8.0, np.float32)
-    assert np.flatnonzero(matched_in(region, disparity)[2]).tolist() == list(range(18, 28))
