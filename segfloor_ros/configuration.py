@@ -18,11 +18,11 @@ from typing import Any
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.cloud.labelled_cloud import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError
-from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
+from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.settings import GONE, RobotSettings, StageSettings, setting, suggestion
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import StereoSlamSettings
 
 MAX_KEYFRAMES_UNDER_WAY = 4
 """Keyframes that may be between SLAM and the grid while the next frame is taken."""

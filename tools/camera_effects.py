@@ -15,7 +15,7 @@ import typer
 
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import announcing, console, figure_table
-from segfloor_ros.files.yaml_files import read_yaml
+from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.simulation.drive_files import RecordingOptions, render_once
 from segfloor_ros.simulation.scene_file import open_scene, shipped
 from segfloor_ros.suite.job import ProgramError, run_segfloor

@@ -147,7 +147,9 @@ FLOOR: dict[str, Mechanism] = {
 GRID: dict[str, Mechanism] = {
     'ray limit Q3 + 1.5 IQR': Mechanism({'grid.keyframe_evidence.ray_length_limit': lambda _: 1e9}),
     'rays shortened': Mechanism({'grid.keyframe_evidence._certain': _first}),
-    'partly free edges': Mechanism({'grid.fan.Fan.edges': lambda self: _nowhere(self.lengths)}),
+    'partly free edges': Mechanism(
+        {'grid.keyframe_evidence.Fan.edges': lambda self: _nowhere(self.lengths)}
+    ),
     'evidence ends where it is sure': Mechanism({'grid.fold.MOST': 2.8}),
     'dilation of hits': Mechanism({'grid.fold._AROUND': np.ones((1, 1), np.uint8)}),
     'slant': Mechanism({'grid.keyframe_evidence.slant': lambda range_m, _: np.ones(len(range_m))}),
@@ -158,7 +160,7 @@ GRID: dict[str, Mechanism] = {
             )
         }
     ),
-    'shadows of what stands': Mechanism({'grid.fan.Fan.shadow': _none}),
+    'shadows of what stands': Mechanism({'grid.keyframe_evidence.Fan.shadow': _none}),
 }
 """What makes the map of masks, scans and points."""
 

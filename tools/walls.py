@@ -28,9 +28,8 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
 from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
-from segfloor_ros.grid.map_file import FREE, OccupancyGrid
+from segfloor_ros.grid.map_file import FREE, OccupancyGrid, render
 from segfloor_ros.grid.mapper import EvidenceHistory
-from segfloor_ros.grid.raster import render
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import KeyframeFeatures

@@ -198,7 +198,7 @@ def _pose(values: Any) -> Pose2d | None:
 def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline | None) -> None:
     """Print the table and what fails, and write the files of the suite."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.suite.page import junit, page
+    from segfloor_ros.suite.result_files import junit, page
 
     console.print(_table(result, described))
     for checked in result.recordings:

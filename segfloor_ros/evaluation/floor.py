@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import check_same_size, read_mask
-from segfloor_ros.files.yaml_files import read_yaml
+from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 OUTLINES = ('floor', 'obstacle', 'unsure')

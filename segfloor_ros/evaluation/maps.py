@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.whole import read_table
-from segfloor_ros.files.yaml_files import read_yaml
+from segfloor_ros.files.whole import read_table, read_yaml
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import (
     FREE,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
-from segfloor_ros.camera.depth import shrunk
+from segfloor_ros.camera.images import shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     COARSE_BLOCK_PX,

@@ -16,17 +16,26 @@ from numpy.typing import NDArray
 
 from segfloor_ros.floor.observation import CELL_M
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.fan import (
+from segfloor_ros.grid.keyframe_evidence import (
     SUBPIXEL_BITS,
     Fan,
+    KeyframeEvidence,
     find_jumps,
     fixed_point,
     nearest_cells,
     unit_vectors,
 )
-from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
-from segfloor_ros.grid.map_file import OccupancyGridSettings
-from segfloor_ros.grid.raster import HIT, LEAST, MISS, MOST, OCCUPIED_FROM, SURE, ZERO, steps
+from segfloor_ros.grid.map_file import (
+    HIT,
+    LEAST,
+    MISS,
+    MOST,
+    OCCUPIED_FROM,
+    SURE,
+    ZERO,
+    OccupancyGridSettings,
+    steps,
+)
 
 _AROUND = np.ones((3, 3), np.uint8)
 

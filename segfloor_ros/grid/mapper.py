@@ -22,8 +22,7 @@ from segfloor_ros.grid.keyframe_evidence import (
     evidence_to_arrays,
     gather_evidence,
 )
-from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings
-from segfloor_ros.grid.raster import LogOddsRaster, render
+from segfloor_ros.grid.map_file import LogOddsRaster, OccupancyGrid, OccupancyGridSettings, render
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5

@@ -20,8 +20,14 @@ from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
-from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
-from segfloor_ros.camera.images import EightBitScale, depth_image, eye_calibration, grey_image
+from segfloor_ros.camera.images import (
+    EightBitScale,
+    depth_calibration,
+    depth_image,
+    disparity_of_depth,
+    eye_calibration,
+    grey_image,
+)
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.rig_check import InputFault
 from segfloor_ros.configuration import StereoSlamNodeSettings

@@ -20,7 +20,7 @@ from rclpy.task import Future
 from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.camera.images import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.yaml_files import read_yaml, shortened, yaml_value
+from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
 from segfloor_ros.settings import suggestion

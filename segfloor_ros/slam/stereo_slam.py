@@ -31,9 +31,8 @@ from segfloor_ros.slam.results import (
     in_merged_map,
     take_snapshot,
 )
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import Rig, StereoSlamSettings
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState

@@ -10,8 +10,8 @@ from typing import Any
 
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.files.whole import Key, MarkedYaml, read_marked_yaml
 from segfloor_ros.files.whole import number as finite_number
-from segfloor_ros.files.yaml_files import Key, MarkedYaml, read_marked_yaml
 from segfloor_ros.settings import suggestion
 from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
 from segfloor_ros.suite.result_files import find_recordings, is_url

@@ -25,7 +25,7 @@ from camera_recordings import (
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
-from segfloor_ros.camera.depth import (
+from segfloor_ros.camera.images import (
     VIRTUAL_BASELINE_M,
     depth_calibration,
     disparity_at,

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.yaml_files import MAX_BYTES, read_marked_yaml, read_yaml, yaml_value
+from segfloor_ros.files.whole import MAX_YAML_BYTES, read_marked_yaml, read_yaml, yaml_value
 
 
 def read(tmp_path, text):
@@ -98,7 +98,7 @@ def test_what_a_file_costs_is_bounded(tmp_path):
             read(tmp_path, text)
     assert time.monotonic() - start_s < 10
     with pytest.raises(InputError, match=r'more than 0\.3 MB'):
-        read(tmp_path, 'a: ' + MAX_BYTES * 'x')
+        read(tmp_path, 'a: ' + MAX_YAML_BYTES * 'x')
     assert len(read(tmp_path, f'a: [{", ".join(["1"] * 20_000)}]')['a']) == 20_000
 
 

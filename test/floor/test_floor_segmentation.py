@@ -18,7 +18,7 @@ from floor_scenes import (
     wall,
 )
 
-from segfloor_ros.camera.depth import disparity_of_depth
+from segfloor_ros.camera.images import disparity_of_depth
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings

@@ -7,7 +7,7 @@ import pytest
 from costmap import Costmap
 from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_pose
 
-from segfloor_ros.camera.depth import shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.camera.images import shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.floor.observation import CELL_M, FloorScan, FloorSegmentationSettings, free_ranges
 from segfloor_ros.floor.segmentation import FloorSegmentation
 

@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 
 from segfloor_ros.grid.fold import draw_rays
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGridSettings
-from segfloor_ros.grid.raster import FREE_FROM, OCCUPIED_FROM, ZERO, LogOddsRaster, render, steps
+from segfloor_ros.grid.map_file import (
+    FREE,
+    FREE_FROM,
+    OCCUPIED,
+    OCCUPIED_FROM,
+    UNKNOWN,
+    ZERO,
+    LogOddsRaster,
+    OccupancyGridSettings,
+    render,
+    steps,
+)
 
 PATH = np.array([[0.05, 0.05]])
 

@@ -7,8 +7,7 @@ import pytest
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, LabelledPoints
 from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
-from segfloor_ros.grid.fan import slant
-from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence, gather_evidence
+from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence, gather_evidence, slant
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 

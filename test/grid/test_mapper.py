@@ -11,9 +11,14 @@ from conftest import Drive, World, cells_at, centres, no_points, path_of
 from segfloor_ros.errors import MapError
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid import mapper as history
-from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings
+from segfloor_ros.grid.map_file import (
+    ZERO,
+    LogOddsRaster,
+    OccupancyGrid,
+    OccupancyGridSettings,
+    render,
+)
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.grid.raster import ZERO, LogOddsRaster, render
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 
 MakeDrive = Callable[..., Drive]

@@ -14,8 +14,8 @@ from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.back_end import Submap
+from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, save_slam
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import HARDLY_BEGUN, StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -21,7 +21,7 @@ from segfloor_ros.suite.measures import (
     read_baseline,
     write_baseline,
 )
-from segfloor_ros.suite.page import junit, page
+from segfloor_ros.suite.result_files import junit, page
 
 GOOD = {'tracked_percent': 100.0, 'path_error_m': 0.012, 'recall_percent': 93.0}
 

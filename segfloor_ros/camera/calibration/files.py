@@ -14,8 +14,7 @@ import yaml
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
-from segfloor_ros.files.whole import number, read_lines
-from segfloor_ros.files.yaml_files import read_yaml
+from segfloor_ros.files.whole import number, read_lines, read_yaml
 from segfloor_ros.geometry import Array, invert
 
 FILE_NAMES = (

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import given_calibration, given_left_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.images import (
     Grey,
+    depth_calibration,
     depth_image,
+    disparity_of_depth,
     eye_calibration,
     grey_image,
     imu_sample,

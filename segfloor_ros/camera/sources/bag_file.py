@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources.files import SIDES, is_side, side_pairs
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.whole import check_file
-from segfloor_ros.files.yaml_files import read_yaml
+from segfloor_ros.files.whole import check_file, read_yaml
 
 BAG_SUFFIXES = {'.mcap', '.db3', '.bag'}
 REPAIRS = {'.mcap': 'mcap recover', '.bag': 'rosbag reindex'}

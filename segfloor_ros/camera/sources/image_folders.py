@@ -26,7 +26,7 @@ from segfloor_ros.camera.calibration.files import (
     read_kitti_eye,
 )
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.depth import depth_calibration, disparity_of_depth
+from segfloor_ros.camera.images import depth_calibration, disparity_of_depth
 from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCameraSettings
 from segfloor_ros.camera.sources import files
 from segfloor_ros.camera.sources.files import (

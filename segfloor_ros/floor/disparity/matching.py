@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.depth import is_disparity, seen_from_right
+from segfloor_ros.camera.images import is_disparity, seen_from_right
 from segfloor_ros.camera.model import Mount, StereoCamera
 
 SUBPIXEL = 16

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.depth import measured_sigma_px
+from segfloor_ros.camera.images import measured_sigma_px
 from segfloor_ros.floor.disparity.matching import MEAN_NOISE, NOISE_PX, SIGMAS, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.disparity.view import FloorView

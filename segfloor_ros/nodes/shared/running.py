@@ -36,7 +36,7 @@ from segfloor_ros.configuration import (
     is_node_parameter,
 )
 from segfloor_ros.errors import SegfloorError, SettingsError
-from segfloor_ros.files.yaml_files import yaml_value
+from segfloor_ros.files.whole import yaml_value
 from segfloor_ros.settings import SettingSpec, suggestion
 
 PROFILES = Path(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))

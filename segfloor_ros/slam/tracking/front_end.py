@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from segfloor_ros.camera.depth import is_disparity
+from segfloor_ros.camera.images import is_disparity
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import KeyframeRecord
@@ -27,8 +27,8 @@ from segfloor_ros.slam.results import (
     ObservedFeatures,
     Track,
 )
+from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
-from segfloor_ros.slam.settings import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.following import MIN_FOUND, Follower
 from segfloor_ros.slam.tracking.images import (

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.depth import disparity_at
+from segfloor_ros.camera.images import disparity_at
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import MAJORITY
 from segfloor_ros.slam.rig import Observations

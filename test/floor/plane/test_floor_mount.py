@@ -11,7 +11,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
 from segfloor_ros.floor.plane.plane import mean_climb
 from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import StereoSlamSettings
 
 
 def estimate(scene: Scene, **known) -> Mount | None:

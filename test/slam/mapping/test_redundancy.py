@@ -10,8 +10,7 @@ from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import redundant_share, retire_redundant
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import Rig, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 

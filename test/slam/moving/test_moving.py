@@ -9,7 +9,7 @@ from moving_drive import MovingDrive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import dilate, is_inside, union
 

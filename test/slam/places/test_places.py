@@ -14,7 +14,7 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.settings import StereoSlamSettings
+from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE = np.eye(4)
