@@ -22,7 +22,7 @@ from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.settings import GONE, RobotSettings, StageSettings, setting, suggestion
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 
 MAX_KEYFRAMES_UNDER_WAY = 4
 """Keyframes that may be between SLAM and the grid while the next frame is taken."""

@@ -29,8 +29,8 @@ from segfloor_ros.slam.results import (
     KeyframeFeatures,
     KeyframePath,
     SparseCloud,
+    StereoSlamSettings,
 )
-from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes

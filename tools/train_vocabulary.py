@@ -16,7 +16,7 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.slam.places import place_recognition as vocabulary
 from segfloor_ros.slam.places.place_recognition import BRANCHES, LEVELS
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.tracking.features import FeatureExtractor
 
 FRAMES_PER_RECORDING = 80

@@ -27,11 +27,12 @@ from segfloor_ros.slam.results import (
     HeldResults,
     Keyframe,
     LastPose,
+    StereoSlamSettings,
     Track,
     in_merged_map,
     take_snapshot,
 )
-from segfloor_ros.slam.rig import Rig, StereoSlamSettings
+from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images

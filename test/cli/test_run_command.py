@@ -13,7 +13,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 
 FRAMES = 16
 

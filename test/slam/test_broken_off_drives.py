@@ -14,7 +14,7 @@ from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.back_end import Submap
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import HARDLY_BEGUN, StereoSlam
 

@@ -9,8 +9,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.keyframe_mapping import find_duplicates
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.features import FeatureExtractor
 from segfloor_ros.slam.tracking.images import Images

@@ -8,7 +8,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.files.saved_map import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.rig import OffsetEstimate, StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 

@@ -5,7 +5,7 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.features import FeatureExtractor
 

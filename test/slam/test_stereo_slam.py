@@ -11,8 +11,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import invert, rotation_angle
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=800)

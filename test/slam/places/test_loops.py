@@ -12,7 +12,7 @@ from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import plan_closing
 from segfloor_ros.slam.places.loops import LoopChecks
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -13,8 +13,7 @@ from segfloor_ros.slam.places.known_views import (
     view_novelty,
     views_near,
 )
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import StereoSlamSettings
+from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE = np.eye(4)

@@ -11,8 +11,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.results import Track
-from segfloor_ros.slam.rig import Observations, StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings, Track
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.pose import PoseEstimate

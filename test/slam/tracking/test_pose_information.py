@@ -7,7 +7,8 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import WheelPose
-from segfloor_ros.slam.rig import Observations, StereoSlamSettings
+from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.patch_alignment import with_patch_noise
 from segfloor_ros.slam.tracking.pose import PoseEstimate, PoseInformation
