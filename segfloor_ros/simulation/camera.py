@@ -235,7 +235,11 @@ def _in_steps(picture: Picture, shot: Shot) -> NDArray[np.uint8]:
 
 def _mosaic(picture: NDArray[np.uint8], shot: Shot) -> NDArray[np.uint8]:
     """One colour per pixel, the others interpolated."""
-    return cv2.cvtColor(picture, cv2.COLOR_BayerBG2GRAY) if shot.rig.bayer else picture
+    if not shot.rig.bayer:
+        return picture
+    # In 16 bits: some versions of OpenCV round each pixel down.
+    fine = cv2.cvtColor(picture.astype(np.uint16) * 256, cv2.COLOR_BayerBG2GRAY)
+    return np.asarray(np.round(fine / 256), np.uint8)
 
 
 def _compressed(picture: NDArray[np.uint8], shot: Shot) -> NDArray[np.uint8]:

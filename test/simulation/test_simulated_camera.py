@@ -108,7 +108,7 @@ def test_a_darker_right_eye_swings_to_a_lighter_one():
 def test_a_mosaic_makes_noise_of_neighbours_alike():
     grainy = image(flat(120), noise_sigma=4.0)
     mixed = image(flat(120), noise_sigma=4.0, bayer=True)
-    assert mixed.mean() == pytest.approx(120, abs=1.0)  # OpenCV 4.6 rounds down
+    assert mixed.mean() == pytest.approx(120, abs=0.3)
     alike = [np.corrcoef(a[:, :-1].ravel(), a[:, 1:].ravel())[0, 1] for a in (grainy, mixed)]
     assert abs(alike[0]) < 0.03
     assert alike[1] > 0.3
