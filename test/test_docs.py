@@ -17,6 +17,7 @@ from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped
 from segfloor_ros.simulation.textures import GENERATORS
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
+PAGES = [DOCS.parent / 'README.md', DOCS.parent / 'CONTRIBUTING.md', *sorted(DOCS.rglob('*.md'))]
 SIMULATION = (DOCS / 'simulation.md').read_text()
 
 
@@ -75,8 +76,7 @@ def test_the_scene_of_the_page_can_be_opened() -> None:
     assert scene.boxes[0].size == (0.6, 0.4, 0.3)
 
 
-@pytest.mark.parametrize('page', [DOCS.parent / 'README.md', *sorted(DOCS.glob('*.md'))],
-                         ids=lambda path: path.name)  # fmt: skip
+@pytest.mark.parametrize('page', PAGES, ids=lambda path: str(path.relative_to(DOCS.parent)))
 def test_what_a_page_links_to_is_there(page) -> None:
     links = re.findall(r'\]\((?!https?:|#)([^)#]+)', page.read_text())
     assert [link for link in links if not (page.parent / link).exists()] == []
