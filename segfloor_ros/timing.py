@@ -23,14 +23,6 @@ MAX_SAMPLES = 200
 
 _PROC = Path('/proc')
 
-SEED = 20220101
-SIZE = (480, 640)
-SHIFT_PX = 24
-FEATURES = 2000
-DISPARITIES = 64
-BLOCK_PX = 5
-REPETITIONS = 5
-
 
 class StageTimes:
     """Collects durations by name; one instance is shared by the stages of a run. clock: in
@@ -131,20 +123,30 @@ class MemoryLog:
 class ReferenceWorkload:
     """ORB features and semi-global matching on a generated 640x480 pair; never change it."""
 
+    seed = 20220101
+    rows = 480
+    columns = 640
+    shift_px = 24
+    features = 2000
+    disparities = 64
+    block_px = 5
+    repetitions = 5
+
     def __init__(self) -> None:
-        rng = np.random.default_rng(SEED)
-        wide = cv2.GaussianBlur(rng.normal(size=(SIZE[0], SIZE[1] + SHIFT_PX)), (0, 0), 2.0)
+        rng = np.random.default_rng(self.seed)
+        noise = rng.normal(size=(self.rows, self.columns + self.shift_px))
+        wide = cv2.GaussianBlur(noise, (0, 0), 2.0)
         grey = np.clip(128 + 40 * wide / wide.std(), 0, 255).astype(np.uint8)
-        # The scene is a plane: what the left image has at u the right one has at u - SHIFT_PX.
-        self.left = np.ascontiguousarray(grey[:, : SIZE[1]])
-        self.right = np.ascontiguousarray(grey[:, SHIFT_PX:])
-        self._orb = cv2.ORB_create(FEATURES)
+        # The scene is a plane: what the left image has at u the right one has at u - shift_px.
+        self.left = np.ascontiguousarray(grey[:, : self.columns])
+        self.right = np.ascontiguousarray(grey[:, self.shift_px :])
+        self._orb = cv2.ORB_create(self.features)
         self._matcher = cv2.StereoSGBM_create(
             0,
-            DISPARITIES,
-            BLOCK_PX,
-            P1=8 * BLOCK_PX**2,
-            P2=32 * BLOCK_PX**2,
+            self.disparities,
+            self.block_px,
+            P1=8 * self.block_px**2,
+            P2=32 * self.block_px**2,
             disp12MaxDiff=1,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
@@ -158,13 +160,13 @@ class ReferenceWorkload:
         """
         keypoints, _ = self._orb.detectAndCompute(self.left, None)
         disparity = self._matcher.compute(self.left, self.right)
-        return len(keypoints), float(np.median(disparity[:, DISPARITIES:])) / 16
+        return len(keypoints), float(np.median(disparity[:, self.disparities :])) / 16
 
     def time(self) -> None:
         """Time the work a few times; called before and after what is compared with it."""
         if not self._times_ms:
             self.run()  # The first run pays for memory and for tables.
-        for _ in range(REPETITIONS):
+        for _ in range(self.repetitions):
             start = time.perf_counter()
             self.run()
             self._times_ms.append(1e3 * (time.perf_counter() - start))

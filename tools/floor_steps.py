@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, STEP_M, CorridorImages
+from segfloor_ros.benchmark.corridor import CAMERA, DRIVE, MOUNT, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
@@ -55,7 +55,7 @@ def generated_drive(frames: int, seed: int) -> Iterator[FloorInput]:
     """Yield a drive through a corridor without SLAM: its poses are known."""
     for frame in CorridorImages(frames, seed).drive():
         T_map_base = np.eye(4)
-        T_map_base[0, 3] = frame.index * STEP_M
+        T_map_base[0, 3] = frame.index * DRIVE.step_m
         yield FloorInput(frame.left, frame.right, MOUNT, T_map_base)
 
 

@@ -9,11 +9,11 @@ from std_srvs.srv import SetBool
 from segfloor_ros.cli.replay_nodes import NodeGraph
 from segfloor_ros.cli.replay_session import connected_nodes, cpu_s
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.messages.diagnostics import NEED_LASTS_S
+from segfloor_ros.messages.diagnostics import LASTS_S
 from segfloor_ros.messages.topics import CAMERA, GRID
 
 SETTLE_S = 3.0
-ALL_IDLE_S = 3 * NEED_LASTS_S + SETTLE_S
+ALL_IDLE_S = 3 * LASTS_S + SETTLE_S
 """One node after the other finds that nobody needs it."""
 
 PHASES = ('no images', 'camera stands', 'grid paused, nobody listens')

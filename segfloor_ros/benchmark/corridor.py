@@ -6,6 +6,7 @@ look the same everywhere.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,38 +18,47 @@ from segfloor_ros.geometry import Array, invert, make_transform, transform_point
 from segfloor_ros.pipeline import MapInput
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
-HALF_WIDTH_M = 1.5
-CEILING_M = 2.4
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 MOUNT = Mount(height_m=0.3, pitch_rad=0.12)
 
-STRIDE_M = 0.25
-"""Between two keyframes."""
-POINTS_PER_M = 400
-"""A hundred new points per keyframe, as in drives through rendered halls."""
-SIGHT_M = 6.0
-POINT_NOISE_M = 0.01
-SCAN_STEP_RAD = 0.01
-SCAN_RANGE_MAX_M = 8.0
-CORRECTION_EVERY = 100
-CORRECTION_RAD = 0.002
-"""Every so many keyframes the whole map turns by so much, as after the closing of a loop."""
-STEP_M = 0.05
 
-FRAME_PERIOD_NS = 100_000_000
+@dataclass(frozen=True)
+class CorridorDrive:
+    """A corridor, what is seen of it, and the drive along it.
 
-KEYFRAME_PERIOD_NS = round(STRIDE_M / STEP_M) * FRAME_PERIOD_NS
+    stride_m: between two keyframes. points_per_m: a hundred new points per keyframe, as in drives
+    through rendered halls. correction_every, correction_rad: every so many keyframes the whole map
+    turns by so much, as after the closing of a loop. spare_m: from the last frame to the end wall,
+    and from the wall behind to the first one. grey, contrast, noise_grey: of the images, mean and
+    standard deviations.
+    """
 
-SPARE_M = 5.0
-"""From the last frame to the end wall, and from the wall behind to the first one."""
+    half_width_m: float = 1.5
+    ceiling_m: float = 2.4
+    sight_m: float = 6.0
+    spare_m: float = 5.0
+    points_per_m: int = 400
+    point_noise_m: float = 0.01
+    scan_step_rad: float = 0.01
+    scan_range_max_m: float = 8.0
+    stride_m: float = 0.25
+    step_m: float = 0.05
+    frame_period_ns: int = 100_000_000
+    correction_every: int = 100
+    correction_rad: float = 0.002
+    texels_per_m: int = 100
+    texels: int = 1024
+    grey: float = 128.0
+    contrast: float = 30.0
+    noise_grey: float = 1.5
 
-TEXELS_PER_M = 100
+    @property
+    def keyframe_period_ns(self) -> int:
+        """Time between two keyframes."""
+        return round(self.stride_m / self.step_m) * self.frame_period_ns
 
-TEXELS = 1024
 
-GREY, CONTRAST, NOISE_GREY = 128.0, 30.0, 1.5
-
-FACES = 6
+DRIVE = CorridorDrive()
 
 
 class Corridor:
@@ -57,7 +67,7 @@ class Corridor:
     def __init__(self, keyframes: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.keyframes = keyframes
-        self._points = _points(keyframes * STRIDE_M + SIGHT_M, rng)
+        self._points = _points(keyframes * DRIVE.stride_m + DRIVE.sight_m, rng)
         # As they lie in the map before and after a correction: what is handed out takes no memory.
         self._xyz_map = [
             transform_points(turn, self._points).astype(np.float32) for turn in _corrections()
@@ -68,14 +78,14 @@ class Corridor:
 
     def drive(self) -> Iterator[MapInput]:
         """Yield the keyframes in order; the cloud and the path grow with each."""
-        stamp_ns = np.arange(1, self.keyframes + 1, dtype=np.int64) * KEYFRAME_PERIOD_NS
+        stamp_ns = np.arange(1, self.keyframes + 1, dtype=np.int64) * DRIVE.keyframe_period_ns
         T_world_base = np.tile(np.eye(4), (self.keyframes, 1, 1))
-        T_world_base[:, 0, 3] = np.arange(self.keyframes) * STRIDE_M
+        T_world_base[:, 0, 3] = np.arange(self.keyframes) * DRIVE.stride_m
         for index in range(self.keyframes):
-            turned = index // CORRECTION_EVERY % 2
+            turned = index // DRIVE.correction_every % 2
             path = _corrections()[turned] @ T_world_base[: index + 1]
-            x_m = index * STRIDE_M
-            known = int(np.searchsorted(self._points[:, 0], x_m + SIGHT_M))
+            x_m = index * DRIVE.stride_m
+            known = int(np.searchsorted(self._points[:, 0], x_m + DRIVE.sight_m))
             first = int(np.searchsorted(self._points[:, 0], x_m))
             xyz_map = self._xyz_map[turned][:known]
             yield MapInput(
@@ -102,16 +112,16 @@ class Corridor:
     def _scan(self) -> FloorScan:
         """Return how far the floor goes per bearing: to the walls, or as far as sight."""
         half = np.arctan(0.5 * CAMERA.width / CAMERA.fx)
-        bearings = np.arange(-half, half, SCAN_STEP_RAD)
-        wall_m = HALF_WIDTH_M / np.maximum(np.abs(np.sin(bearings)), 1e-6)
-        wall_m += self._scan_rng.normal(scale=POINT_NOISE_M, size=len(bearings))
-        in_sight = wall_m < SIGHT_M
+        bearings = np.arange(-half, half, DRIVE.scan_step_rad)
+        wall_m = DRIVE.half_width_m / np.maximum(np.abs(np.sin(bearings)), 1e-6)
+        wall_m += self._scan_rng.normal(scale=DRIVE.point_noise_m, size=len(bearings))
+        in_sight = wall_m < DRIVE.sight_m
         return FloorScan(
             float(bearings[0]),
-            SCAN_STEP_RAD,
-            np.minimum(wall_m, SIGHT_M).astype(np.float32),
+            DRIVE.scan_step_rad,
+            np.minimum(wall_m, DRIVE.sight_m).astype(np.float32),
             np.where(in_sight, wall_m, np.nan).astype(np.float32),
-            SCAN_RANGE_MAX_M,
+            DRIVE.scan_range_max_m,
         )
 
 
@@ -122,26 +132,26 @@ def floor_mask() -> NDArray[np.uint8]:
     directions = rays @ MOUNT.T_base_left[:3, :3].T
     down = np.maximum(-directions[:, 2], 1e-9)
     forward_m, left_m = (directions[:, :2] * (MOUNT.height_m / down)[:, None]).T
-    mask = np.where(np.abs(left_m) < HALF_WIDTH_M, FLOOR, NOT_FLOOR).astype(np.uint8)
-    mask[(forward_m > SIGHT_M) & (mask == FLOOR)] = NO_EVIDENCE
+    mask = np.where(np.abs(left_m) < DRIVE.half_width_m, FLOOR, NOT_FLOOR).astype(np.uint8)
+    mask[(forward_m > DRIVE.sight_m) & (mask == FLOOR)] = NO_EVIDENCE
     return mask.reshape(u.shape)
 
 
 def _points(length_m: float, rng: np.random.Generator) -> Array:
     """Return map points (N, 3) on floor and walls, in the order in which they come into sight."""
-    count = round(length_m * POINTS_PER_M)
+    count = round(length_m * DRIVE.points_per_m)
     x = np.sort(rng.uniform(0.0, length_m, count))
     on_floor = rng.random(count) < 0.5
-    side = np.where(rng.random(count) < 0.5, HALF_WIDTH_M, -HALF_WIDTH_M)
-    y = np.where(on_floor, rng.uniform(-HALF_WIDTH_M, HALF_WIDTH_M, count), side)
+    side = np.where(rng.random(count) < 0.5, DRIVE.half_width_m, -DRIVE.half_width_m)
+    y = np.where(on_floor, rng.uniform(-DRIVE.half_width_m, DRIVE.half_width_m, count), side)
     z = np.where(on_floor, 0.0, rng.uniform(0.05, 1.5, count))
-    noise = rng.normal(scale=POINT_NOISE_M, size=(count, 2))
+    noise = rng.normal(scale=DRIVE.point_noise_m, size=(count, 2))
     return np.stack([x, y + noise[:, 0], z + noise[:, 1]], axis=1)
 
 
 def _corrections() -> Array:
     """Return the two ways in which the map lies in turns, (2, 4, 4)."""
-    c, s = np.cos(CORRECTION_RAD), np.sin(CORRECTION_RAD)
+    c, s = np.cos(DRIVE.correction_rad), np.sin(DRIVE.correction_rad)
     turn = make_transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     return np.stack([np.eye(4), turn])
 
@@ -153,9 +163,12 @@ class CorridorImages:
         self.frames = frames
         self._rng = np.random.default_rng(seed)
         self._texture = _texture(self._rng)
-        self._shifts = self._rng.uniform(0, TEXELS, (FACES, 2))
-        low = np.array([-SPARE_M, -HALF_WIDTH_M, 0.0], np.float32)
-        high = np.array([frames * STEP_M + SPARE_M, HALF_WIDTH_M, CEILING_M], np.float32)
+        low = np.array([-DRIVE.spare_m, -DRIVE.half_width_m, 0.0], np.float32)
+        high = np.array(
+            [frames * DRIVE.step_m + DRIVE.spare_m, DRIVE.half_width_m, DRIVE.ceiling_m], np.float32
+        )
+        # Of the six faces, two across each axis.
+        self._shifts = self._rng.uniform(0, DRIVE.texels, (2 * len(low), 2))
         # The base drives along x without turning, so the rays and the side they go to stay.
         v, u = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
         uv = np.stack([u.ravel(), v.ravel()], axis=1)
@@ -168,10 +181,10 @@ class CorridorImages:
         to_right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
         for index in range(self.frames):
             T_world_left = MOUNT.T_base_left.copy()
-            T_world_left[0, 3] += index * STEP_M
+            T_world_left[0, 3] += index * DRIVE.step_m
             left = self._view(T_world_left[:3, 3])
             right = self._view((T_world_left @ to_right)[:3, 3])
-            yield StereoFrame(index, (index + 1) * FRAME_PERIOD_NS, left, right)
+            yield StereoFrame(index, (index + 1) * DRIVE.frame_period_ns, left, right)
 
     def _view(self, origin: Array) -> NDArray[np.uint8]:
         """Return the grey image (H, W) uint8 seen from a point."""
@@ -182,18 +195,18 @@ class CorridorImages:
         x, y, z = start + self._rays * nearest
         axis = to_faces.argmin(axis=0)
         beyond = np.take_along_axis(self._rays, axis[None], axis=0)[0] > 0
-        shifts = (self._shifts / TEXELS_PER_M).astype(np.float32)[2 * axis + beyond]
+        shifts = (self._shifts / DRIVE.texels_per_m).astype(np.float32)[2 * axis + beyond]
         # A face across x shows y and z, one across y shows x and z, one across z x and y.
         first, second = np.where(axis == 0, y, x), np.where(axis == 2, y, z)
         shape = (CAMERA.height, CAMERA.width)
         image = cv2.remap(
             self._texture,
-            ((first + shifts[:, 0]) * TEXELS_PER_M).reshape(shape),
-            ((second + shifts[:, 1]) * TEXELS_PER_M).reshape(shape),
+            ((first + shifts[:, 0]) * DRIVE.texels_per_m).reshape(shape),
+            ((second + shifts[:, 1]) * DRIVE.texels_per_m).reshape(shape),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_WRAP,
         )
-        image += NOISE_GREY * self._rng.standard_normal(shape, np.float32)
+        image += DRIVE.noise_grey * self._rng.standard_normal(shape, np.float32)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
@@ -201,7 +214,7 @@ def _texture(rng: np.random.Generator) -> NDArray[np.float32]:
     """Return grey values of fine and coarse blots, the same at opposite edges."""
     layers = []
     for deviation in (2.0, 8.0):
-        noise = np.pad(rng.normal(size=(TEXELS, TEXELS)), 64, mode='wrap')
+        noise = np.pad(rng.normal(size=(DRIVE.texels, DRIVE.texels)), 64, mode='wrap')
         layer = cv2.GaussianBlur(noise, (0, 0), deviation)[64:-64, 64:-64]
         layers.append(layer / layer.std())
-    return (GREY + CONTRAST * (layers[0] + layers[1])).astype(np.float32)
+    return (DRIVE.grey + DRIVE.contrast * (layers[0] + layers[1])).astype(np.float32)

@@ -16,7 +16,7 @@ from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 OUTLINES = ('floor', 'obstacle', 'unsure')
-FAR_PX = 1 << 15
+FAR_PX = np.iinfo(np.int16).max
 UNSURE_PX = 2
 """How far the outlines of floor that are drawn by hand may be off."""
 

@@ -16,14 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.evaluation.maps import Cells, MapTruth, Mask, Pose2d, observable, resample, states
+from segfloor_ros.evaluation.maps import (
+    SAME_PLACE_M,
+    Cells,
+    MapTruth,
+    Mask,
+    Pose2d,
+    observable,
+    resample,
+    states,
+)
 from segfloor_ros.files.results import write_file
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
 
 DEFAULT_RANGE_M = 5.0
-DEFAULT_TOLERANCE_M = 0.1
-DRAWS_PER_NODE = 200
-"""Free cells drawn per wanted node before giving up on the minimum distance."""
 
 COLOURS = {
     'free, agree': (255, 255, 255),
@@ -45,6 +51,7 @@ LEGEND_ROW_PX = 26
 class RoadMapPlan:
     """How road maps are built. nodes: wanted number of nodes, 0 chooses one per 1.5 m² of floor,
     between 20 (a corridor) and 400. min_distance_m: between nodes. max_edge_m: longest edge.
+    draws_per_node: free cells drawn per wanted node before giving up on the minimum distance.
     """
 
     nodes: int = 0
@@ -52,6 +59,7 @@ class RoadMapPlan:
     max_edge_m: float = 2.0
     repetitions: int = 30
     seed: int = 0
+    draws_per_node: int = 200
 
     def nodes_for(self, area_m2: float) -> int:
         """Return the number of nodes for a floor of this area."""
@@ -211,7 +219,7 @@ def sample_nodes(
     cells = (rows + margin) * width + columns + margin
     available, disc = available.ravel(), _disc(min_distance_cells, margin, width)
     nodes: list[int] = []
-    for _ in range(count * DRAWS_PER_NODE):
+    for _ in range(count * RoadMapPlan.draws_per_node):
         cell = cells[rng.integers(len(cells))]
         if available[cell]:
             nodes.append(int(cell))
@@ -257,7 +265,7 @@ def opened(mask: Mask) -> Mask:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
 
 
-def score_cells(maps: Comparison, tolerance_m: float = DEFAULT_TOLERANCE_M) -> CellScore:
+def score_cells(maps: Comparison, tolerance_m: float = SAME_PLACE_M) -> CellScore:
     """Return precision and recall per cell, obstacles within `tolerance_m` of each other."""
     free, occupied = maps.estimate == FREE, maps.estimate == OCCUPIED
     reach = 2 * round(tolerance_m / maps.resolution_m) + 1

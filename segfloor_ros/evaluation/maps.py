@@ -35,18 +35,17 @@ Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""
 
 BEARINGS = 361
-SAME_PLACE_M = 0.1
-SAME_HEADING_RAD = 0.05
+SAME_PLACE_M, SAME_HEADING_RAD = 0.1, 0.05
+"""Places and headings that differ by less are one: where sight is followed, where two maps are
+compared, and the step of the search for an alignment.
+"""
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 
-COARSE_CELL_M = 0.1
-COARSE_HEADINGS = 120
-NEAR_OBSTACLE_M = 0.05
 MAX_SCORED_CELLS = 40000
 REFINEMENTS = 4
-"""Steps of the refinement: a coarse cell, then half of the one before."""
+"""Steps of the refinement: that of the search, then half of the one before."""
 
 TURN_PER_METRE = 0.15
 """Radians of a refinement step that go with a metre: a lever of about 7 m."""
@@ -259,7 +258,7 @@ def _gain_images(truth: OccupancyGrid) -> tuple[Array, Array]:
     """Return what a free and what an occupied estimated cell earn at each cell of the truth."""
     state = states(truth)
     free_gain = np.where(state == FREE, 1.0, -1.0)
-    reach = 2 * max(1, round(NEAR_OBSTACLE_M / truth.resolution_m)) + 1
+    reach = 2 * max(1, round(SAME_PLACE_M / 2 / truth.resolution_m)) + 1
     near = cv2.dilate((state == OCCUPIED).astype(np.uint8), np.ones((reach, reach), np.uint8))
     return free_gain, near.astype(np.float64)
 
@@ -268,7 +267,7 @@ def _refine(fit: _Fit, start: Pose2d) -> Pose2d:
     """Move to the best of the neighbouring poses until none is better, with shrinking steps."""
     best, best_score = start, fit.score(start)
     moves = [move for move in product((-1, 0, 1), repeat=3) if any(move)]
-    for step in COARSE_CELL_M / 2 ** np.arange(REFINEMENTS):
+    for step in SAME_PLACE_M / 2 ** np.arange(REFINEMENTS):
         improved = True
         while improved:
             centre, improved = best, False
@@ -286,24 +285,24 @@ def _refine(fit: _Fit, start: Pose2d) -> Pose2d:
 
 def _search_everywhere(fit: _Fit) -> Pose2d:
     """Return the best pose over all headings and coarse translations by correlation."""
-    scale = fit.truth.resolution_m / COARSE_CELL_M
+    scale = fit.truth.resolution_m / SAME_PLACE_M
     size = [max(1, round(side * scale)) for side in fit.free_gain.shape[::-1]]
     # Outside the truth nothing is free: shift the gains so that zero padding means a loss.
     free_gain = cv2.resize(fit.free_gain, size, interpolation=cv2.INTER_AREA) + 1.0
     occupied_gain = cv2.resize(fit.occupied_gain, size, interpolation=cv2.INTER_AREA)
     best, best_score = (0.0, 0.0, 0.0), -np.inf
-    headings = np.linspace(-np.pi, np.pi, COARSE_HEADINGS, endpoint=False)
+    headings = np.linspace(-np.pi, np.pi, round(math.tau / SAME_HEADING_RAD), endpoint=False)
     # From the smallest turn on, so that a symmetric place is not turned over for nothing.
     for yaw in sorted(headings, key=abs):
         turned = from_frame(np.vstack([fit.free, fit.occupied]), (0.0, 0.0, float(yaw)))
-        low = np.floor(turned.min(axis=0) / COARSE_CELL_M) * COARSE_CELL_M
+        low = np.floor(turned.min(axis=0) / SAME_PLACE_M) * SAME_PLACE_M
         counts = [_histogram(part, low, turned) for part in np.split(turned, [len(fit.free)])]
         score = _correlate([free_gain, occupied_gain], counts)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         if score[row, column] > best_score:
             best_score = float(score[row, column])
             offset = np.array([column, row]) - np.array(counts[0].shape[::-1]) + 1
-            shift = np.array(fit.truth.origin_xy_m) + offset * COARSE_CELL_M - low
+            shift = np.array(fit.truth.origin_xy_m) + offset * SAME_PLACE_M - low
             best = (float(shift[0]), float(shift[1]), float(yaw))
     return best
 
@@ -323,7 +322,7 @@ def _correlate(gains: list[Array], counts: list[Array]) -> Array:
 
 def _histogram(points: Array, low: Array, all_points: Array) -> Array:
     """Count points per coarse cell of the box that holds all points."""
-    columns, rows = (np.floor((all_points.max(axis=0) - low) / COARSE_CELL_M) + 1).astype(int)
-    cells = np.floor((points - low) / COARSE_CELL_M).astype(np.int64)
+    columns, rows = (np.floor((all_points.max(axis=0) - low) / SAME_PLACE_M) + 1).astype(int)
+    cells = np.floor((points - low) / SAME_PLACE_M).astype(np.int64)
     flat = np.bincount(cells[:, 1] * columns + cells[:, 0], minlength=rows * columns)
     return flat.reshape(rows, columns).astype(np.float64)

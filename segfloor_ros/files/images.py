@@ -33,7 +33,9 @@ JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _lock = threading.Lock()
-_inside = 0
+_silent: set[object] = set()
+"""The blocks of `silent_libraries` that are under way."""
+
 _standard_error: int | None = None
 
 
@@ -151,24 +153,19 @@ def silent_libraries() -> Iterator[None]:
     """Drop what libraries write to standard error: libpng and libjpeg have no other switch that
     OpenCV passes on.
     """
-    global _inside
     if _standard_error is None:
         yield
         return
+    block = object()
     with _lock:
-        if _inside == 0:
-            _point_to(os.devnull)
-        _inside += 1
+        if not _silent:
+            with open(os.devnull, 'w') as nowhere:
+                os.dup2(nowhere.fileno(), 2)
+        _silent.add(block)
     try:
         yield
     finally:
         with _lock:
-            _inside -= 1
-            if _inside == 0:
+            _silent.remove(block)
+            if not _silent:
                 os.dup2(_standard_error, 2)
-
-
-def _point_to(path: str) -> None:
-    file = os.open(path, os.O_WRONLY)
-    os.dup2(file, 2)
-    os.close(file)

@@ -35,13 +35,7 @@ END_NS = 2**31 * 10**9
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
 MAX_YAML_BYTES = 1 << 18
-MAX_VALUES = MAX_YAML_BYTES // 2
-"""More values than a file of that size can name without aliases."""
-
 MAX_DEPTH = 40
-MAX_WHOLE = 1 << 63
-"""Whole numbers of a file are below this, as those of ROS parameters."""
-
 Key = tuple[str | int, ...]
 """Where a value is: names of entries and numbers of list items from the top."""
 
@@ -233,7 +227,7 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.yaml_implicit_resolvers = {
-    first: [form for form in forms if form[0] in _KEPT]
+    first: [(tag, pattern) for tag, pattern in forms if tag in _KEPT]
     for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 _Loader.add_implicit_resolver(
@@ -277,7 +271,7 @@ class _Values:
         """Return the value of a node at a key."""
         self._lines[key] = line = node.start_mark.line + 1
         self._count += 1
-        if len(key) > MAX_DEPTH or self._count > MAX_VALUES:
+        if len(key) > MAX_DEPTH or self._count > MAX_YAML_BYTES:
             raise _YamlError('has too many values, or aliases that hold themselves', line)
         if isinstance(node, yaml.SequenceNode):
             return [self.of(item, (*key, i)) for i, item in enumerate(node.value)]
@@ -321,7 +315,8 @@ class _Values:
             value = getattr(self._loader, f'construct_yaml_{kind}')(node)
         except (ValueError, KeyError, IndexError, AttributeError, yaml.YAMLError):
             raise _YamlError(f'{shortened(text)} is no {kind}', line) from None
-        too_large = kind == 'int' and not -MAX_WHOLE <= value < MAX_WHOLE
+        whole = np.iinfo(np.int64)  # as ROS parameters
+        too_large = kind == 'int' and not whole.min <= value <= whole.max
         if too_large or (kind == 'float' and math.isinf(value) and 'n' not in text.lower()):
             raise _YamlError(f'{shortened(text)} is larger than any number here', line)
         return value

@@ -14,7 +14,7 @@ from statistics import median
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from segfloor_ros.messages.topics import make_header, to_ns
+from segfloor_ros.messages.topics import PATIENCE_S, make_header, to_ns
 
 CONNECTIONS = 'connections'
 """Kind of the status that says how many subscribers each topic of a node has."""
@@ -27,17 +27,16 @@ HEALTH = 'health'
 
 HEALTH_PERIOD_S = 1.0
 
-NEED_LASTS_S = 5.0
-"""A node that nobody has needed for so long takes no messages until somebody does."""
+LASTS_S = 3.0
+"""What is looked for once a second is over when it was not seen for so long: a problem, somebody
+who needs a node, the images of a camera.
+"""
 
 RECORDING = 'recording'
 """Kind of the status of the camera that says that its recording has ended."""
 
 RECENT = 10
 """So many of the last messages of a topic are looked at together."""
-
-LIVE_S = 60.0
-"""A stamp older than this is that of a recording; its age tells nothing."""
 
 
 class Level(enum.Enum):
@@ -133,13 +132,13 @@ class Health:
         self._measured_s = clock_s()
 
     def received(self, topic: str, delay_s: float | None, waited_s: float = 0.0) -> None:
-        """Count a message; delay_s: age of its stamp, None where it has none. waited_s: since it
-        came, in the queue.
+        """Count a message; delay_s: age of its stamp, None where it has none; that of a recording
+        tells nothing. waited_s: since it came, in the queue.
         """
         meter = self._inputs.setdefault(topic, InputMeter())
         meter.count += 1
         meter.longest_wait_s = max(meter.longest_wait_s, waited_s)
-        if delay_s is not None and abs(delay_s) < LIVE_S:
+        if delay_s is not None and abs(delay_s) < PATIENCE_S:
             meter.delays_s.append(delay_s)
 
     def lost(self, topic: str, count: int) -> None:

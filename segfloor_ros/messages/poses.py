@@ -29,7 +29,8 @@ from segfloor_ros.geometry import Array, invert, make_transform, se3_log
 from segfloor_ros.messages.topics import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
 
-UNKNOWN_TWIST_VARIANCE = 1e6
+LEAST_VARIANCE = 1e-6
+"""Of a millimetre and a milliradian, in m² and rad²: filters take a zero for certainty."""
 
 WHEELS_FRAME = 'wheel_odom'
 
@@ -67,7 +68,7 @@ def odometry_message(
     message.pose.pose = pose_message(T_a_b)
     message.pose.covariance = np.ascontiguousarray(covariance, np.float64).ravel()
     if twist is None:
-        message.twist.covariance = (np.eye(6) * UNKNOWN_TWIST_VARIANCE).ravel()
+        message.twist.covariance = (np.eye(6) / LEAST_VARIANCE).ravel()
     else:
         vx, vy, vz, wx, wy, wz = (float(value) for value in twist)
         message.twist.twist = Twist(
@@ -106,9 +107,11 @@ def twist_covariance(
     return axes @ (covariance_before + covariance_now) @ axes.T / duration_s**2
 
 
-def at_least(covariance: Array, variance: float) -> Array:
-    """Return a covariance (6, 6) with a least variance: filters take a zero for certainty."""
-    return covariance + np.diag(np.maximum(variance - np.diag(covariance), 0.0))
+def never_certain(covariance: Array) -> Array:
+    """Return a covariance (6, 6) with `LEAST_VARIANCE` at least: the first pose is the origin by
+    definition.
+    """
+    return covariance + np.diag(np.maximum(LEAST_VARIANCE - np.diag(covariance), 0.0))
 
 
 class PathMessages:

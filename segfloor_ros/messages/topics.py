@@ -17,6 +17,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from rclpy.constants import S_TO_NS
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import (
     CameraInfo,
@@ -45,14 +46,20 @@ FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
 PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 """Topics that a lossless camera listens to: how far frames and keyframes are."""
 
-NS_PER_S = 1_000_000_000
-
 PATIENCE_S = 10.0
 """What is under way between nodes and has not come for so long, is lost: a frame, a keyframe, the
-part of a map, the answer of a service."""
+part of a map, the answer of a service. A stamp older than this is that of a recording. Nodes that
+are started together have found each other by then.
+"""
 
 
-def _reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+FRESH_S = 0.5
+"""No robot steers by what is older: points are published again, a sensor is not waited for."""
+
+
+def _reliable(
+    depth: int = 1, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE
+) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
 
 
@@ -69,7 +76,7 @@ KEYFRAMES = _reliable(100)
 """Poses, and everything about a keyframe; deep enough for a burst after the camera's mount was
 measured. As tf2 does, for moving frames, too."""
 
-LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = _reliable(durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """The last value also for those who come later: the map, the camera's mount (REP-2003)."""
 
 LATCHED_BY_MANY = _reliable(KEYFRAMES.depth, DurabilityPolicy.TRANSIENT_LOCAL)
@@ -211,13 +218,13 @@ def subscribed_by(node: str, alternatives: bool = False) -> list[Topic]:
 
 def to_time(stamp_ns: int) -> Time:
     """Return the ROS time of a stamp in ns."""
-    sec, nanosec = divmod(int(stamp_ns), NS_PER_S)
+    sec, nanosec = divmod(int(stamp_ns), S_TO_NS)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def to_ns(time: Time) -> int:
     """Return a ROS time in ns."""
-    return int(time.sec) * NS_PER_S + int(time.nanosec)
+    return int(time.sec) * S_TO_NS + int(time.nanosec)
 
 
 def make_header(stamp_ns: int, frame_id: str) -> Header:

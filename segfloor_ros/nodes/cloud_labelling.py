@@ -17,7 +17,7 @@ from segfloor_ros.files.saved_map import MapFile
 from segfloor_ros.messages import maps as clouds
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.messages.topics import FRESH_S, to_ns
 from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
@@ -27,8 +27,6 @@ from segfloor_ros.slam.results import SparseCloud
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
 
 POSE, MASK = 'keyframe/odometry', 'keyframe/floor_mask'
-
-KEEP_ALIVE_S = 0.5
 
 
 class RobotCheck:
@@ -136,7 +134,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         obstacles, stamp_ns = self._obstacles, to_ns(message.header.stamp)
         if obstacles is not None:
             age_s = 1e-9 * (stamp_ns - to_ns(obstacles.header.stamp))
-            if not 0 <= age_s < KEEP_ALIVE_S:
+            if not 0 <= age_s < FRESH_S:
                 obstacles.header.stamp = message.header.stamp
                 self.outputs.publish('obstacle_points', obstacles)
 

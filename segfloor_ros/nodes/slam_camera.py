@@ -32,11 +32,11 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.rig_check import InputFault
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
-from segfloor_ros.messages.diagnostics import LIVE_S, RECENT, Level
+from segfloor_ros.messages.diagnostics import LASTS_S, RECENT, Level
 from segfloor_ros.messages.images import same_calibration
-from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, best_effort
+from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
-from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S, offered_best_effort
+from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 
 CATCH_UP = 0.2
@@ -52,7 +52,6 @@ Pair = dict[str, Any]
 
 StampedPair = tuple[int, Pair]
 
-SILENT_S = 3.0
 PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
 """Beyond these a mount that was measured is hard to believe."""
 
@@ -277,7 +276,7 @@ class StereoInput:
         self._infos[topic] = message
         if self._rectifier is not None:
             text = f'{topic}: the calibration is not the one in use; ~/reset takes it over'
-            self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=EVENT_LASTS_S)
+            self._node.reporter.diagnose(f'calibration on {topic}', text, lasts_s=PATIENCE_S)
         self._on_news()
 
 
@@ -300,7 +299,7 @@ class CameraWatch:
         self._stamps[topic].append(stamp_ns)
         now_ns = self._node.get_clock().now().nanoseconds
         self._last_image_s[topic] = 1e-9 * now_ns
-        self._is_live = abs(now_ns - stamp_ns) < 1e9 * LIVE_S
+        self._is_live = abs(now_ns - stamp_ns) < 1e9 * PATIENCE_S
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
         """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
@@ -318,7 +317,7 @@ class CameraWatch:
             f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
             'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
             'play a recording with lossless set on stereo_camera',
-            lasts_s=EVENT_LASTS_S,
+            lasts_s=PATIENCE_S,
         )
 
     def find_problems(self, missing_infos: list[str]) -> None:
@@ -338,7 +337,7 @@ class CameraWatch:
         """Diagnose what was found in the images."""
         for fault in faults:
             text = fault.line(' and '.join(self._stamps))
-            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, EVENT_LASTS_S)
+            self._node.reporter.diagnose(fault.fault, text, Level.ERROR, PATIENCE_S)
 
     def judge_measured(self, mount: Mount) -> None:
         """Say so where the mount that was measured from the floor is hard to believe."""
@@ -357,7 +356,7 @@ class CameraWatch:
         for topic, last_s in self._last_image_s.items():
             # A recording may end or wait for the nodes; a camera may not. The time of one that has
             # ended stands still.
-            if self._is_live and now_s - last_s > SILENT_S:
+            if self._is_live and now_s - last_s > LASTS_S:
                 self._node.reporter.diagnose(
                     f'silence of {topic}',
                     f'no image on {topic} for a while; is the camera connected and its driver '

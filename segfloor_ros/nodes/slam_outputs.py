@@ -53,9 +53,6 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 
 MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 
-LEAST_VARIANCE = 1e-6
-"""Of a millimetre and a milliradian, in m² and rad²: the first pose is the origin by definition."""
-
 PARTS = {'cloud', 'grid'}
 """What the nodes behind know of a map."""
 
@@ -137,11 +134,11 @@ class SlamTopics:
 
     def _publish_odometry(self, result: FrameResult) -> None:
         last, twist, of_twist = self._last, None, None
-        covariance = poses.at_least(result.covariance, LEAST_VARIANCE)
+        covariance = poses.never_certain(result.covariance)
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
             duration_s = (result.stamp_ns - last.stamp_ns) * 1e-9
             twist = poses.body_twist(last.T_odom_base, result.T_odom_base, duration_s)
-            before = poses.at_least(last.covariance, LEAST_VARIANCE)
+            before = poses.never_certain(last.covariance)
             of_twist = poses.twist_covariance(before, result.T_odom_base, covariance, duration_s)
         own = self._own
         if self._out.listeners('pose'):
@@ -162,7 +159,7 @@ class SlamTopics:
         self._publish_pair(KEYFRAME_PARTS, stamp_ns, images, self._calibration)
         moving = np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
-        covariance = poses.at_least(result.covariance, LEAST_VARIANCE)
+        covariance = poses.never_certain(result.covariance)
         pose = poses.odometry_message(*at, own.base_frame, keyframe.T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
         out.publish('keyframe/features', clouds.features_message(*at, keyframe.features))

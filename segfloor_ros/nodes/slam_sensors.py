@@ -24,9 +24,9 @@ from segfloor_ros.camera.sources.files import is_upright
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.messages.images import grey8_image
 from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import IMAGES, SENSORS, best_effort, to_ns
+from segfloor_ros.messages.topics import FRESH_S, IMAGES, PATIENCE_S, SENSORS, best_effort, to_ns
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
-from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S, offered_best_effort
+from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -35,12 +35,6 @@ WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'
 MAX_LATE_S = 0.05
 """So long an image waits for what sensors measured up to its time."""
-
-NEAR_NS = 5_000_000
-"""Over so short a time what was measured before tells as well."""
-
-LIVE_S = 0.5
-"""A sensor that has said nothing for so long is not waited for."""
 
 SIGMAS = 3.0
 
@@ -68,6 +62,7 @@ class SensorInput:
         self._transforms = transforms
         self._on_message = on_message
         self._takes_best_effort = False
+        self._same_time_ns = 1e9 * node.settings.sync_tolerance_s
         self.reset()
         for name in (WHEELS, IMU):
             receive = partial(self.receive, name)
@@ -129,7 +124,7 @@ class SensorInput:
             return False
         self._look_at_tf(now_s)
         return any(
-            latest_ns < stamp_ns + lag_ns - NEAR_NS and now_s < heard_s + LIVE_S
+            latest_ns < stamp_ns + lag_ns - self._same_time_ns and now_s < heard_s + FRESH_S
             for latest_ns, heard_s in self._latest.values()
         )
 
@@ -251,7 +246,7 @@ class InitialPose:
         if message.header.frame_id not in ('', self._map_frame):
             its, own = message.header.frame_id, self._map_frame
             text = f'{INITIAL_POSE} is in frame {its}; give it in {own}'
-            self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=EVENT_LASTS_S)
+            self._node.reporter.diagnose(INITIAL_POSE, text, lasts_s=PATIENCE_S)
             return
         T_map_base = pose_array(message.pose.pose)
         sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))

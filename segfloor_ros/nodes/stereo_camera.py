@@ -43,7 +43,6 @@ from segfloor_ros.messages.topics import (
     to_time,
 )
 from segfloor_ros.nodes.shared.inputs import LOOK_S
-from segfloor_ros.nodes.shared.reporter import SETTLED_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import TfLink
@@ -268,7 +267,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         self.reporter.over(WAITING)
 
     def _log_waiting_for(self, what: str) -> None:
-        if what and time.monotonic() - self._waiting_since_s > SETTLED_S:
+        if what and time.monotonic() - self._waiting_since_s > PATIENCE_S:
             self.reporter.diagnose(WAITING, f'waiting for {what}')
 
 

@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import typing
 from collections.abc import Iterable
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -46,29 +47,38 @@ RANGES = {
 }  # fmt: skip
 """Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
 
-FURNITURE_HEIGHTS_M = (0.4, 0.8, 1.2, 1.8)
-WALL_TEXTURES = ('rough_plaster', 'bricks', 'concrete', 'books', 'goods')
-FURNITURE_TEXTURES = ('wood', 'granite', 'goods', 'metal')
-TEXTURE_PATCH_M = 5.0
-"""Long walls change their look about this often."""
-
-WALL_EXTENT_M = 2.5
-"""Connected obstacles at least this large are walls, up to the ceiling; smaller ones furniture."""
-
 Cells = NDArray[np.int64]
 
 Mask = NDArray[np.bool_]
 
-CLEARANCE_M = 0.45
 
-COMFORT_M = 1.2
-"""Nearer to an obstacle than this the way counts longer, up to three times at the clearance."""
+@dataclass(frozen=True)
+class FloorPlan:
+    """How a floor plan becomes a scene. wall_extent_m: connected obstacles at least this large are
+    walls, up to the ceiling; smaller ones are furniture. texture_patch_m: long walls change their
+    look about this often.
 
-PLANNING_CELL_M = CLEARANCE_M / 3
+    Of the tour: comfort_m: nearer to an obstacle than this the way counts longer, up to three times
+    at the clearance. seen_m: what is so near was seen.
+    """
 
-SEEN_RADIUS_M = 4.0
+    wall_extent_m: float = 2.5
+    furniture_heights_m: tuple[float, ...] = (0.4, 0.8, 1.2, 1.8)
+    wall_textures: tuple[str, ...] = ('rough_plaster', 'bricks', 'concrete', 'books', 'goods')
+    furniture_textures: tuple[str, ...] = ('wood', 'granite', 'goods', 'metal')
+    texture_patch_m: float = 5.0
+    clearance_m: float = 0.45
+    comfort_m: float = 1.2
+    seen_m: float = 4.0
+    longest_m: float = 60.0
 
-MAX_TOUR_M = 60.0
+    @property
+    def cell_m(self) -> float:
+        """Side of the cells in which the tour is planned."""
+        return self.clearance_m / 3
+
+
+PLAN = FloorPlan()
 
 
 def shipped(kind: str = 'scenes') -> dict[str, Path]:
@@ -260,14 +270,14 @@ def _boxes(grid: OccupancyGrid, occupied: NDArray[np.bool_], seed: int) -> list[
     )
     rng = np.random.default_rng([seed, 5])
     extent_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * grid.resolution_m
-    is_wall = extent_m >= WALL_EXTENT_M
-    height_m = np.where(is_wall, Wall.height_m, rng.choice(FURNITURE_HEIGHTS_M, count))
+    is_wall = extent_m >= PLAN.wall_extent_m
+    height_m = np.where(is_wall, Wall.height_m, rng.choice(PLAN.furniture_heights_m, count))
     boxes = []
     for rectangle in merged_rectangles(occupied):
         label = int(labels[rectangle[0], rectangle[2]])
         bottom, top, left, right = (float(value) * grid.resolution_m for value in rectangle)
         x, y = grid.origin_xy_m
-        texture = FURNITURE_TEXTURES[label % len(FURNITURE_TEXTURES)]
+        texture = PLAN.furniture_textures[label % len(PLAN.furniture_textures)]
         if is_wall[label]:
             texture = _wall_texture(rectangle[[0, 2]] * grid.resolution_m, seed)
         boxes.append(
@@ -282,9 +292,9 @@ def _boxes(grid: OccupancyGrid, occupied: NDArray[np.bool_], seed: int) -> list[
 
 def _wall_texture(place_m: Array, seed: int) -> str:
     """Return the look of a wall by its place."""
-    patch = (place_m // TEXTURE_PATCH_M).astype(np.int64)
-    chosen = np.random.default_rng([seed, 6, *patch]).integers(len(WALL_TEXTURES))
-    return WALL_TEXTURES[int(chosen)]
+    patch = (place_m // PLAN.texture_patch_m).astype(np.int64)
+    chosen = np.random.default_rng([seed, 6, *patch]).integers(len(PLAN.wall_textures))
+    return PLAN.wall_textures[int(chosen)]
 
 
 def plan_tour(free: Mask, resolution_m: float, origin_xy_m: tuple[float, float]) -> Array:
@@ -296,23 +306,25 @@ def plan_tour(free: Mask, resolution_m: float, origin_xy_m: tuple[float, float])
     room_m = cv2.distanceTransform(
         np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
     )[1:-1, 1:-1] * resolution_m  # fmt: skip
-    stride = max(1, round(PLANNING_CELL_M / resolution_m))
+    stride = max(1, round(PLAN.cell_m / resolution_m))
     places = _reachable(room_m[stride // 2 :: stride, stride // 2 :: stride])
     cells = np.argwhere(places)
     coarse_room_m = room_m[stride // 2 :: stride, stride // 2 :: stride][places]
     graph = _graph(places, coarse_room_m, stride * resolution_m)
     visits = _tour(graph, cells, coarse_room_m, stride * resolution_m)
     fine = cells[visits] * stride + stride // 2
-    corners = _pulled_straight(room_m >= CLEARANCE_M - resolution_m, fine)
+    corners = _pulled_straight(room_m >= PLAN.clearance_m - resolution_m, fine)
     return np.array(origin_xy_m) + (corners[:, ::-1] + 0.5) * resolution_m
 
 
 def _reachable(room_m: Array) -> Mask:
     """Return the largest connected part that is wide enough."""
-    wide = (room_m >= CLEARANCE_M).astype(np.uint8)
+    wide = (room_m >= PLAN.clearance_m).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=4)
     if len(stats) < 2:
-        raise InputError(f'the map has no place with {CLEARANCE_M} m of room around it to drive')
+        raise InputError(
+            f'the map has no place with {PLAN.clearance_m} m of room around it to drive'
+        )
     return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
 
 
@@ -322,7 +334,7 @@ def _graph(places: Mask, room_m: Array, cell_m: float) -> csr_array:
     """
     index = np.full(np.array(places.shape) + 2, -1, np.int32)
     index[1:-1, 1:-1][places] = np.arange(places.sum())
-    tightness = np.clip((COMFORT_M - room_m) / (COMFORT_M - CLEARANCE_M), 0, 1)
+    tightness = np.clip((PLAN.comfort_m - room_m) / (PLAN.comfort_m - PLAN.clearance_m), 0, 1)
     here = index[1:-1, 1:-1][places]
     rows, columns, weights = [], [], []
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -342,7 +354,7 @@ def _tour(graph: csr_array, cells: Cells, room_m: Array, cell_m: float) -> Cells
     start = here = int(np.argmax(room_m))
     seen = _within(cells, cells[start], cell_m)
     visits, length_m = [start], 0.0
-    while length_m < MAX_TOUR_M and not seen.all():
+    while length_m < PLAN.longest_m and not seen.all():
         costs, previous = _ways_from(graph, here)
         costs = np.where(seen | ~np.isfinite(costs), np.inf, costs)
         if not np.isfinite(costs).any():
@@ -373,7 +385,7 @@ def _way(previous: NDArray[np.int32], goal: int) -> list[int]:
 
 
 def _within(cells: Cells, place: Cells, cell_m: float) -> Mask:
-    return np.asarray(np.hypot(*(cells - place).T) * cell_m <= SEEN_RADIUS_M)
+    return np.asarray(np.hypot(*(cells - place).T) * cell_m <= PLAN.seen_m)
 
 
 def _pulled_straight(wide: Mask, cells: Cells) -> Cells:

@@ -44,19 +44,37 @@ Mover = Person | Car
 MOVING_WITHIN_S = 0.2
 """What changes its place within this time around a moment moves."""
 
-# Of a person of the usual height, in metres: the joints and how long the limbs are between them.
-THIGH_M, SHIN_M, SOLE_M = 0.44, 0.42, 0.02
-HIP_M = THIGH_M + SHIN_M + SOLE_M
-SHOULDER_M = 1.42
-STRIDE_RAD = 0.42
-"""Largest swing of a thigh; with it the length of a step follows, so that feet do not slide."""
-
-KNEE_RAD = 0.9
-"""Bend of the knee while the foot swings forward."""
-
-ARM_RAD = 0.45
-ELBOW_RAD = 0.35
 SIDES = (1, -1)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A person of the usual height: the joints, how long the limbs are between them, and how far
+    they swing. stride_rad: largest swing of a thigh; with it the length of a step follows, so that
+    feet do not slide. knee_rad: bend of the knee while the foot swings forward.
+    """
+
+    thigh_m: float = 0.44
+    shin_m: float = 0.42
+    sole_m: float = 0.02
+    shoulder_m: float = 1.42
+    stride_rad: float = 0.42
+    knee_rad: float = 0.9
+    arm_rad: float = 0.45
+    elbow_rad: float = 0.35
+
+    @property
+    def leg_m(self) -> float:
+        """Length of a straight leg without the sole."""
+        return self.thigh_m + self.shin_m
+
+    @property
+    def hip_m(self) -> float:
+        """Height of the hip of someone who stands."""
+        return self.leg_m + self.sole_m
+
+
+BODY = Body()
 
 
 @dataclass(frozen=True)
@@ -295,10 +313,10 @@ def part_solids(mover: Mover) -> list[list[Prism]]:
         cylinder((0.0, 0.0), 0.06, 0.12, 'concrete', 0.54),
         cylinder((0.01, 0.0), 0.1, 0.24, 'concrete', 0.63),
     ]
-    thigh = [cylinder((0.0, 0.0), 0.085, THIGH_M + 0.05, trousers, -THIGH_M)]
+    thigh = [cylinder((0.0, 0.0), 0.085, BODY.thigh_m + 0.05, trousers, -BODY.thigh_m)]
     shin = [
-        cylinder((0.0, 0.0), 0.06, SHIN_M + 0.03, trousers, -SHIN_M),
-        block((0.07, 0.0), (0.27, 0.1, 0.08), 'granite', bottom_m=-SHIN_M - SOLE_M),
+        cylinder((0.0, 0.0), 0.06, BODY.shin_m + 0.03, trousers, -BODY.shin_m),
+        block((0.07, 0.0), (0.27, 0.1, 0.08), 'granite', bottom_m=-BODY.shin_m - BODY.sole_m),
     ]
     upper_arm = [cylinder((0.0, 0.0), 0.055, 0.32, cloth, -0.29)]
     forearm = [cylinder((0.0, 0.0), 0.045, 0.27, 'concrete', -0.26)]
@@ -328,21 +346,21 @@ def _limbs(walked_m: float, scale: float) -> Array:
     The leg on the floor is straight, which gives the height of the hip, and its foot stays where it
     is; the other knee bends, so that its foot clears the floor. Arms swing against the legs.
     """
-    step_m = 2 * (THIGH_M + SHIN_M) * scale * np.sin(STRIDE_RAD)
+    step_m = 2 * BODY.leg_m * scale * np.sin(BODY.stride_rad)
     phase = np.pi * walked_m / step_m
     # Whole steps between standing and standing: the swing grows over the first one.
     swing = min(1.0, walked_m / step_m)
-    of_leg = swing * np.sin(STRIDE_RAD) * np.arcsin(np.sin(phase)) / (np.pi / 2)
+    of_leg = swing * np.sin(BODY.stride_rad) * np.arcsin(np.sin(phase)) / (np.pi / 2)
     angles = [float(np.arcsin(of_leg)), -float(np.arcsin(of_leg))]
-    dip = (THIGH_M + SHIN_M) * (1 - np.cos(angles[0]))
-    hip = _joint(0.0, 0.0, HIP_M - dip, 0.0)
+    dip = BODY.leg_m * (1 - np.cos(angles[0]))
+    hip = _joint(0.0, 0.0, BODY.hip_m - dip, 0.0)
     poses = [hip]
     for side, angle, forward in zip(SIDES, angles, (np.cos(phase), -np.cos(phase)), strict=True):
         thigh = hip @ _joint(0.0, 0.1 * side, 0.0, -angle)
-        shin = thigh @ _joint(0.0, 0.0, -THIGH_M, swing * KNEE_RAD * max(0.0, forward))
-        reach = -angle / STRIDE_RAD * ARM_RAD
-        upper_arm = hip @ _joint(0.0, 0.235 * side, SHOULDER_M - HIP_M - 0.04, -reach)
-        forearm = upper_arm @ _joint(0.0, 0.0, -0.28, -ELBOW_RAD)
+        shin = thigh @ _joint(0.0, 0.0, -BODY.thigh_m, swing * BODY.knee_rad * max(0.0, forward))
+        reach = -angle / BODY.stride_rad * BODY.arm_rad
+        upper_arm = hip @ _joint(0.0, 0.235 * side, BODY.shoulder_m - BODY.hip_m - 0.04, -reach)
+        forearm = upper_arm @ _joint(0.0, 0.0, -0.28, -BODY.elbow_rad)
         poses += [thigh, shin, upper_arm, forearm]
     scaled = np.array(poses)
     scaled[:, :3, 3] *= scale

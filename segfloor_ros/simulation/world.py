@@ -14,12 +14,8 @@ from segfloor_ros.simulation.scene import Lighting, Scene
 from segfloor_ros.simulation.solids import Prism, floors, obstacles, part_solids
 from segfloor_ros.simulation.textures import Texture, make_texture
 
-NEAR_M, FAR_M = 0.02, 120.0
-
-GROUND_HALF_M = 60.0
-
-SHADOW_HALF_M, SHADOW_PX = 12, 4096
-"""Within so far of the origin the sun casts shadows, of so many pixels across."""
+SHADOW_PX = 4096
+"""Side of the picture of the shadows, which the sun casts within 12 m of the origin."""
 
 RIG = 'rig'
 
@@ -215,9 +211,8 @@ def _add_plane(world: World, name: str, height_m: float, texture: str, reflectan
     )
     facing = '0 1 0 0' if height_m > 0 else '1 0 0 0'
     world.bodies.append(
-        f'<geom name="{name}" type="plane" pos="0 0 {height_m}" quat="{facing}" '
-        f'size="{GROUND_HALF_M} {GROUND_HALF_M} 1" material="{name}" '
-        'contype="0" conaffinity="0"/>'
+        f'<geom class="plane" name="{name}" pos="0 0 {height_m}" quat="{facing}" '
+        f'material="{name}"/>'
     )
 
 
@@ -240,9 +235,6 @@ def _document(world: World, width: int, height: int) -> str:
     return template.format(
         width=width,
         height=height,
-        near_m=NEAR_M,
-        far_m=FAR_M,
-        shadow_half_m=SHADOW_HALF_M,
         shadow_px=SHADOW_PX if scene.lighting.sun > 0 else 0,
         assets=''.join(world.assets),
         ambient=_grey(scene.lighting.ambient),

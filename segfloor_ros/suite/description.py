@@ -18,7 +18,6 @@ from segfloor_ros.suite.result_files import find_recordings, is_url
 
 RUN, REPLAY = 'run', 'replay'
 RECORDING, SCENE, RESULTS = SOURCES = ('input', 'simulate', 'results')
-TIMEOUT_S = 3600.0
 SUITE_KEYS = ('name', 'defaults', 'recordings', 'about', 'published')
 SHARED_KEYS = ('truth', 'reference_map', 'mode', 'rate', 'params', 'set', 'timeout_s', 'expect',
                'no_worse_by', 'no_map')  # fmt: skip
@@ -48,7 +47,7 @@ class Entry:
     assignments: tuple[str, ...] = ()
     truth: str = ''
     reference_map: str = ''
-    timeout_s: float = TIMEOUT_S
+    timeout_s: float = 3600.0
     bounds: tuple[Bound, ...] = ()
     slacks: Mapping[str, Slack] = field(default_factory=dict)
     continue_from: str = ''
@@ -153,7 +152,7 @@ class _Reader:
             'rate': self._number('rate', 0.0, 0.0),
             'params': self._path('params'),
             'assignments': self._assignments('set'),
-            'timeout_s': self._number('timeout_s', TIMEOUT_S, 1.0),
+            'timeout_s': self._number('timeout_s', Entry.timeout_s, 1.0),
             'truth': self._path('truth'),
             'reference_map': self._path('reference_map'),
             'bounds': tuple(self._bounds()),

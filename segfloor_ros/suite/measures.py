@@ -24,7 +24,6 @@ from segfloor_ros.trajectory import read_trajectory
 
 HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 
-ROUNDING = 1e-9
 PATHS = ('.txt', '.csv')
 """Of files with a true path."""
 
@@ -221,7 +220,9 @@ class Verdict:
         """Whether the bound is kept."""
         if self.measured is None:
             return False
-        return self.bound.least - ROUNDING <= self.measured <= self.bound.greatest + ROUNDING
+        limits = self.bound.least, self.bound.greatest
+        is_at_limit = any(math.isclose(self.measured, limit) for limit in limits)
+        return is_at_limit or limits[0] < self.measured < limits[1]
 
     def __str__(self) -> str:
         measure = MEASURES[self.bound.measure]

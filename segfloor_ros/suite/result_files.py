@@ -47,7 +47,6 @@ from segfloor_ros.suite.measures import (
 MEASURED = 'measured.json'
 ARCHIVE = 'results.tar'
 
-CHUNK = 1 << 20
 MAX_ARCHIVE = 1 << 32
 
 WILDCARDS = '*?['
@@ -172,7 +171,7 @@ def digest_of(path: Path) -> str:
             continue
         result.update(f'{file.relative_to(path)}\0{file.stat().st_size}\0'.encode())
         with file.open('rb') as opened:
-            while chunk := opened.read(CHUNK):
+            while chunk := opened.read(io.DEFAULT_BUFFER_SIZE):
                 result.update(chunk)
     return result.hexdigest()
 

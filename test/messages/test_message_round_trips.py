@@ -171,7 +171,7 @@ def test_no_variance_is_below_the_least_one() -> None:
     covariance[0, 2] = covariance[2, 0] = 1e-12
     expected = np.diag([1e-6, 1e-6, 2.0, 1e-6, 1e-6, 1e-6])
     expected[0, 2] = expected[2, 0] = 1e-12
-    np.testing.assert_allclose(poses.at_least(covariance, 1e-6), expected, rtol=1e-12)
+    np.testing.assert_allclose(poses.never_certain(covariance), expected, rtol=1e-12)
 
 
 def test_impossible_poses_are_refused() -> None:

@@ -13,8 +13,7 @@ import rclpy
 import yaml
 from rclpy.node import Node
 
-from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
-from segfloor_ros.nodes.cloud_labelling import KEEP_ALIVE_S
+from segfloor_ros.messages.topics import DIAGNOSTICS, FRESH_S, TOPICS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAV2 = REPOSITORY / 'params' / 'nav2.yaml'
@@ -161,7 +160,7 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert TOPICS[floor['topic'].removeprefix('/')].type_name.endswith(floor['data_type'])
         assert (floor['clearing'], floor['marking'], floor['inf_is_valid']) == (True, False, True)
     monitor = nav2_node('collision_monitor')
-    assert monitor['source_timeout'] > 2 * KEEP_ALIVE_S
+    assert monitor['source_timeout'] > 2 * FRESH_S
     assert nav2_node('planner_server')['planner_plugins'] == ['GridBased']
 
 

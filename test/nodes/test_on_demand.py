@@ -23,7 +23,7 @@ from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 def test_without_listeners_nothing_is_received(
     make_graph, monkeypatch, make, received, made
 ) -> None:
-    monkeypatch.setattr(connections, 'NEED_LASTS_S', 1.0)
+    monkeypatch.setattr(connections, 'LASTS_S', 1.0)
     graph = make_graph()
     graph.be_deaf()
     node = graph.add(make())

@@ -9,7 +9,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 from segfloor_ros.simulation.scene import Person, Scene
 from segfloor_ros.simulation.scene_file import (
-    CLEARANCE_M,
+    PLAN,
     merged_rectangles,
     open_scene,
     plan_tour,
@@ -263,7 +263,7 @@ def test_tour_keeps_clear_of_walls_and_comes_back():
     for start, end in pairwise(tour):
         line = np.linspace(start, end, 40)
         gaps = np.linalg.norm(blocked[None] - line[:, None], axis=2)
-        assert gaps.min() > CLEARANCE_M - 0.1
+        assert gaps.min() > PLAN.clearance_m - 0.1
     # All around the block in the middle.
     assert np.ptp(tour, axis=0).min() > 2.0
     with pytest.raises(InputError, match='no place'):

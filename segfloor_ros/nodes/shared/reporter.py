@@ -20,24 +20,17 @@ from segfloor_ros.errors import SegfloorError
 from segfloor_ros.messages.diagnostics import (
     CONNECTIONS,
     HEALTH,
-    NEED_LASTS_S,
+    LASTS_S,
     Health,
     Level,
     Status,
     status_message,
 )
-from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS, Topic, describe_policies
+from segfloor_ros.messages.topics import DIAGNOSTICS, PATIENCE_S, TOPICS, Topic, describe_policies
 from segfloor_ros.timing import rss_mb
 
 if TYPE_CHECKING:
     from segfloor_ros.nodes.shared.inputs import StampJoiner
-
-LASTS_S, EVENT_LASTS_S = 3.0, 10.0
-"""So long a problem counts that is looked for once a second, or shows now and then."""
-
-SETTLED_S = 10.0
-"""Nodes that are started together are seen one after the other: what is missing is not logged
-before."""
 
 MOST = 3
 
@@ -46,8 +39,6 @@ SIDES = {
     'right': ('right', 'infra2', 'ir_right', 'cam1'),
 }
 """How drivers call the two sides."""
-
-FALLS_BEHIND_S = 2.0
 
 
 class LossCounter:
@@ -115,7 +106,7 @@ class Reporter:
             self.health.lost(topic.name, lost)
             name, profile = self._node.get_name(), subscription.qos_profile
             text = loss_in_words(topic.name, lost, name, profile)
-            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, EVENT_LASTS_S)
+            self.diagnose(f'loss on {topic.name}', text, Level.ERROR, PATIENCE_S)
 
     def note_opened(self) -> None:
         """Note that messages are received from now on; what came before is not missed."""
@@ -157,8 +148,8 @@ class Reporter:
             text = f'no message on {names} with stamp {dropped.stamp_ns}; dropped{crowded}'
             self.health.count('dropped')
             # Others may still be starting; a second publisher is wrong from the first moment.
-            if crowded or time.monotonic() - self._opened_s >= SETTLED_S:
-                self.diagnose(f'parts {names}{crowded}', text, lasts_s=EVENT_LASTS_S)
+            if crowded or time.monotonic() - self._opened_s >= PATIENCE_S:
+                self.diagnose(f'parts {names}{crowded}', text, lasts_s=PATIENCE_S)
             self.report(dropped.stamp_ns, Level.ERROR, text)
 
     def diagnose(
@@ -191,7 +182,7 @@ class Reporter:
         self._silent_until_s = {k: s for k, s in self._silent_until_s.items() if s > now_s}
         if text in self._silent_until_s:
             return
-        self._silent_until_s[text] = now_s + EVENT_LASTS_S
+        self._silent_until_s[text] = now_s + PATIENCE_S
         log.error(text if text.startswith(where) else f'{where}: {text}')
         if not isinstance(error, SegfloorError):
             log.debug(''.join(traceback.format_exception(error)))
@@ -353,7 +344,7 @@ class Connections:
         now_s = time.monotonic()
         if is_needed_otherwise or any(self._counts.values()):
             self._last_needed_s = now_s
-        return now_s - self._last_needed_s < NEED_LASTS_S
+        return now_s - self._last_needed_s < LASTS_S
 
     def find_problems(self) -> None:
         """Report topics that do not connect, a node of the same name, and queues that grow."""
@@ -361,7 +352,7 @@ class Connections:
         self._find_silent()
         self._find_twin()
         topic, waited_s = self._reporter.health.longest_wait()
-        if waited_s > FALLS_BEHIND_S:
+        if waited_s > LASTS_S:
             text = (
                 f'{self._node.get_name()} falls behind: messages on {topic} wait {waited_s:.1f} s; '
                 'lower the rate or the size of the images, or let stereo_slam make fewer keyframes'
@@ -388,7 +379,7 @@ class Connections:
         what = f'nobody publishes {in_words(silent)}'
         hints = [hint for name in silent if (hint := self._hint(name))]
         text = '; '.join([what, 'start the node that does, or remap', *hints])
-        is_settled = now_s - min(self._silent_since_s.values()) >= SETTLED_S
+        is_settled = now_s - min(self._silent_since_s.values()) >= PATIENCE_S
         line = f'{what}; /diagnostics says what to do' if is_settled else None
         self._reporter.diagnose('publishers', text, line=line)
 

@@ -17,9 +17,15 @@ from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array, FrameTree, invert
 from segfloor_ros.messages.poses import transform_array, transform_message
-from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, LATCHED, LATCHED_BY_MANY, to_ns
+from segfloor_ros.messages.topics import (
+    IMAGES,
+    KEYFRAMES,
+    LATCHED,
+    LATCHED_BY_MANY,
+    PATIENCE_S,
+    to_ns,
+)
 from segfloor_ros.nodes.shared.inputs import LOOK_S
-from segfloor_ros.nodes.shared.reporter import EVENT_LASTS_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.slam.results import FrameResult
 
@@ -91,7 +97,7 @@ class TfLink:
                     self.frames.add_moving(stamp_ns, parent, child, transform_array(found))
             except InputError as error:
                 text = f'tf from {parent} to {child}: {error}'
-                self._node.reporter.diagnose(f'{parent} {child}', text, lasts_s=EVENT_LASTS_S)
+                self._node.reporter.diagnose(f'{parent} {child}', text, lasts_s=PATIENCE_S)
 
 
 class Transforms:
