@@ -132,29 +132,37 @@ def to_grey(image: Grey) -> Grey:
 
 
 class EightBitScale:
-    """Brings grey pairs of 16 bits to 8 by dropping the same number of low bits for the whole
-    recording.
+    """Brings grey pairs of 16 bits to 8 by one curve for the whole recording: the square root.
 
-    A scale per image (its own minimum and maximum) would change the brightness of the same
-    point from frame to frame. The number of bits in use is declared, or else the smallest usual
-    one (8, 10, 12, 14, 16) that holds the first pair; brighter pixels later on saturate.
+    The noise of light grows with the root of its amount, so that one step of the result is the same
+    part of the noise everywhere, and dark floors keep theirs below bright lamps (Anscombe, The
+    transformation of Poisson, binomial and negative-binomial data, 1948). A scale per image would
+    change the brightness of the same point from frame to frame. The number of bits in use is
+    declared, or else the smallest usual one that holds all pairs so far: a recording may begin in
+    the dark.
     """
 
     def __init__(self, bit_depth: int = 0) -> None:
-        self.bit_depth = bit_depth
+        self._is_declared = bit_depth > 0
+        self._use(bit_depth)
 
     def __call__(self, left: Grey, right: Grey) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Return both images (H, W) as uint8; 8-bit images pass through."""
-        if not self.bit_depth and np.uint16 in (left.dtype, right.dtype):
-            brightest = max(int(left.max()), int(right.max()))
-            self.bit_depth = next(b for b in USUAL_BIT_DEPTHS if brightest < 1 << b)
+        deep = [int(image.max()) for image in (left, right) if image.dtype == np.uint16]
+        if deep and not self._is_declared and max(deep) >= 1 << self._bit_depth:
+            self._use(next(bits for bits in USUAL_BIT_DEPTHS if max(deep) < 1 << bits))
         return self._scaled(left), self._scaled(right)
 
+    def _use(self, bit_depth: int) -> None:
+        self._bit_depth = bit_depth
+        brightest = (1 << bit_depth) - 1
+        share = np.minimum(np.arange(1 << 16), brightest) / max(brightest, 1)
+        # Eight bits in sixteen are those of a camera that has brought them to 8 itself.
+        curve = np.sqrt(share) if bit_depth > 8 else share
+        self._table = np.rint(255 * curve).astype(np.uint8)
+
     def _scaled(self, image: Grey) -> NDArray[np.uint8]:
-        if image.dtype == np.uint8:
-            return image  # type: ignore[return-value]
-        shift = max(self.bit_depth - 8, 0)
-        return np.minimum(image >> shift, 255).astype(np.uint8)
+        return self._table[image] if image.dtype == np.uint16 else np.asarray(image, np.uint8)
 
 
 def _grey_of(pixels: Grey, encoding: str) -> Grey:

@@ -174,7 +174,7 @@ class StereoCameraSettings(StageSettings):
     )
     bit_depth: int = setting(
         0,
-        'Bits used in the pixels of 16-bit images; 0 takes it from the first pair.',
+        'Bits used in the pixels of 16-bit images; 0 takes it from the brightest so far.',
         unit='bits',
         within=(0, 16),
     )

@@ -27,6 +27,7 @@ from camera_recordings import (
     write_rosbag2,
 )
 
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
 from segfloor_ros.errors import CalibrationError, InputError
@@ -106,7 +107,30 @@ def test_colour_and_sixteen_bit_images_become_grey(tmp_path: Path) -> None:
     deep = np.full((48, 64), 1000, np.uint16)  # 10 bits
     messages = stereo_messages([(deep, deep)], STAMPS[:1], encoding='mono16')
     source = opened(ros1_bag(tmp_path, messages))
-    assert next(source.raw_pairs()).left[0, 0] == 250
+    assert next(source.raw_pairs()).left[0, 0] == 252
+
+
+@pytest.mark.parametrize('write', [mcap_file, ros1_bag])
+def test_a_fisheye_of_sixteen_bits_is_rectified_as_from_files(
+    tmp_path: Path, write: Callable[[Path, Sequence[Message]], Path]
+) -> None:
+    D = [0.02, -0.005, 0.003, -0.001]
+    eyes = [
+        EyeCalibration(64, 48, eye.K, D, np.eye(3), eye.P, 'equidistant')
+        for eye in (calibration().left, calibration().right)
+    ]
+    fisheye = StereoCalibration(*eyes)
+    pairs = [
+        (left.astype(np.uint16) << 4, right.astype(np.uint16) << 4) for left, right in grey_pairs(4)
+    ]
+    source = opened(
+        write(tmp_path, stereo_messages(pairs, STAMPS, eyes=fisheye, encoding='mono16'))
+    )
+    assert source.calibration.left.distortion_model == 'equidistant'
+    rectifier = StereoRectifier(fisheye)
+    for frame, (left, _) in zip(source.frames(), pairs, strict=True):
+        grey = np.rint(255 * np.sqrt(left / 4095)).astype(np.uint8)
+        np.testing.assert_array_equal(frame.left, rectifier.rectify(grey, grey)[0])
 
 
 @pytest.mark.parametrize('write', [mcap_file, ros1_bag])

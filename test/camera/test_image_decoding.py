@@ -144,20 +144,41 @@ def test_data_that_is_no_image_is_refused(data: bytes, message: str) -> None:
         decode_file(data, 'left')
 
 
-def test_the_scale_is_that_of_the_first_pair() -> None:
+def test_the_scale_is_one_for_both_eyes_and_all_pairs() -> None:
     scale = EightBitScale()
-    bright = np.array([[4095, 16]], np.uint16)  # 12 bits: 4 are dropped
-    dark = np.array([[160, 32]], np.uint16)
-    assert [image.tolist() for image in scale(bright, dark)] == [[[255, 1]], [[10, 2]]]
-    # A dark pair later on stays dark, a brighter one saturates.
-    brighter = np.array([[5000, 320]], np.uint16)
-    assert [image.tolist() for image in scale(dark, brighter)] == [[[10, 2]], [[255, 20]]]
+    bright = np.array([[4095, 16]], np.uint16)  # 12 bits: 255 at 4095, and the root of it at 16
+    dark = np.array([[1024, 16]], np.uint16)
+    assert [image.tolist() for image in scale(bright, dark)] == [[[255, 16]], [[128, 16]]]
+    assert [image.tolist() for image in scale(dark, dark)] == [[[128, 16]], [[128, 16]]]
+
+
+def test_a_recording_that_begins_in_the_dark_does_not_saturate() -> None:
+    scale = EightBitScale()
+    scale(*[np.array([[9, 3]], np.uint16)] * 2)
+    day = np.array([[4000, 1000]], np.uint16)
+    grey = scale(day, day)[0][0].astype(int)
+    assert grey[0] > 250
+    assert 120 < grey[1] < 130
+
+
+def test_the_steps_of_the_scale_are_those_of_the_noise_of_light() -> None:
+    """One grey level is the same part of the noise, the root of the light, dark or bright."""
+    scale = EightBitScale(12)
+    for light in (256, 1024, 2304):
+        noise = np.array([[light, light + round(3 * light**0.5)]], np.uint16)
+        dark, bright = scale(noise, noise)[0][0].astype(int)
+        assert bright - dark == pytest.approx(3 * 255 / 2 / 4095**0.5, abs=1)
 
 
 def test_a_declared_bit_depth_is_used() -> None:
-    dark = np.array([[512, 256]], np.uint16)
-    assert EightBitScale(16)(dark, dark)[0].tolist() == [[2, 1]]
-    assert EightBitScale(10)(dark, dark)[0].tolist() == [[128, 64]]
+    dark = np.array([[16384, 256]], np.uint16)
+    assert EightBitScale(16)(dark, dark)[0].tolist() == [[128, 16]]
+    assert EightBitScale(10)(dark, dark)[0].tolist() == [[255, 128]]
+
+
+def test_eight_bits_in_sixteen_are_those_of_the_camera() -> None:
+    image = np.array([[7, 100, 255]], np.uint16)
+    assert EightBitScale()(image, image)[0].tolist() == image.tolist()
 
 
 def test_eight_bits_pass_through() -> None:

@@ -102,7 +102,23 @@ def test_euroc_is_rectified(shared_data: Path) -> None:
     assert np.median(np.abs(row_differences_px(unrectified))) > 2.0
 
 
-@pytest.mark.parametrize('name', ['library', 'euroc_tiny'])
+def test_a_fisheye_of_16_bits_is_rectified(shared_data: Path) -> None:
+    source = opened(shared_data / 'tumvi')
+    camera, raw_fx = source.camera, source.calibration.left.K[0, 0]
+    assert camera.baseline_m == pytest.approx(0.101, abs=5e-4)  # Schubert et al. 2018
+    assert camera.fx == pytest.approx(0.7 * raw_fx, rel=0.01)
+    frame = frame_of(source, 8)
+    assert np.median(np.abs(row_differences_px(frame))) < 0.5
+    # No lamp or window hides the floor: less than a tenth is white, and what is dark is not black.
+    assert np.mean(frame.left == 255) < 0.1
+    assert np.percentile(frame.left, 5) > 16
+    assert [sensor.name for sensor in source.sensors if sensor.used] == ['imu']
+    # Held about level: what an IMU feels lies along the image's vertical.
+    felt = np.mean([sample.accel_m_s2 for sample in source.sensors[0].read()], axis=0)
+    assert -felt[1] / np.linalg.norm(felt) > 0.99
+
+
+@pytest.mark.parametrize('name', ['library', 'euroc_tiny', 'tumvi'])
 def test_real_recordings_survive_the_round_trip(
     shared_data: Path, tmp_path: Path, name: str
 ) -> None:

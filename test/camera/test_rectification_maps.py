@@ -65,6 +65,20 @@ def test_rectified_images_are_those_of_the_ideal_camera(model: str) -> None:
         assert np.percentile(error, 99) <= 2
 
 
+def test_what_lies_beyond_the_lens_of_a_fisheye_is_no_image() -> None:
+    """Of k1 = -0.2 the radius falls again from 1 / sqrt(0.6) rad = 74 degrees on."""
+    K = np.array([[60.0, 0.0, 79.5], [0.0, 60.0, 59.5], [0.0, 0.0, 1.0]])
+    P = np.array([[10.0, 0.0, 79.5, 0.0], [0.0, 10.0, 59.5, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    left = EyeCalibration(160, 120, K, [-0.2, 0.0, 0.0, 0.0], np.eye(3), P, 'equidistant')
+    right = dataclasses.replace(left, P=P - [[1.0 * (i == 3) for i in range(4)], [0] * 4, [0] * 4])
+    raw = np.full((120, 160), 200, np.uint8)
+    view, _ = StereoRectifier(StereoCalibration(left, right)).rectify(raw, raw)
+    pixels = pixel_grid(160, 120) - (79.5, 59.5)
+    angle = np.degrees(np.arctan(np.linalg.norm(pixels, axis=1) / 10)).reshape(120, 160)
+    assert (view[angle > 76] == 0).all()
+    assert (view[angle < 72] == 200).all()
+
+
 def test_rectified_pairs_pass_through() -> None:
     left, right = grey_pairs(1)[0]
     images = StereoRectifier(calibration()).rectify(left, right)

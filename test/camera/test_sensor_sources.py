@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_recordings import (
+    HEIGHT,
     MS,
+    WIDTH,
     Message,
     grey_pairs,
     opened,
@@ -108,6 +110,17 @@ def test_the_imu_of_euroc_is_turned_into_the_left_camera(tmp_path: Path) -> None
     np.testing.assert_allclose(sample.gyro_rad_s, [-2, 1, 3], atol=1e-6)
     np.testing.assert_allclose(sample.accel_m_s2, [0, -9.81, 0], atol=1e-5)
     np.testing.assert_allclose(sample.place_m, [0.1, 0.2, -0.3], atol=1e-6)
+    for camera in ('cam0', 'cam1', 'imu0'):  # and the same of a file of Kalibr
+        (folder / 'mav0' / camera / 'sensor.yaml').unlink()
+    eye = f'intrinsics: [50, 50, 32, 24], resolution: [{WIDTH}, {HEIGHT}], camera_model: pinhole'
+    shift = [[1, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    (folder / 'dso').mkdir()
+    (folder / 'dso' / 'camchain.yaml').write_text(
+        f'cam0: {{{eye}, T_cam_imu: {T_body_imu.tolist()}}}\ncam1: {{{eye}, T_cn_cnm1: {shift}}}\n'
+    )
+    (of_kalibr,) = measured(opened(folder))
+    for name in ('gyro_rad_s', 'accel_m_s2', 'place_m'):
+        np.testing.assert_allclose(getattr(of_kalibr, name), getattr(sample, name), atol=1e-5)
 
 
 def test_a_file_beside_the_imu_of_a_folder_tells_where_it_is(tmp_path: Path) -> None:

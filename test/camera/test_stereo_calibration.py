@@ -25,11 +25,14 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.calibration.chessboard import rectified_pixels
 from segfloor_ros.camera.calibration.files import (
+    find_calibration,
+    given_calibration,
     read_calibration,
     read_kitti_calibration,
     write_ros_calibration,
 )
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
+from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.geometry import make_transform, transform_points
 
@@ -125,6 +128,88 @@ def test_euroc_poses_give_the_baseline(tmp_path: Path) -> None:
     assert pair.left.distortion_model == 'plumb_bob'
     assert pair.camera.baseline_m == pytest.approx(0.2)
     np.testing.assert_allclose(pair.left.R, np.eye(3), atol=1e-12)
+
+
+KALIBR = """
+cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [0.02, -0.005, 0.003, -0.001]
+  distortion_model: equidistant
+  intrinsics: [300.0, 302.0, 320.0, 236.0]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1: {rows}
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.02, -0.005, 0.003, -0.001]
+  distortion_model: equidistant
+  intrinsics: [300.0, 302.0, 330.0, 236.0]
+  resolution: [640, 480]
+"""
+
+
+def kalibr_file(folder: Path, old: str = '', new: str = '') -> Path:
+    text = KALIBR.replace('{rows}', str(T_RIGHT_LEFT.tolist()))
+    path = folder / 'camchain.yaml'
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+def test_kalibr_files_hold_both_cameras(tmp_path: Path) -> None:
+    path = kalibr_file(tmp_path)
+    model = 'equidistant'
+    expected = StereoCalibration.from_extrinsics(
+        raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT
+    )
+    given = given_calibration(StereoCameraSettings(left_calibration=str(path)))
+    found = find_calibration('drive', (tmp_path,), StereoCameraSettings())
+    for pair in (read_calibration(path, path), given, found):
+        assert pair is not None
+        assert pair.camera.baseline_m == pytest.approx(expected.camera.baseline_m)
+        for eye, other in ((pair.left, expected.left), (pair.right, expected.right)):
+            for name in 'KRP':
+                np.testing.assert_allclose(getattr(eye, name), getattr(other, name), atol=1e-9)
+            assert eye.distortion_model == model
+            np.testing.assert_array_equal(eye.D, [0.02, -0.005, 0.003, -0.001])
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'message'),
+    [
+        ('pinhole', 'ds', 'camchain.yaml, cam0: unknown camera model ds; calibrate it as pinhole'),
+        ('equidistant', 'fov', 'cam0: unknown distortion model fov; known are plumb_bob'),
+        ('T_cn_cnm1', 'T', 'cam1: T_cn_cnm1 is missing'),
+        ('intrinsics', 'focal', 'cam0: intrinsics is missing'),
+        ('cam0', 'camera0', 'camchain.yaml: cam0 is missing'),
+    ],
+)
+def test_faults_in_kalibr_files_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = kalibr_file(tmp_path, old, new)
+    with pytest.raises(CalibrationError, match=message):
+        read_calibration(path, path)
+
+
+def test_the_view_of_a_fisheye_keeps_its_share_of_the_resolution_in_the_middle() -> None:
+    model = 'equidistant'
+    pair = StereoCalibration.from_extrinsics(raw_eye(model), raw_eye(model, 330.0), T_RIGHT_LEFT)
+    # Two directions a degree apart, around the middle of the view.
+    middle = np.array([pair.camera.width - 1, pair.camera.height - 1]) / 2
+    for eye in (pair.left, pair.right):
+        ray = np.linalg.solve(eye.P[:, :3], [*middle, 1.0])
+        turned = Rotation.from_rotvec([0.0, np.radians(1.0), 0.0]).apply(ray)
+        raw = project(eye, np.array([ray, turned]) @ eye.R)
+        view = rectified_pixels(eye, raw)
+        size_px = [np.linalg.norm(uv[1].ravel() - uv[0].ravel()) for uv in (view, raw)]
+        assert size_px[0] / size_px[1] == pytest.approx(0.7, abs=0.02)
+
+
+def test_coefficients_that_a_driver_fills_up_with_zeros_are_taken() -> None:
+    eye = dataclasses.replace(raw_eye('equidistant'), D=[0.1, 0.02, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(eye.D, [0.1, 0.02, 0.0, 0.0])
+    with pytest.raises(CalibrationError, match='equidistant has 4 coefficients, not 5'):
+        dataclasses.replace(eye, D=[0.1, 0.02, 0.0, 0.0, 0.3])
 
 
 def test_right_intrinsics_become_the_left_ones_and_the_baseline_stays() -> None:

@@ -1,5 +1,5 @@
-"""Calibration files: of ROS camera_calibration, EuRoC (sensor.yaml) and KITTI (calib.txt); read,
-written, and found beside a recording.
+"""Calibration files: of ROS camera_calibration, EuRoC (sensor.yaml), Kalibr (camchain.yaml) and
+KITTI (calib.txt); read, written, and found beside a recording.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from segfloor_ros.errors import CalibrationError
 from segfloor_ros.files.whole import number, read_lines, read_yaml
 from segfloor_ros.geometry import Array, invert
 
+KALIBR_NAMES = ('camchain.yaml', 'dso/camchain.yaml')
+"""Both cameras are in one file; TUM-VI has it in `dso`."""
+
 FILE_NAMES = (
     ('left.yaml', 'right.yaml'),
     ('left.yml', 'right.yml'),
@@ -26,17 +29,22 @@ FILE_NAMES = (
     ('left/camera.yaml', 'right/camera.yaml'),
     ('calibration/left.yaml', 'calibration/right.yaml'),
     ('calib/left.yaml', 'calib/right.yaml'),
+    *((name, name) for name in KALIBR_NAMES),
+    ('cam0/sensor.yaml', 'cam1/sensor.yaml'),
 )
 
 
 def read_calibration(left: Path, right: Path) -> StereoCalibration:
-    """Read a pair of ROS camera calibration files or of EuRoC sensor files.
+    """Read a pair of ROS camera calibration files or of EuRoC sensor files, or one file of Kalibr,
+    twice.
 
     Raises CalibrationError naming the file when one is missing, incomplete or impossible.
     """
     documents = _read(left), _read(right)
     if all('T_BS' in document for document in documents):
         return _from_euroc(left, right, *documents)
+    if all('cam1' in document for document in documents):
+        return _from_kalibr(left, documents[0])
     return StereoCalibration(_ros_eye(documents[0], str(left)), _ros_eye(documents[1], str(right)))
 
 
@@ -141,16 +149,55 @@ def _from_euroc(
     return StereoCalibration.from_extrinsics(eyes[0], eyes[1], invert(poses[1]) @ poses[0])
 
 
+def _from_kalibr(path: Path, document: Mapping[str, Any]) -> StereoCalibration:
+    """Furgale et al., Unified temporal and spatial calibration for multi-sensor systems, IROS 2013:
+    T_cn_cnm1 maps points of the camera before into this one.
+    """
+    left, right = (_kalibr_camera(path, document, name) for name in ('cam0', 'cam1'))
+    if 'T_cn_cnm1' not in right:
+        raise CalibrationError(f'{path}, cam1: T_cn_cnm1 is missing; calibrate both cameras in one')
+    T_right_left = _matrix(right['T_cn_cnm1'], 16, f'{path}, T_cn_cnm1').reshape(4, 4)
+    eyes = _euroc_eye(left, f'{path}, cam0'), _euroc_eye(right, f'{path}, cam1')
+    return StereoCalibration.from_extrinsics(*eyes, T_right_left)
+
+
+def _kalibr_camera(path: Path, document: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    camera = document.get(name)
+    if not isinstance(camera, dict):
+        raise CalibrationError(f'{path}: {name} is missing; a camchain.yaml of Kalibr has it')
+    return camera
+
+
+def read_kalibr_imu(path: Path) -> Array:
+    """Return T_cam_imu (4, 4) of the left camera in a file of Kalibr: from the IMU's frame to the
+    raw left one. Raises CalibrationError.
+    """
+    camera = _kalibr_camera(path, _read(path), 'cam0')
+    if 'T_cam_imu' not in camera:
+        raise CalibrationError(
+            f'{path}, cam0: T_cam_imu is missing; calibrate the IMU, too, or --ignore imu'
+        )
+    return _matrix(camera['T_cam_imu'], 16, f'{path}, T_cam_imu').reshape(4, 4)
+
+
 def _euroc_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:
     for key in ('resolution', 'intrinsics'):
         if key not in document:
-            raise CalibrationError(f'{origin}: {key} is missing; an EuRoC sensor.yaml has it')
+            raise CalibrationError(
+                f'{origin}: {key} is missing; an EuRoC sensor.yaml and a camchain.yaml have it'
+            )
+    lens = document.get('camera_model', 'pinhole')
+    if lens != 'pinhole':
+        raise CalibrationError(
+            f'{origin}: unknown camera model {lens}; calibrate it as pinhole, of a fisheye with '
+            'the distortion model equidistant'
+        )
     width, height = _numbers(document['resolution'], 2, f'{origin}, resolution').astype(int)
     fu, fv, cu, cv = _numbers(document['intrinsics'], 4, f'{origin}, intrinsics')
     K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
-    D = _numbers(
-        document.get('distortion_coefficients', []), None, f'{origin}, distortion_coefficients'
-    )
+    words = ('distortion_coefficients', 'distortion_coeffs')
+    word = next((word for word in words if word in document), words[0])
+    D = _numbers(document.get(word, []), None, f'{origin}, {word}')
     P = np.hstack([K, np.zeros((3, 1))])
     model = str(document.get('distortion_model', 'plumb_bob'))
     return EyeCalibration(int(width), int(height), K, D, np.eye(3), P, model, origin)
@@ -198,6 +245,8 @@ def given_calibration(settings: StereoCameraSettings) -> StereoCalibration | Non
     left, right = settings.left_calibration, settings.right_calibration
     if not left and not right:
         return None
+    if left and not right and 'cam1' in _read(Path(left)):
+        right = left
     if not left or not right:
         raise CalibrationError(
             'stereo_camera.left_calibration and stereo_camera.right_calibration belong together; '

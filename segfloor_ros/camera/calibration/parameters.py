@@ -32,6 +32,11 @@ MODEL_ALIASES = {
 SAME_PX = 1e-3
 """Intrinsics that differ by less than this are the same."""
 
+FISHEYE_RESOLUTION = 0.7
+"""So much of a fisheye's resolution its rectified view keeps in the middle. A plane cannot have all
+of it and the borders, too: this leaves 125 degrees of an image of two radians and a half.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class EyeCalibration:
@@ -123,11 +128,25 @@ class EyeCalibration:
                 f'{self.origin}: unknown distortion model {self.distortion_model}; '
                 f'known are {", ".join(COEFFICIENTS)}'
             )
+        if self.D.size > max(counts) and not self.D[max(counts) :].any():
+            object.__setattr__(self, 'D', self.D[: max(counts)])  # some drivers fill up with 0
         if self.D.size not in counts:
             raise CalibrationError(
                 f'{self.origin}: {self.distortion_model} has {" or ".join(map(str, counts))} '
                 f'coefficients, not {self.D.size}'
             )
+
+
+def _fisheye_projections(
+    left: EyeCalibration, right: EyeCalibration, baseline_m: float
+) -> tuple[Array, Array]:
+    """Return the projections (3, 4) of the rectified views of two fisheyes."""
+    f = FISHEYE_RESOLUTION * float(np.mean([eye.K[i, i] for eye in (left, right) for i in (0, 1)]))
+    middle = (left.width - 1) / 2, (left.height - 1) / 2
+    P = np.array([[f, 0.0, middle[0], 0.0], [0.0, f, middle[1], 0.0], [0.0, 0.0, 1.0, 0.0]])
+    shift = np.zeros((3, 4))
+    shift[0, 3] = -f * baseline_m
+    return P, P + shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +197,8 @@ class StereoCalibration:
         replaced.
 
         T_right_left (4, 4) maps points of the left raw optical frame into the right one. Bouguet's
-        rectification as in `cv2.stereoRectify`, cropped to the pixels both images have.
+        rectification as in `cv2.stereoRectify`, cropped to the pixels both images have; of a
+        fisheye a view of `FISHEYE_RESOLUTION`, whose corners the raw images need not reach.
         """
         size = (left.width, left.height)
         rotation, translation = T_right_left[:3, :3].copy(), T_right_left[:3, 3:].copy()
@@ -197,7 +217,8 @@ class StereoCalibration:
                 'right swapped?'
             )
         if left.distortion_model == 'equidistant':
-            R1, R2, P1, P2, _ = cv2.fisheye.stereoRectify(*eyes, cv2.CALIB_ZERO_DISPARITY)
+            R1, R2, *_ = cv2.fisheye.stereoRectify(*eyes, cv2.CALIB_ZERO_DISPARITY)
+            P1, P2 = _fisheye_projections(left, right, float(np.linalg.norm(translation)))
         else:
             R1, R2, P1, P2, *_ = cv2.stereoRectify(*eyes, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
         return cls(dataclasses.replace(left, R=R1, P=P1), dataclasses.replace(right, R=R2, P=P2))

@@ -82,11 +82,26 @@ def rectification_maps(eye: EyeCalibration) -> Maps:
     """
     size = (eye.width, eye.height)
     arguments = (eye.K, eye.D, eye.R, eye.P[:, :3].copy(), size, cv2.CV_16SC2)
-    if eye.distortion_model == 'equidistant':
-        maps = cv2.fisheye.initUndistortRectifyMap(*arguments)
-    else:
+    if eye.distortion_model != 'equidistant':
         maps = cv2.initUndistortRectifyMap(*arguments)
+        return maps[0], maps[1]
+    maps = cv2.fisheye.initUndistortRectifyMap(*arguments)
+    maps[0][_is_beyond_lens(eye)] = np.iinfo(np.int16).min
     return maps[0], maps[1]
+
+
+def _is_beyond_lens(eye: EyeCalibration) -> NDArray[np.bool_]:
+    """Return which pixels (H, W) of the view of a fisheye lie further out than its model goes: up
+    to where the radius in the raw image grows with the angle. What lies behind it would be a
+    mirror image (Kannala and Brandt, A generic camera model, PAMI 2006).
+    """
+    angles = np.linspace(0, np.pi / 2, eye.width + eye.height)
+    falling = np.flatnonzero(np.diff(angles * np.polyval([*eye.D[::-1], 1.0], angles**2)) <= 0)
+    limit = angles[falling[0]] if len(falling) else np.pi / 2
+    u, v = np.meshgrid(np.arange(eye.width), np.arange(eye.height))
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+    rays = pixels @ np.linalg.inv(eye.P[:, :3]).T @ eye.R
+    return np.asarray(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]) > limit)
 
 
 def deblocked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

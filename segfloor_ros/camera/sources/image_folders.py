@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import (
+    KALIBR_NAMES,
     find_calibration,
     given_calibration,
     given_left_calibration,
     read_body_pose,
-    read_calibration,
     read_eye_calibration,
+    read_kalibr_imu,
     read_kitti_calibration,
     read_kitti_eye,
 )
@@ -42,7 +43,7 @@ from segfloor_ros.camera.sources.source import Stamped, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
 from segfloor_ros.files.whole import nanoseconds, whole_nanoseconds
-from segfloor_ros.geometry import invert, make_transform
+from segfloor_ros.geometry import Array, invert, make_transform
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
 NANOSECOND_DIGITS = 16
@@ -188,9 +189,8 @@ def open_euroc(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     left, right = (_read_index(root / camera) for camera in EUROC_CAMERAS)
     names = (str(root / EUROC_CAMERAS[0]), str(root / EUROC_CAMERAS[1]))
     pairs = files.pairs_by_stamp(left, right, settings.pairing_tolerance_s, names)
-    sides = (root / camera / SENSOR for camera in EUROC_CAMERAS)
-    calibration = given_calibration(settings) or read_calibration(*sides)
-    sensors = _sensors(root, calibration, settings)
+    calibration = find_calibration(str(folder), (root, folder), settings)
+    sensors = _sensors(root, folder, calibration, settings)
     return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
 
@@ -199,18 +199,23 @@ def _root(folder: Path) -> Path:
 
 
 def _sensors(
-    root: Path, calibration: StereoCalibration, settings: StereoCameraSettings
+    root: Path, folder: Path, calibration: StereoCalibration, settings: StereoCameraSettings
 ) -> list[RecordedSensor]:
-    """The IMU of imu0 is in the rectified left optical frame where both `T_BS` have it."""
     imu, ignored = root / IMU_FOLDER / INDEX, settings.ignored_sensors
     if not imu.exists() or IMU in ignored:
         return folder_sensors(root, ignored, None, imu)
-    T_body_left, T_body_imu = (
-        read_body_pose(root / n / SENSOR) for n in (EUROC_CAMERAS[0], IMU_FOLDER)
-    )
     T_left_raw = make_transform(calibration.left.R, np.zeros(3))
-    T_left_imu = T_left_raw @ invert(T_body_left) @ T_body_imu
-    return folder_sensors(root, ignored, T_left_imu, imu)
+    return folder_sensors(root, ignored, T_left_raw @ _T_raw_imu(root, folder), imu)
+
+
+def _T_raw_imu(root: Path, folder: Path) -> Array:
+    """Return the IMU's frame in that of the raw left images (4, 4)."""
+    for chain in (place / name for place in (root, folder) for name in KALIBR_NAMES):
+        if chain.exists():
+            return read_kalibr_imu(chain)
+    poses = (read_body_pose(root / n / SENSOR) for n in (EUROC_CAMERAS[0], IMU_FOLDER))
+    T_body_left, T_body_imu = poses
+    return invert(T_body_left) @ T_body_imu
 
 
 def _read_index(camera: Path) -> list[Stamped[Path]]:
