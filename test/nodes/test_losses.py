@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.messages.diagnostics import HEALTH, Level
+from segfloor_ros.messages.diagnostics import HEALTH, LASTS_S, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
@@ -55,7 +55,7 @@ def test_a_queue_that_runs_over_is_named_with_its_topic_and_the_node_goes_on(mak
     for stamp_ns in range(2, last + 1):
         for name, message in cloud_messages(stamp_ns).items():
             publishers[name].publish(message)
-    time.sleep(2.5)
+    time.sleep(LASTS_S + 0.2)
     graph.until(lambda: len(labelled) > KEYFRAMES.depth, 'the keyframes of the queue')
     lost = last - len(labelled)
     assert lost == 9
