@@ -1,6 +1,6 @@
 # make        everything needed, in .venv        make test   style, types and the fast tests
 # make demo   record a drive, map it, score it   make lint   style and types only
-# make test-slow    the tests left out of make test
+# make test-slow    the tests left out of make test        make site   the documentation, in site/
 # make test-noble   the tests with the versions of Ubuntu 24.04, in .venv-noble
 # PYTHON=/path/to/python chooses the interpreter (3.10 or newer), PYTHON312=... that of test-noble.
 
@@ -25,7 +25,7 @@ CODE := segfloor_ros test launch_configs docs tools .ci setup.py
 # The tests start many processes, which need not compile the same modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: all test fast-tests test-slow test-noble noble-python demo lint format docs clean
+.PHONY: all test fast-tests test-slow test-noble noble-python demo lint format docs site clean
 
 all: $(STAMP) $(TF)
 
@@ -97,5 +97,9 @@ format: $(STAMP)
 docs: $(STAMP)
 	$(BIN)/python docs/generate.py
 
+# NO_MKDOCS_2_WARNING: the theme's notice of its successor is not a warning of these pages.
+site: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q
+
 clean:
-	rm -rf $(VENV) $(NOBLE) build install log .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) $(NOBLE) build install log site .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -75,6 +75,7 @@ setup(
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
             'colcon-common-extensions',
+            'mkdocs-material>=9.5',
             'mypy',
             'pytest',
             'pytest-timeout',

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import subprocess
+import sys
 import typing
 from pathlib import Path
 
 import pytest
 import yaml
 
+from segfloor_ros import __version__
 from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped
 from segfloor_ros.simulation.textures import GENERATORS
+from tools import figures
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 PAGES = [DOCS.parent / 'README.md', DOCS.parent / 'CONTRIBUTING.md', *sorted(DOCS.rglob('*.md'))]
@@ -97,3 +101,28 @@ def test_the_parameters_of_the_page_exist() -> None:
     page = (DOCS / 'robot.md').read_text()
     assert all(name in page for name in named)
     assert named <= known
+
+
+@pytest.mark.parametrize('page', figures.PAGES, ids=lambda path: path.name)
+def test_the_tables_of_the_pages_hold_the_figures_that_were_measured(page) -> None:
+    text = page.read_text()
+    assert figures.written(text) == text
+    assert 'python -m tools.figures write' in text
+
+
+def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path) -> None:
+    pytest.importorskip('material', reason='mkdocs-material is not installed')
+    words = [sys.executable, '-m', 'mkdocs', 'build', '--strict', '-q', '-d', str(tmp_path)]
+    built = subprocess.run(words, cwd=DOCS.parent, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    pages = {path.relative_to(DOCS).with_suffix('.html') for path in DOCS.rglob('*.md')}
+    renamed = {path.parent / 'index.html' if path.stem == 'README' else path for path in pages}
+    assert renamed <= {path.relative_to(tmp_path) for path in tmp_path.rglob('*.html')}
+    home = (tmp_path / 'index.html').read_text()
+    assert 'images/demo.gif' in home
+    assert (tmp_path / 'images' / 'demo.gif').stat().st_size < 3e6
+
+
+def test_how_to_cite_names_the_version() -> None:
+    said = yaml.safe_load((DOCS.parent / 'CITATION.cff').read_text())
+    assert said['version'] == __version__
