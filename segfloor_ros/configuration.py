@@ -17,7 +17,7 @@ from typing import Any
 
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.cloud.labelled_cloud import CloudLabellingSettings
-from segfloor_ros.errors import SettingsError
+from segfloor_ros.errors import SettingsError, about
 from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.grid.map_file import OccupancyGridSettings
@@ -70,18 +70,19 @@ def resolve(
     A value of the robot holds for all stages that know it; `--set` takes it without a stage, too.
     Raises SettingsError naming the parameter, the value and what is accepted.
     """
-    values: dict[str, dict[str, Any]] = {name: {} for name in STAGE_SETTINGS}
-    if params_file is not None:
-        _merge(values, _checked(read_params_file(params_file), str(params_file)))
     assigned: dict[str, dict[str, Any]] = {}
     for assignment in assignments:
         stage, name, value = _parse_assignment(assignment)
         assigned.setdefault(stage, {})[name] = value
-    _merge(values, _checked(assigned, '--set'))
-    _merge(values, stage_changes)
-    stages: dict[str, Any] = {
-        name: STAGE_SETTINGS[name].from_mapping(changes) for name, changes in values.items()
-    }
+    layers = [('--set', _with_one_robot(assigned, '--set')), ('', stage_changes)]
+    if params_file is not None:
+        where = str(params_file)
+        layers.insert(0, (where, _with_one_robot(read_params_file(params_file), where)))
+    stages: dict[str, Any] = {name: settings() for name, settings in STAGE_SETTINGS.items()}
+    for where, values in layers:
+        with about(where):
+            for stage, changes in values.items():
+                stages[stage] = stages[stage].replaced(**changes)
     return Configuration(**stages)
 
 
@@ -107,26 +108,16 @@ def read_params_file(path: Path) -> dict[str, dict[str, Any]]:
 
 def _by_stage(node: str, parameters: dict[str, Any], path: Path) -> dict[str, dict[str, Any]]:
     stage = node.rsplit('/', 1)[-1]
-    if stage in STAGE_SETTINGS:
-        # What only the node has (frames, rates) is no concern of the stage.
-        known = {spec.name for spec in STAGE_SETTINGS[stage].specs()}
-        return {
-            stage: {
-                k: v for k, v in parameters.items() if k in known or not is_node_parameter(stage, k)
-            }
-        }
-    if stage != '**':
-        return {}
+    stages = [known for known in STAGE_SETTINGS if stage in (known, '**')]
     values: dict[str, dict[str, Any]] = {}
     for name, value in parameters.items():
-        owners = [
-            stage
-            for stage, cls in STAGE_SETTINGS.items()
-            if any(spec.name == name for spec in cls.specs())
-        ]
-        if not owners and not any(is_node_parameter(stage, name) for stage in STAGE_SETTINGS):
-            gone = suggestion(name, []) if name in GONE else ''
-            raise SettingsError(f'{path}: no stage has a parameter {name}{gone}')
+        owners = [known for known in stages if STAGE_SETTINGS[known].has(name)]
+        # What only a node has (frames, rates) is no concern of its stage.
+        if stages and not owners and not any(is_node_parameter(known, name) for known in stages):
+            if stage == '**':
+                gone = suggestion(name, []) if name in GONE else ''
+                raise SettingsError(f'{path}: no stage has a parameter {name}{gone}')
+            owners = stages
         for owner in owners:
             values.setdefault(owner, {})[name] = value
     return values
@@ -149,19 +140,6 @@ def _parse_assignment(assignment: str) -> tuple[str, str, Any]:
         near = suggestion(stage, list(STAGE_SETTINGS))
         raise SettingsError(f'--set: unknown stage {shortened(stage)}{near}')
     return stage, name, value
-
-
-def _checked(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:
-    """Return values by stage with those of the robot in all stages. Raises SettingsError saying
-    where a bad one is from.
-    """
-    result = _with_one_robot(values, where)
-    try:
-        for name, changes in result.items():
-            STAGE_SETTINGS[name].from_mapping(changes)
-    except SettingsError as error:
-        raise SettingsError(f'{where}: {error}') from None
-    return result
 
 
 def _with_one_robot(values: dict[str, dict[str, Any]], where: str) -> dict[str, dict[str, Any]]:
@@ -386,4 +364,4 @@ NODE_SETTINGS: dict[str, type[NodeSettings]] = {
 
 def is_node_parameter(node: str, name: str) -> bool:
     """Return whether a node has a parameter of this name."""
-    return any(spec.name == name for spec in NODE_SETTINGS[node].specs())
+    return NODE_SETTINGS[node].has(name)

@@ -36,7 +36,7 @@ from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.trajectory import Trajectory, write_tum
 
-MAP = 'map.yaml'
+MAP, REPORT = 'map.yaml', 'report.html'
 PICTURES = ('floor_masks', 'moving_masks', 'floor_debug')
 OUTPUT_NAMES = (
     *PICTURES,
@@ -48,7 +48,7 @@ OUTPUT_NAMES = (
     'labelled_cloud.ply',
     'summary.json',
     'settings.yaml',
-    'report.html',
+    REPORT,
 )
 
 FIGURES = (
@@ -337,16 +337,14 @@ def _try_to(write: Callable[[Path], object], path: Path) -> str:
 
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     """Return the summary as (what, value with unit) for people."""
-    tracked = f'{summary.tracked_frames} of {summary.frames}'
-    lost = ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'
-    repeated = summary.repeated_frames
     used = ', '.join(f'{name} ({count})' for name, count in summary.sensors.items())
+    # What does not apply is None.
     rows: list[tuple[str, Any]] = [
-        *([('sensors used (messages)', used)] if used else []),
-        ('frames tracked', tracked),
-        *([('of them on sensors alone', summary.blind_frames)] if used else []),
-        *([('frames repeated by the camera', repeated)] if repeated else []),
-        ('frames lost', lost),
+        ('sensors used (messages)', used or None),
+        ('frames tracked', f'{summary.tracked_frames} of {summary.frames}'),
+        ('of them on sensors alone', summary.blind_frames if used else None),
+        ('frames repeated by the camera', summary.repeated_frames or None),
+        ('frames lost', ', '.join(f'{a}-{b}' for a, b in summary.lost_intervals) or 'none'),
         *(('frames in a submap', _submap_words(submap)) for submap in summary.submaps),
         *(('remark', remark) for remark in summary.sensor_remarks),
         *(
@@ -354,13 +352,9 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             for fault in summary.input_faults
         ),
         ('frames skipped (unreadable)', summary.skipped_frames),
-        *([('frames that failed', summary.failed_frames)] if summary.failed_frames else []),
-        *(
-            [('keyframes that failed', summary.failed_keyframes)]
-            if summary.failed_keyframes
-            else []
-        ),
-        *([('interrupted', 'yes')] if summary.interrupted else []),
+        ('frames that failed', summary.failed_frames or None),
+        ('keyframes that failed', summary.failed_keyframes or None),
+        ('interrupted', 'yes' if summary.interrupted else None),
         ('frames with something that moves', summary.moving_frames),
         ('keyframes', summary.keyframes),
         ('map updates', summary.map_updates),
@@ -369,7 +363,7 @@ def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ('memory, peak', f'{summary.rss_mb["peak"]:.0f} MB'),
         ('memory per map update', f'{summary.rss_mb["slope_per_update"]:.3f} MB'),
     ]
-    return [(what, str(value)) for what, value in rows]
+    return [(what, str(value)) for what, value in rows if value is not None]
 
 
 def _mount_rows(height_m: float | None, pitch_rad: float | None) -> list[tuple[str, str]]:

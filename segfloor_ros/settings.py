@@ -140,6 +140,11 @@ class StageSettings:
         ]
 
     @classmethod
+    def has(cls, name: str) -> bool:
+        """Whether there is a setting of this name."""
+        return any(spec.name == name for spec in cls.specs())
+
+    @classmethod
     def from_mapping(cls: type[S], values: Mapping[str, Any]) -> S:
         """Build the settings from names and values. Raises SettingsError for an unknown name or a
         bad value.

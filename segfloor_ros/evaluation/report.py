@@ -23,8 +23,8 @@ from segfloor_ros.evaluation.report_pictures import (
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import add_files
+from segfloor_ros.results_folder import REPORT
 
-REPORT_NAME = 'report.html'
 
 STYLE = Path(__file__).with_name('report.css')
 
@@ -37,9 +37,9 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     """
     data = read_run(run, truth)
     page = _page(data)
-    path = run / REPORT_NAME
+    path = run / REPORT
     with os_errors(f'{path}: cannot be written'):
-        add_files(run, {REPORT_NAME: page.encode()})
+        add_files(run, {REPORT: page.encode()})
     return path
 
 

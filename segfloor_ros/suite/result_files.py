@@ -30,11 +30,11 @@ from junitparser.junitparser import SystemErr, SystemOut
 
 from segfloor_ros import __version__
 from segfloor_ros.errors import InputError, printable, without_credentials
-from segfloor_ros.evaluation.report import REPORT_NAME, html_page
 from segfloor_ros.files.images import read_mask
 from segfloor_ros.files.results import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.files.whole import read_bytes, read_json
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
+from segfloor_ros.results_folder import REPORT
 from segfloor_ros.suite.measures import (
     MEASURES,
     Bound,
@@ -209,6 +209,9 @@ def _stem(path: str) -> str:
 
 def page(result: SuiteResult, folder: Path) -> bytes:
     """Return the page of a suite's folder, which holds a folder for each recording."""
+    # Imported here: Matplotlib takes a second that no other command should wait for.
+    from segfloor_ros.evaluation.report import html_page
+
     kept = sum(checked.holds for checked in result.recordings)
     names = ('recording', 'map', '', *COLUMNS)
     head = ''.join(f'<th>{_heading(name)}</th>' for name in names)
@@ -226,7 +229,7 @@ def page(result: SuiteResult, folder: Path) -> bytes:
 
 def _row(checked: Checked, folder: Path) -> str:
     name = html.escape(checked.name)
-    link = f'{checked.name}/{REPORT_NAME}'
+    link = f'{checked.name}/{REPORT}'
     has_map = not checked.problem  # what is there of an earlier check is not of this one
     if has_map and (folder / link).is_file():
         name = f'<a href="{html.escape(link)}">{name}</a>'

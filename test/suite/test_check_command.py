@@ -6,14 +6,14 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
+from command_line import segfloor
 from junitparser import JUnitXml
 
 from segfloor_ros.suite.description import RESULTS, Entry
@@ -35,9 +35,8 @@ recordings:
 """
 
 
-def check(*arguments) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', 'segfloor_ros.cli.main', 'check', *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240)
+def check(*arguments) -> SimpleNamespace:
+    return segfloor('check', *arguments)
 
 
 def suite_of(folder: Path, room: Path, text: str = SUITE) -> Path:

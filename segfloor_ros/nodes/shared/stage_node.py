@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -216,7 +217,7 @@ class States(ManagedEntity):
         return response
 
 
-class StageNode(LifecycleNode, Generic[Settings]):
+class StageNode(LifecycleNode, ABC, Generic[Settings]):
     """A managed node around one stage.
 
     Configured, it has its topics and services (`set_up`) and an empty map (`reset_stage`).
@@ -254,15 +255,15 @@ class StageNode(LifecycleNode, Generic[Settings]):
         """Return the topics that the node publishes whatever its parameters are."""
         return published_by(self.settings.stage_name())
 
+    @abstractmethod
     def set_up(self) -> None:
         """Make the inputs, the services and further topics. Raises SegfloorError when that cannot
         be.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def reset_stage(self) -> None:
         """Begin with an empty map, first of all after `set_up`. The topics stay."""
-        raise NotImplementedError
 
     def restore(self, saved: MapFile) -> None:
         """Go on with a map, first of all after `reset_stage`: what a killed node has left in
