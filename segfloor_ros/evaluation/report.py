@@ -25,7 +25,6 @@ from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import add_files
 from segfloor_ros.results_folder import REPORT
 
-
 STYLE = Path(__file__).with_name('report.css')
 
 

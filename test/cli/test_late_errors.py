@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,6 +48,15 @@ KNOWN_MOUNT = [
 def drive(tmp_path_factory) -> Path:
     frames, _ = room_drive(FRAMES)
     return write_kitti(tmp_path_factory.mktemp('recording') / 'drive', frames)
+
+
+@pytest.fixture(scope='module')
+def whole(drive, tmp_path_factory) -> Path:
+    """The result of the whole drive."""
+    out = tmp_path_factory.mktemp('whole') / 'out'
+    done = segfloor('run', drive, '--out', out, *KNOWN_MOUNT)
+    assert done.returncode == 0, done.stderr
+    return out
 
 
 def run(*words: object) -> subprocess.Popen[str]:
@@ -100,10 +110,8 @@ def test_an_interrupt_keeps_what_is_mapped_and_no_whole_result_goes(drive, tmp_p
     assert names == {'out', 'out.interrupted', 'room.map', 'room.map.interrupted'}
 
 
-def test_a_killed_run_leaves_what_was_there_and_nothing_else(drive, tmp_path):
-    out = tmp_path / 'out'
-    done = segfloor('run', drive, '--out', out, *KNOWN_MOUNT)
-    assert done.returncode == 0, done.stderr
+def test_a_killed_run_leaves_what_was_there_and_nothing_else(drive, whole, tmp_path):
+    out = shutil.copytree(whole, tmp_path / 'out')
     before = {path: path.read_bytes() for path in out.rglob('*') if path.is_file()}
     masks = len(list(out.rglob('floor_masks/*.png')))
     process = run(drive, '--out', out)
@@ -144,12 +152,11 @@ def test_what_cannot_be_written_is_said_before_the_first_frame(drive, tmp_path, 
     assert (tmp_path / 'photo.map').read_text() == 'mine'
 
 
-def test_files_that_cannot_be_written_late_are_elsewhere(drive, tmp_path):
+def test_files_that_cannot_be_written_late_are_elsewhere(drive, whole, tmp_path):
     """As on a disk that is full: no file may be larger than the summary is."""
-    elsewhere, out, saved = tmp_path / 'elsewhere', tmp_path / 'out', tmp_path / 'room.map'
+    elsewhere, saved = tmp_path / 'elsewhere', tmp_path / 'room.map'
     elsewhere.mkdir()
-    whole = segfloor('run', drive, '--out', out, *KNOWN_MOUNT)
-    assert whole.returncode == 0
+    out = shutil.copytree(whole, tmp_path / 'out')
     before = {path: path.read_bytes() for path in out.rglob('*') if path.is_file()}
     limit = 6000
     assert (out / 'map.pgm').stat().st_size > limit > (out / 'keyframes.txt').stat().st_size

@@ -18,9 +18,9 @@ from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
 from segfloor_ros.messages.images import grey8_image, right_image
 from segfloor_ros.messages.poses import imu_message, pose_array, transform_message, wheel_message
 from segfloor_ros.messages.topics import KEYFRAMES, to_ns
+from segfloor_ros.nodes import slam_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.slam_sensors import MAX_LATE_S, SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -267,14 +267,17 @@ def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
     assert (mask[-40:] == 255).mean() > 0.9
 
 
-def test_right_images_that_are_seen_late_are_taken_before_depth_images(make_graph) -> None:
+def test_right_images_that_are_seen_late_are_taken_before_depth_images(
+    make_graph, monkeypatch
+) -> None:
+    monkeypatch.setattr(slam_camera, 'DISCOVERY_S', 2.0)
     graph = make_graph()
     node = graph.add(StereoSlamNode())
     graph.publisher('left/image_raw')
     graph.publisher('depth/image_raw')
-    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), 1.0)
+    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), 0.5)
     right = graph.publisher('right/image_raw')
-    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), DISCOVERY_S)
+    assert not graph.comes(lambda: node.count_subscribers('depth/image_raw'), 2.0)
     assert node.count_subscribers('right/image_raw') == 1
     graph.tester.destroy_publisher(right)
     graph.until(lambda: node.count_subscribers('depth/image_raw'), 'depth for want of right images')

@@ -98,7 +98,7 @@ def poses_by_stamp(messages) -> dict[int, np.ndarray]:
 def test_the_chain_of_frames_leads_to_the_camera(start, drive) -> None:
     """map → odom → base_link → camera, each link at the stamp of the image."""
     frames, truth = drive
-    chain = start()
+    chain = start(tf_wait_s=1.0)
     graph, tf = chain.graph, Listener(chain.graph)
     keyframes, odometry = graph.collect('keyframe/odometry'), graph.collect('odometry')
     graph.until(lambda: graph.tester.count_subscribers('/tf') >= 2, 'the listeners')
@@ -192,7 +192,7 @@ def test_a_camera_that_hangs_on_its_body_is_put_on_the_base_with_it(start, drive
         others.append(Broadcaster(graph))
         others[0].send_fixed(('camera_link', CAMERA_FRAME, T_body_camera))
 
-    chain = start(broadcast, tf_wait_s=4.0)
+    chain = start(broadcast, tf_wait_s=2.0)
     tf = Listener(chain.graph)
     chain.graph.connected([others[0].fixed])
     chain.drive(frames[:1])

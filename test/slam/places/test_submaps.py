@@ -81,11 +81,16 @@ def test_the_odometry_goes_on_where_the_camera_got_lost(merged):
 def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_there):
     """What it sees 1.6 s after it got lost looks like a place 4 m away."""
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    way = [planar_pose(-2.0 + 0.05 * k, 0.0, 0.0) for k in range(81)]
-    drive(slam, way)
+    way = [planar_pose(-2.0 + 0.1 * k, 0.0, 0.0) for k in range(41)]
+    lost = 2 * len(way)
+    found = lost + 15 + 10 * waited_s
+    # At 0.5 m/s: an image every 0.2 s is enough.
+    for k, pose in enumerate(way):
+        drive(slam, [pose], 2 * k)
     for k in range(15):
-        drive(slam, way[-1:], len(way) + k, StereoRoom(seed=77 + k % 4))
-    drive(slam, way[:40], len(way) + 15 + 10 * waited_s)
+        drive(slam, way[-1:], lost + k, StereoRoom(seed=77 + k % 4))
+    for k, pose in enumerate(way[:20]):
+        drive(slam, [pose], found + 2 * k)
     assert (slam.back_end.submap is Submap.LOST) is not is_there
 
 
