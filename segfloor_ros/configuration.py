@@ -74,7 +74,10 @@ def resolve(
     for assignment in assignments:
         stage, name, value = _parse_assignment(assignment)
         assigned.setdefault(stage, {})[name] = value
-    layers = [('--set', _with_one_robot(assigned, '--set')), ('', stage_changes)]
+    layers: list[tuple[str, Mapping[str, Mapping[str, Any]]]] = [
+        ('--set', _with_one_robot(assigned, '--set')),
+        ('', stage_changes),
+    ]
     if params_file is not None:
         where = str(params_file)
         layers.insert(0, (where, _with_one_robot(read_params_file(params_file), where)))
