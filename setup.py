@@ -71,6 +71,7 @@ setup(
         ],
         'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
         'sim': ['mujoco>=3.3'],
+        'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
         # colcon takes the tests to be pytest's by this name.
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
@@ -80,6 +81,7 @@ setup(
             'pytest',
             'pytest-timeout',
             'pytest-xdist',
+            "rerun-sdk>=0.41; python_version >= '3.11'",
             'ruff',
             "scipy-stubs; python_version >= '3.11'",
             'setuptools<80',

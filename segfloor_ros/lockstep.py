@@ -8,11 +8,11 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,18 @@ T = TypeVar('T')
 
 ProgressListener = Callable[[int, str], None]
 """Told after every frame: how many are done, and the state in words."""
+
+
+class Watcher(Protocol):
+    """Watches a run, and changes nothing."""
+
+    def on_frame(
+        self, frame: StereoFrame, results: Sequence[FrameResult], pipeline: Pipeline
+    ) -> None:
+        """A frame is done; these results came with it."""
+
+    def on_keyframe(self, keyframe: Keyframe, floor: FloorObservation, pipeline: Pipeline) -> None:
+        """A keyframe is in the map; called on the thread that makes the map."""
 
 
 class SaveMasks(str, Enum):
@@ -124,7 +136,7 @@ def no_floor(name: str, frames: int) -> str:
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs. interrupted: ends the drive after the frame at which it is set. path_only: no map is
-    made, and no floor is looked for.
+    made, and no floor is looked for. watcher: sees the drive while it is under way.
 
     note: what there is to say about the map that was to be saved. broken_off: why the recording
     could not be read to its end. no_map: why only a path came of the drive.
@@ -140,7 +152,9 @@ class LockstepRun:
         map_options: MapOptions = NO_MAPS,
         interrupted: threading.Event | None = None,
         path_only: bool = False,
+        watcher: Watcher | None = None,
     ) -> None:
+        self._watcher = watcher
         self._source = source
         self._configuration = configuration
         self._folder = folder
@@ -161,6 +175,7 @@ class LockstepRun:
         self._results: list[FrameResult] = []
         self._failed_frames = 0
         self._faults_said: set[str] = set()
+        self._loop_times_s: list[float] = []
         self._frames = 0
         self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
@@ -251,8 +266,13 @@ class LockstepRun:
                 if self._save_masks is SaveMasks.all:
                     self._unmasked[frame.index] = frame
                 results = self._attempt(frame.index, partial(self._pipeline.process, frame))
-                for result in [lost_frame(frame)] if results is None else results:
+                results = [lost_frame(frame)] if results is None else results
+                for result in results:
                     self._note(result)
+                new_loops = slam.back_end.loop_count - len(self._loop_times_s)
+                self._loop_times_s += [round(1e-9 * frame.stamp_ns, 6)] * new_loops
+                if self._watcher is not None:
+                    self._watcher.on_frame(frame, results, self._pipeline)
                 if self._frames >= SETTLED_FRAMES:
                     self._say_faults()
                 if on_progress is not None:
@@ -312,6 +332,8 @@ class LockstepRun:
             overlay, histogram = mask_overlay(keyframe.left, floor.mask), v_disparity_picture(floor)
             self._folder.add_picture('floor_debug', f'{number}_overlay', overlay)
             self._folder.add_picture('floor_debug', f'{number}_v_disparity', histogram)
+        if self._watcher is not None:
+            self._watcher.on_keyframe(keyframe, floor, self._pipeline)
 
     def _why_no_map(self) -> str:
         name = self._configuration.stereo_camera.input
@@ -343,7 +365,7 @@ class LockstepRun:
             has_map,
             skipped_frames=self._source.skipped_frames,
             keyframes=len(slam.map.keyframes),
-            loops=slam.back_end.loop_count,
+            loop_times_s=self._loop_times_s,
             map_updates=pipeline.keyframe_stages.map_updates,
             sensors=self._sensors_used(),
             sensor_remarks=[*slam.sensors.remarks.values()],

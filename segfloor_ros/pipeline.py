@@ -135,7 +135,7 @@ class Pipeline:
         path_only: bool = False,
     ) -> None:
         self.times = StageTimes()
-        self._camera = camera
+        self.camera = camera
         self.path_only = path_only
         mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
         self.slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
@@ -183,7 +183,7 @@ class Pipeline:
         """Return the whole map, once all keyframes are finished. Raises MapError before there is
         one.
         """
-        saved = save_slam(self.slam, self._camera)
+        saved = save_slam(self.slam, self.camera)
         saved.parts |= self.keyframe_stages.to_arrays()
         return saved
 
@@ -191,7 +191,7 @@ class Pipeline:
         """Go on with a saved map, before the first frame. localize: it stays as it is. Raises
         InputError, by the file's name, for one that is damaged or of another camera.
         """
-        loaded = load_slam(self.slam, self._camera, saved, name, localize)
+        loaded = load_slam(self.slam, self.camera, saved, name, localize)
         self.keyframe_stages.load(saved.parts, loaded, name)
 
     def close(self) -> None:

@@ -64,10 +64,11 @@ class RunSummary:
 
     map: the file, None where only a path came of the drive; camera_height_m, camera_pitch_rad and
     camera_roll_rad are None where the mount is not known. lost_intervals: first and last frame
-    number of every stretch without a pose. relocalisations: the times in seconds at which tracking
-    was lost and found again, lost_s and found_s. submaps: the first_frame and last_frame of every
-    stretch that was mapped without knowing where in the map it is, and whether it was `merged`
-    later; what was not is in no map and no trajectory. sensors: messages used, by name.
+    number of every stretch without a pose. loop_times_s: when loops were closed, and
+    relocalisations: when tracking was lost and found again, lost_s and found_s, in seconds.
+    submaps: the first_frame and last_frame of every stretch that was mapped without knowing where
+    in the map it is, and whether it was `merged` later; what was not is in no map and no
+    trajectory. sensors: messages used, by name.
     repeated_frames: tracked although the camera delivered the image before again, bit for bit.
     blind_frames: with a pose of wheels or gyroscope alone. moving_frames: in which something was
     found that moves. sensor_remarks: what seems wrong with sensors, in words. input_faults: what is
@@ -84,6 +85,7 @@ class RunSummary:
     lost_intervals: list[tuple[int, int]]
     keyframes: int
     loops: int
+    loop_times_s: list[float]
     relocalisations: list[dict[str, float]]
     submaps: list[dict[str, int | bool]]
     map_updates: int
@@ -147,7 +149,12 @@ class DriveFrame:
 
 
 def summarise(
-    frames: Sequence[DriveFrame], wall_s: float, mount: Mount | None, has_map: bool, **others: Any
+    frames: Sequence[DriveFrame],
+    wall_s: float,
+    mount: Mount | None,
+    has_map: bool,
+    loop_times_s: list[float],
+    **others: Any,
 ) -> RunSummary:
     """Return the summary of a drive, whoever drove it. frames: in order of their stamps. others:
     what does not follow from them.
@@ -160,6 +167,8 @@ def summarise(
         frames=len(frames),
         tracked_frames=int(tracked.sum()),
         lost_intervals=lost_intervals(indices, tracked),
+        loops=len(loop_times_s),
+        loop_times_s=loop_times_s,
         relocalisations=relocalisations(stamps, tracked),
         submaps=submap_intervals(indices, in_submap, tracked),
         wall_s=round(wall_s, 3),

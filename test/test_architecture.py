@@ -26,6 +26,7 @@ ONLY_IN = {
     'distributed': ('suite',),
     'fsspec': ('suite',),
     'junitparser': ('suite',),
+    'rerun': ('cli',),
 }
 FLOW = ('camera', 'slam', 'floor', 'cloud', 'grid')
 """Data flows one way: a stage may know the data of the stages before it, not of those behind it."""

@@ -14,7 +14,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.cli.terminal import console, figure_table, print_error, within
+from segfloor_ros.cli.terminal import View, console, figure_table, print_error, within
+from segfloor_ros.cli.view import open_view
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.evaluation.maps import Pose2d
 from segfloor_ros.files.results import add_files, check_target, check_writable
@@ -74,13 +75,13 @@ def check_suite(
     cache: Annotated[
         Path | None,
         typer.Option(
-            help='Folder for results, renderings and copies to use again. '
-            '[default: ~/.cache/segfloor]'
+            help='Folder for results, renderings and copies to use again; else ~/.cache/segfloor.'
         ),
     ] = None,
     no_cache: Annotated[
         bool, typer.Option('--no-cache', help='Map every recording, whatever the cache has.')
     ] = False,
+    view: View = None,
 ) -> None:
     """Map recordings and hold the results against bounds. Status 1: a bound failed."""
     described = read_suite(suite, data)
@@ -93,7 +94,10 @@ def check_suite(
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, Checked] = {}
-    with contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results:
+    with (
+        open_view(view) as shown,
+        contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results,
+    ):
         for job, outcome in results:
             bounds = list(job.entry.bounds)
             if known is not None:
@@ -101,8 +105,10 @@ def check_suite(
             checked = check(outcome, bounds)
             found[checked.name] = checked
             _print_progress(checked, len(found), len(todo))
-    result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
-    _finish(result, out, described, known)
+            if shown is not None and not outcome.problem:
+                shown.results(out / outcome.name, outcome.name)
+        result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
+        _finish(result, out, described, known)
     if baseline_to_write is not None:
         write_baseline(result, baseline_to_write)
         console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)

@@ -7,6 +7,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from importlib import resources, util
 from pathlib import Path
 from typing import Annotated, Any
@@ -29,16 +32,16 @@ from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
-from segfloor_ros.cli.replay import replay
-from segfloor_ros.cli.terminal import console, figure_table, value_table, within
-from segfloor_ros.configuration import Configuration, resolve
+from segfloor_ros.cli.terminal import DriveOptions, console, figure_table, value_table, within
+from segfloor_ros.cli.view import open_view
+from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings, resolve
 from segfloor_ros.errors import MapError, SettingsError, about
 from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.files.results import add_files, check_writable, write_file
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.lockstep import LockstepRun, MapOptions, SaveMasks
-from segfloor_ros.processes import first_interrupt_noted
+from segfloor_ros.lockstep import LockstepRun, SaveMasks
+from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
 
 DEFAULT = BenchmarkPlan()
@@ -50,19 +53,9 @@ DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 """
 
 
+@terminal.with_options
 def run(
-    input: terminal.Input,
-    out: terminal.Out,
-    params: terminal.Params = None,
-    assignments: terminal.Set = None,
-    start: terminal.Start = None,
-    frames: terminal.Frames = None,
-    every: terminal.Every = None,
-    ignore: terminal.Ignore = None,
-    depth: terminal.Depth = False,
-    save_masks: Annotated[
-        SaveMasks, typer.Option(help='Floor masks to save.')
-    ] = SaveMasks.keyframes,
+    options: terminal.DriveOptions,
     save_debug: Annotated[
         bool,
         typer.Option(
@@ -70,45 +63,133 @@ def run(
             help='Save pictures of the floor of each keyframe: mask, v-disparity with profile.',
         ),
     ] = False,
-    masks: terminal.Masks = None,
-    save_map: terminal.SaveMap = None,
-    load_map: terminal.LoadMap = None,
-    localize: terminal.Localize = False,
-    report: terminal.Report = False,
-    no_map: terminal.NoMap = False,
 ) -> None:
     """Map a recording: every frame, no ROS graph, the same result byte for byte."""
-    maps = MapOptions(load_map, save_map, localize)
-    part = {'start': start, 'frames': frames, 'every': every}
-    configuration = terminal.configuration(
-        params, assignments, input, masks=masks, ignore=ignore, depth=depth, **part
-    )
-    source = open_source(configuration.stereo_camera)
-    terminal.print_sensors(source.sensors)
-    inputs = (configuration.stereo_camera.input, configuration.stereo_camera.masks)
-    with OutputFolder(out, inputs) as folder, first_interrupt_noted() as interrupt:
-        with terminal.progress_bar('mapping', source.frame_count) as progress:
+    _run(options, save_debug)
+
+
+def _run(options: DriveOptions, save_debug: bool = False) -> None:
+    maps = options.maps
+    configuration, source = options.open()
+    with open_view(options.view) as view:
+        with (
+            _drive(options, configuration) as (folder, interrupt),
+            terminal.progress_bar('mapping', source.frame_count) as progress,
+        ):
             drive = LockstepRun(
-                source, configuration, folder, save_masks, save_debug, maps, interrupt, no_map
+                source,
+                configuration,
+                folder,
+                options.save_masks,
+                save_debug,
+                maps,
+                interrupt,
+                options.no_map,
+                view,
             )
+            result = drive.execute(progress)
+            folder.write(result)
             try:
-                result = drive.execute(progress)
-            except MapError:
-                terminal.end_if_interrupted(interrupt)
-                raise
-        folder.write(result)
+                drive.save_map()
+            except Exception as error:  # whatever it is, the results are there
+                folder.problems.append(str(error) or type(error).__name__)
+        if view is not None:
+            view.on_result(result)
+        terminal.print_summary(options.input, result.summary)
+        remarks, status = [drive.note] if drive.note else [], interrupt.status
+        if drive.no_map and not options.no_map:
+            folder.problems.append(drive.no_map)
+        if drive.broken_off is not None:
+            remarks.append(f'{drive.broken_off}; the map is of what came before')
+            status = status or 2
+        terminal.finish_run(options.input, options.out, folder, options.report, remarks, status)
+
+
+@contextmanager
+def _drive(
+    options: DriveOptions, configuration: Configuration
+) -> Iterator[tuple[OutputFolder, Interrupt]]:
+    """The results folder of a drive, and the interrupt that ends it early: where there is no map
+    yet, the command ends.
+    """
+    camera = configuration.stereo_camera
+    with (
+        OutputFolder(options.out, (camera.input, camera.masks)) as folder,
+        first_interrupt_noted() as interrupt,
+    ):
         try:
-            drive.save_map()
-        except Exception as error:  # whatever it is, the results are there
-            folder.problems.append(str(error) or type(error).__name__)
-    terminal.print_summary(input, result.summary)
-    remarks, status = [drive.note] if drive.note else [], interrupt.status
-    if drive.no_map and not no_map:
-        folder.problems.append(drive.no_map)
-    if drive.broken_off is not None:
-        remarks.append(f'{drive.broken_off}; the map is of what came before')
-        status = status or 2
-    terminal.finish_run(input, out, folder, report, remarks, status)
+            yield folder, interrupt
+        except MapError:
+            terminal.end_if_interrupted(interrupt)
+            raise
+
+
+@terminal.with_options
+def replay(
+    options: terminal.DriveOptions,
+    rate: Annotated[
+        float,
+        typer.Option(
+            help='Speed against real time, less where the nodes cannot follow; 0: full speed.'
+        ),
+    ] = 1.0,
+) -> None:
+    """Map a recording with the five ROS 2 nodes over DDS."""
+    _replay(options, rate)
+
+
+def _replay(options: DriveOptions, rate: float) -> None:
+    try:
+        from segfloor_ros.cli.replay_session import ReplaySession
+    except ImportError as error:
+        raise SettingsError(
+            f'replay needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
+            "pip install 'segfloor_ros[ros]'"
+        ) from None
+    if options.save_masks is SaveMasks.all:
+        raise SettingsError(
+            '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
+        )
+    StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
+    maps = options.maps
+    # The camera node reads it; it is opened here so that bad input ends at once.
+    configuration, source = options.open()
+    if source.takes_depth:
+        camera = dataclasses.replace(configuration.stereo_camera, depth=True)
+        configuration = dataclasses.replace(configuration, stereo_camera=camera)
+    loaded = maps.read(source.camera)
+    with open_view(options.view) as view:
+        with (
+            _drive(options, configuration) as (folder, interrupt),
+            terminal.progress_bar('replaying', source.frame_count) as progress,
+        ):
+            keep = partial(folder.add_picture, 'floor_masks')
+            session = ReplaySession(
+                configuration,
+                options.params,
+                rate,
+                keep if options.save_masks is SaveMasks.keyframes else None,
+                progress,
+                interrupt,
+                maps,
+                loaded,
+                options.no_map,
+                view,
+            )
+            result, found = session.execute()
+            folder.write(result)
+        if view is not None:
+            view.on_result(result)
+        terminal.print_summary(options.input, result.summary)
+        console.print(
+            f'nodes connected in {found.discovery_s:.1f} s, stopped in {found.shutdown_s:.1f} s; '
+            f'keyframes that failed: {found.failed_keyframes}',
+            highlight=False,
+        )
+        status = interrupt.status or found.status
+        terminal.finish_run(
+            options.input, options.out, folder, options.report, found.notices, status
+        )
 
 
 def demo(
@@ -126,10 +207,10 @@ def demo(
     drive = str(DRIVE / 'drive.mcap')
     if lockstep or util.find_spec('rclpy') is None:
         console.print('mapping a simulated drive through a corridor, in one process without ROS')
-        run(drive, out)
+        _run(DriveOptions(drive, out=out))
     else:
         console.print('replaying a simulated drive through a corridor through the five nodes')
-        replay(drive, out, rate=rate)
+        _replay(DriveOptions(drive, out=out), rate)
     _print_scores(out)
 
 
@@ -151,6 +232,32 @@ def _print_scores(out: Path) -> None:
     add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
     console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)
+
+
+@terminal.with_options
+def view(
+    options: terminal.InputOptions,
+    live: Annotated[
+        bool, typer.Option('--live', help='Show running nodes; INPUT is their namespace, e.g. /.')
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option('--out', metavar='FILE.rrd', help='Write a file, open no window.')
+    ] = None,
+) -> None:
+    """Show the results folder of a run, a recording or the nodes that run."""
+    folder = Path(options.input)
+    with open_view(str(out or '')) as shown:
+        assert shown is not None
+        if live:
+            try:
+                from segfloor_ros.cli.replay_recorder import watch
+            except ImportError as error:
+                raise SettingsError(f'--live needs ROS 2 ({error})') from None
+            watch(shown, options.input)
+        elif (folder / 'summary.json').is_file():
+            shown.results(folder)
+        else:
+            shown.recording(open_source(options.configuration().stereo_camera))
 
 
 def simulate(
@@ -202,21 +309,16 @@ def simulate(
     console.print(f'{facts}: {out}', highlight=False)
 
 
+@terminal.with_options
 def convert(
-    input: terminal.Input,
+    options: terminal.InputOptions,
     out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
     images: Annotated[
         ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
     ] = ImageCoding.raw,
-    start: terminal.Start = None,
-    frames: terminal.Frames = None,
-    every: terminal.Every = None,
-    params: terminal.Params = None,
-    assignments: terminal.Set = None,
 ) -> None:
     """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured."""
-    part = {'start': start, 'frames': frames, 'every': every}
-    settings = terminal.configuration(params, assignments, input, **part).stereo_camera
+    settings = options.configuration().stereo_camera
     source = open_source(settings)
     terminal.print_sensors(source.sensors)
     has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)

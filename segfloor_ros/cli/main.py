@@ -11,10 +11,19 @@ import typer
 
 import segfloor_ros
 from segfloor_ros.cli.check import check_suite
-from segfloor_ros.cli.commands import benchmark, calibrate, convert, demo, run, simulate
+from segfloor_ros.cli.commands import (
+    benchmark,
+    calibrate,
+    convert,
+    demo,
+    replay,
+    run,
+    simulate,
+    view,
+)
 from segfloor_ros.cli.evaluate import app as evaluate
-from segfloor_ros.cli.replay import replay
 from segfloor_ros.cli.terminal import print_error
+from segfloor_ros.cli.view import SUFFIX
 from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.images import own_standard_error
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
@@ -25,7 +34,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, simulate, calibrate, convert, benchmark, demo):
+for command in (run, replay, view, simulate, calibrate, convert, benchmark, demo):
     app.command()(command)
 app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')
@@ -62,6 +71,13 @@ def run_command(command: Callable[..., None]) -> None:
     run_app(program)
 
 
+def with_optional_values(words: list[str]) -> list[str]:
+    """Return the words of a command line with `--view=` for a `--view` without a file."""
+    files = [*words[1:], '']
+    pairs = zip(words, files, strict=True)
+    return ['--view=' if w == '--view' and not f.endswith(SUFFIX) else w for w, f in pairs]
+
+
 def run_app(program: typer.Typer) -> None:
     """Run a command line; known errors print one line.
 
@@ -70,7 +86,7 @@ def run_app(program: typer.Typer) -> None:
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
     try:
         with terminated_like_interrupted():
-            program()
+            program(args=with_optional_values(sys.argv[1:]))
     except MapError as error:
         print_error(str(error))
         sys.exit(1)

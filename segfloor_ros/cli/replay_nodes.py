@@ -21,9 +21,10 @@ from typing import Any
 import rclpy
 import yaml
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from segfloor_ros.cli.replay_recorder import MaskListener, ReplayRecorder
+from segfloor_ros.cli.replay_recorder import SPIN_S, MaskListener, ReplayRecorder
 from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.lockstep import ProgressListener
@@ -41,8 +42,6 @@ _reservation: socket.socket | None = None
 
 STALL_S = 60.0
 """So long nodes may take to connect, to go on, or to save a map."""
-
-SPIN_S = 0.1
 
 STOP_S = 1.2
 """So long processes have to end at a signal before the next, harder one."""
@@ -278,6 +277,10 @@ class NodeGraph:
         self.folder = folder
         self._executor = SingleThreadedExecutor(context=recorder.context)
         self._executor.add_node(recorder)
+
+    def add(self, node: Node) -> None:
+        """Have a node of this process handle what arrives, too."""
+        self._executor.add_node(node)
 
     def connect(self, is_paced: bool = True, interrupted: threading.Event | None = None) -> float:
         """Wait until every topic has its subscribers; returns the seconds it took."""

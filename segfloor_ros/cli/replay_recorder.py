@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import defaultdict
@@ -10,16 +11,23 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.camera.model import Mount
+from segfloor_ros.cli.view import View
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import diagnostics
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.images import bgr_image, grey8_image
+from segfloor_ros.messages.maps import grid_of, labelled_arrays, moving_points_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.messages.topics import (
     CAMERA,
@@ -41,11 +49,19 @@ from segfloor_ros.trajectory import TrackedPose
 MaskListener = Callable[[str, NDArray[np.uint8]], None]
 """Gets the number of a frame, as in the names of masks, and its floor mask."""
 
+SPIN_S = 0.1
+"""So long what arrives is waited for at a time."""
+
 POSES = ('odometry', 'pose')
 MASK, POINTS, KEYFRAME = 'keyframe/floor_mask', 'map_points', 'keyframe/odometry'
-OF_PATH = (*POSES, 'camera_mount', 'keyframe/path')
-OF_MAP = (*OF_PATH, MASK, 'labelled_points', 'map')
+MOUNT, LABELLED = 'camera_mount', 'labelled_points'
+OF_PATH = (*POSES, MOUNT, 'keyframe/path')
+OF_MAP = (*OF_PATH, MASK, LABELLED, 'map')
 """What a replay records: of a path alone, and of a map."""
+
+
+FRAME, FRAME_INFO = 'frame/left/image_rect', 'frame/left/camera_info'
+OVERLAY, MOVING = 'keyframe/floor_overlay', 'moving_points'
 
 
 class DriveNotes:
@@ -127,9 +143,13 @@ class DriveNotes:
         return {stamp_ns for stamp_ns, s in self.answers.items() if s.values.get(name) == '1'}
 
     @property
-    def loops(self) -> int:
-        """How many loops SLAM has closed."""
-        return int(self._last_value('loops') or 0)
+    def loop_times_s(self) -> list[float]:
+        """When SLAM has closed loops, in seconds."""
+        times: list[float] = []
+        for stamp_ns, status in sorted(self.answers.items()):
+            new = int(status.values.get('loops', 0)) - len(times)
+            times += [round(1e-9 * stamp_ns, 6)] * new
+        return times
 
     @property
     def remarks(self) -> list[str]:
@@ -210,7 +230,7 @@ class ReplayRecorder(Node):
     @property
     def mount(self) -> Mount | None:
         """Where the camera sits on the base, None while it is not known."""
-        message = self.latest.get('camera_mount')
+        message = self.latest.get(MOUNT)
         return None if message is None else Mount.from_transform(transform_array(message))
 
     def is_drained(self) -> bool:
@@ -251,3 +271,75 @@ class ReplayRecorder(Node):
         for stamp_ns in sorted(self._masks.keys() & self.notes.frame_index.keys()):
             assert self._on_mask is not None
             self._on_mask(f'{self.notes.frame_index[stamp_ns]:06d}', self._masks.pop(stamp_ns))
+
+
+class ViewNode(Node):
+    """Shows what the nodes of a namespace publish."""
+
+    def __init__(self, context: Context, view: View, namespace: str = '') -> None:
+        super().__init__('segfloor_view', context=context, namespace=namespace)
+        self._view = view
+        self._K: Array | None = None
+        self._T_base_left: Array | None = None
+        shown: dict[str, Callable[[int, Any], None]] = {
+            FRAME: lambda at, message: view.image(at, grey8_image(message, FRAME)),
+            FRAME_INFO: self._take_info,
+            MOUNT: self._take_mount,
+            'pose': lambda at, message: view.pose(at, pose_array(message.pose.pose)),
+            OVERLAY: lambda at, message: view.overlay(at, bgr_image(message, OVERLAY)),
+            'keyframe/path': lambda at, message: view.path(at, path_arrays(message)),
+            MOVING: lambda at, message: view.moving_points(
+                at, moving_points_arrays(message, MOVING)
+            ),
+            LABELLED: lambda at, message: view.cloud(at, labelled_arrays(message, LABELLED)),
+            'map': lambda at, message: view.grid(at, grid_of(message)),
+        }
+        for name, show in shown.items():
+            topic, take = TOPICS[name], partial(self._take, name, show)
+            self.create_subscription(topic.type, name, take, topic.profile)
+        self.create_subscription(
+            DIAGNOSTICS.type, DIAGNOSTICS.name, self._take_statuses, DIAGNOSTICS.profile
+        )
+
+    def _take(self, name: str, show: Callable[[int, Any], None], message: Any) -> None:
+        self._view.paced(name, lambda: show(to_ns(message.header.stamp), message))
+
+    def _take_info(self, stamp_ns: int, message: CameraInfo) -> None:
+        is_new = self._K is None
+        self._K = np.reshape(message.p, (3, 4))[:, :3]
+        self._size = message.width, message.height
+        if is_new:
+            self._show_camera()
+
+    def _take_mount(self, stamp_ns: int, message: TransformStamped) -> None:
+        self._T_base_left = transform_array(message)
+        self._show_camera()
+
+    def _show_camera(self) -> None:
+        if self._K is not None and self._T_base_left is not None:
+            self._view.camera(self._K, self._size, self._T_base_left)
+
+    def _take_statuses(self, message: DiagnosticArray) -> None:
+        for status in diagnostics.statuses(message):
+            if status.kind or not status.stamp_ns:
+                continue
+            if 'processing_ms' in status.values:
+                duration_s = 1e-3 * float(status.values['processing_ms'])
+                self._view.duration(status.stamp_ns, status.node, duration_s)
+            if status.node == SLAM:
+                self._view.state(status.stamp_ns, status.message)
+                self._view.loops(status.stamp_ns, int(status.values.get('loops', 0)))
+
+
+def watch(view: View, namespace: str) -> None:
+    """Show the live graph until an interrupt."""
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(ViewNode(context, view, namespace))
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                executor.spin_once(timeout_sec=SPIN_S)
+    finally:
+        rclpy.try_shutdown(context=context)

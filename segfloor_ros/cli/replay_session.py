@@ -28,7 +28,8 @@ from segfloor_ros.cli.replay_nodes import (
     ReplayError,
     running_nodes,
 )
-from segfloor_ros.cli.replay_recorder import POINTS, MaskListener, ReplayRecorder
+from segfloor_ros.cli.replay_recorder import POINTS, MaskListener, ReplayRecorder, ViewNode
+from segfloor_ros.cli.view import View
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError, SegfloorError
@@ -83,6 +84,7 @@ class ReplaySession:
     maps: MapOptions = NO_MAPS
     loaded: MapFile | None = None
     path_only: bool = False
+    view: View | None = None
 
     def execute(self) -> tuple[RunResult, ReplayReport]:
         """Run the replay. An interrupt, a node that dies or a recording that breaks off ends it
@@ -93,6 +95,8 @@ class ReplaySession:
         """
         nodes = (CAMERA, SLAM) if self.path_only else NODES
         with running_nodes(self._parameters, self.params_file, self.on_mask, nodes) as graph:
+            if self.view is not None:
+                graph.add(ViewNode(graph.recorder.context, self.view))
             return self._follow(graph)
 
     def _parameters(self, folder: Path) -> dict[str, Any]:
@@ -230,7 +234,7 @@ class ReplaySession:
             grid is not None,
             skipped_frames=int(notes.finished.values['skipped']) if notes.finished else 0,
             keyframes=count,
-            loops=notes.loops,
+            loop_times_s=notes.loop_times_s,
             map_updates=len(notes.updated),
             sensors=_sensors_sent(notes.finished),
             sensor_remarks=notes.remarks,

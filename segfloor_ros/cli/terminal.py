@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
@@ -21,11 +24,15 @@ from rich.progress import (
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
+import segfloor_ros
 from segfloor_ros.camera.model import RecordedSensor
+from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError, printable
+from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
+from segfloor_ros.settings import suggestion
 
 console = Console(markup=False)
 error_console = Console(stderr=True, soft_wrap=True, markup=False)
@@ -176,7 +183,14 @@ Frames = Annotated[int | None, typer.Option('--frames', help='How many frames ar
 Every = Annotated[int | None, typer.Option('--every', help='Read every n-th frame only.')]
 Out = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
 Params = Annotated[
-    Path | None, typer.Option('--params', help='ROS parameter file (YAML) for all stages.')
+    Path | None,
+    typer.Option(
+        '--params',
+        callback=lambda path: path and params_file(path),
+        metavar='FILE|NAME',
+        help='ROS parameter file (YAML) for all stages, or the name of one that comes with the '
+        'package (segfloor params).',
+    ),
 ]
 Set = Annotated[
     list[str] | None,
@@ -197,6 +211,9 @@ Ignore = Annotated[
 Depth = Annotated[
     bool, typer.Option('--depth', help='Take depth images in place of the right ones.')
 ]
+SaveMask = Annotated[
+    SaveMasks, typer.Option('--save-masks', help='Floor masks to save; all of them by run only.')
+]
 SaveMap = Annotated[
     Path | None,
     typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
@@ -209,11 +226,118 @@ Localize = Annotated[
 Report = Annotated[
     bool, typer.Option('--report', help='Write report.html: everything about the run on one page.')
 ]
-
-
 NoMap = Annotated[
     bool, typer.Option('--no-map', help='The path alone: no floor is looked for, no map made.')
 ]
+View = Annotated[
+    str | None,
+    typer.Option(
+        '--view',
+        metavar='[FILE.rrd]',
+        help='Show what happens in a window of rerun, or write it to a file for that.',
+    ),
+]
+Json = Annotated[bool, typer.Option('--json', help='Print JSON in place of the table.')]
+
+
+@dataclasses.dataclass(frozen=True)
+class InputOptions:
+    """A recording, or a part of it, with the parameters it is read with."""
+
+    input: Input
+    start: Start = None
+    frames: Frames = None
+    every: Every = None
+    params: Params = None
+    assignments: Set = None
+
+    def configuration(self, **camera: Any) -> Configuration:
+        """Return the configuration that the options stand for. camera: further settings of
+        `stereo_camera`.
+        """
+        part = {'start': self.start, 'frames': self.frames, 'every': self.every}
+        return configuration(self.params, self.assignments, self.input, **part, **camera)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DriveOptions(InputOptions):
+    """What `run` and `replay` have in common."""
+
+    out: Out
+    ignore: Ignore = None
+    depth: Depth = False
+    masks: Masks = None
+    save_masks: SaveMask = SaveMasks.keyframes
+    save_map: SaveMap = None
+    load_map: LoadMap = None
+    localize: Localize = False
+    no_map: NoMap = False
+    report: Report = False
+    view: View = None
+
+    @property
+    def maps(self) -> MapOptions:
+        """The maps to go on with and to save. Raises SettingsError where they contradict."""
+        return MapOptions(self.load_map, self.save_map, self.localize)
+
+    def open(self) -> tuple[Configuration, StereoSource]:
+        """Open the recording, and say what sensors it has."""
+        sensors = {'masks': self.masks, 'ignore': self.ignore, 'depth': self.depth}
+        configuration = self.configuration(**sensors)
+        source = open_source(configuration.stereo_camera)
+        print_sensors(source.sensors)
+        return configuration, source
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of its first parameter, a dataclass, as options."""
+    hints = get_type_hints(command, include_extras=True)
+    first, *own = inspect.signature(command).parameters.values()
+    group = hints.pop(first.name)
+    fields = dataclasses.fields(group)
+    hints |= get_type_hints(group, include_extras=True)
+
+    @functools.wraps(command)
+    def with_all(**values: Any) -> None:
+        options = group(**{field.name: values.pop(field.name) for field in fields})
+        command(options, **values)
+
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    given = [(field.name, field.default) for field in fields] + [(p.name, p.default) for p in own]
+    parameters = [
+        inspect.Parameter(
+            name,
+            keyword,
+            default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
+            annotation=hints[name],
+        )
+        for name, default in given
+    ]
+    with_all.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_all.__annotations__ = hints
+    return with_all
+
+
+def shipped_params() -> dict[str, Path]:
+    """Return the parameter files that come with the package, by name."""
+    package = Path(segfloor_ros.__file__).parent
+    # Of a checkout, and of an installation by pip or colcon, which is lib/python3/site-packages.
+    places = package.parent, package.parents[3] / 'share' / package.name
+    found = next((place / 'params' for place in places if (place / 'params').is_dir()), package)
+    return {path.stem: path for path in sorted(found.glob('*.yaml'))}
+
+
+def params_file(path: Path) -> Path:
+    """Return the parameter file of a path or of a shipped name. Raises SettingsError."""
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = shipped_params()
+    if path.name not in shipped:
+        near = suggestion(path.name, list(shipped))
+        raise SettingsError(
+            f'--params {path}: no such file, and none of this name is shipped{near}'
+        )
+    return shipped[path.name]
 
 
 def configuration(

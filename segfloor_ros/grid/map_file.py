@@ -70,7 +70,7 @@ def save_map(grid: OccupancyGrid, path: Path) -> None:
         'occupied_thresh': OCCUPIED_THRESH,
         'free_thresh': FREE_THRESH,
     }
-    _replace_file(image_path, _pgm_bytes(_trinary_pixels(grid.cells)[::-1]))
+    _replace_file(image_path, _pgm_bytes(pixels_of(grid.cells)))
     _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
 
 
@@ -87,11 +87,14 @@ def load_map(path: Path) -> OccupancyGrid:
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), description['resolution'], (x, y))
 
 
-def _trinary_pixels(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
+def pixels_of(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
+    """Return cells (H, W) as a picture (H, W) in the grey levels of map_server: its first row is
+    their last.
+    """
     pixels = np.full(cells.shape, UNKNOWN_PIXEL, np.uint8)
     pixels[(cells >= FREE) & (cells < 100 * FREE_THRESH)] = FREE_PIXEL
     pixels[cells > 100 * OCCUPIED_THRESH] = OCCUPIED_PIXEL
-    return pixels
+    return pixels[::-1]
 
 
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:

@@ -67,6 +67,14 @@ def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
     return image.astype(np.uint8, copy=False)
 
 
+def bgr_image(message: Image, topic: str) -> NDArray[np.uint8]:
+    """Return the picture (H, W, 3) of a message of encoding bgr8. Raises InputError."""
+    row = np.frombuffer(message.data, np.uint8)
+    if message.encoding != 'bgr8' or len(row) != message.height * message.width * 3:
+        raise InputError(f'{topic}: {message.encoding} or its size is not that of a bgr8 picture')
+    return row.reshape(message.height, message.width, 3)
+
+
 def right_image(message: Image, topic: str) -> NDArray[Any]:
     """Return the right image (H, W) uint8 of a message; of a depth camera the disparity (H, W)
     float32 in its place. Raises InputError.

@@ -117,6 +117,13 @@ def moving_points_message(stamp_ns: int, frame_id: str, moving: MovingPoints) ->
     return cloud_message(stamp_ns, frame_id, points)
 
 
+def moving_points_arrays(message: PointCloud2, topic: str) -> MovingPoints:
+    """Return the points of what moves. Raises InputError."""
+    points = cloud_array(message, MOVING_DTYPE, topic)
+    velocity = np.stack([points[name] for name in ('vx', 'vy', 'vz')], axis=1)
+    return MovingPoints(_xyz(points), velocity.astype(np.float32))
+
+
 def sparse_cloud_message(stamp_ns: int, frame_id: str, cloud: SparseCloud) -> PointCloud2:
     """Return the sparse map as a cloud with x y z and id."""
     points = _points(MAP_POINT_DTYPE, cloud.xyz_map, id=cloud.point_id)

@@ -121,6 +121,21 @@ def test_a_path_alone_is_that_of_the_run(drive, tmp_path) -> None:
     assert (run['map'], run['camera_height_m'], run['tracked_frames']) == (None, None, FRAMES)
 
 
+def test_a_replay_is_watched_without_a_change(drive, tmp_path) -> None:
+    chunk = pytest.importorskip('rerun.chunk', reason='rerun is not installed')
+    out, shown = tmp_path / 'out', tmp_path / 'replay.rrd'
+    words = ('replay', drive, '--rate', 0, '--out', out)
+    status, _, errors = segfloor(*words, '--view', shown)
+    assert status == 0, errors
+    entities = {str(c.entity_path) for c in chunk.RrdReader(shown).stream().to_chunks()}
+    world = ('base', 'base/camera', 'cloud', 'keyframes', 'map', 'path')
+    wanted = {f'/world/{part}' for part in world} | {'/keyframe', '/log', '/ms/stereo_slam'}
+    assert wanted <= entities
+    assert segfloor('run', drive, '--out', tmp_path / 'run')[0] == 0
+    for name in SAME_FILES:
+        assert (out / name).read_bytes() == (tmp_path / 'run' / name).read_bytes(), name
+
+
 def test_eyes_that_are_exchanged_are_said_also_where_no_map_comes_of_it(tmp_path) -> None:
     frames = [replace(f, left=f.right, right=f.left) for f in room_drive(5)[0]]
     drive = write_kitti(tmp_path / 'exchanged', frames)

@@ -1,0 +1,369 @@
+"""What a drive looks like, in a window of rerun: while it is mapped, and afterwards.
+
+Showing changes no result, and what would slow a drive down is left out.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoFrame
+from segfloor_ros.camera.sources import StereoSource, open_source
+from segfloor_ros.cli.terminal import console, progress_bar
+from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.configuration import resolve
+from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.files.images import read_mask
+from segfloor_ros.files.results import check_writable
+from segfloor_ros.floor.observation import FloorObservation
+from segfloor_ros.floor.segmentation import mask_overlay
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map, pixels_of
+from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.results_folder import MAP, MOUNT_FIGURES, RunResult, read_summary, summary_rows
+from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, MovingPoints
+from segfloor_ros.trajectory import read_trajectory
+
+SUFFIX = '.rrd'
+
+SHARE = 0.02
+"""Of the time of a drive that showing its frames may take, and as much its keyframes."""
+
+WIDTH_PX, QUALITY = 480, 80
+"""Of the JPEG images that are shown."""
+
+PATH_M, POINT_M, CAMERA_M = 0.02, 0.015, 0.3
+"""Radii of path and points, and how far ahead of the camera its image is drawn."""
+
+HIGH_M = 2.0
+"""Obstacles are coloured by their height up to this."""
+
+PATH_RGB, KEYFRAME_RGB, LOOP_RGB = (31, 119, 180), (255, 127, 14), (214, 39, 40)
+FLOOR_RGB, UNKNOWN_RGB, MOVING_RGB = (58, 166, 85), (150, 150, 150), (225, 40, 200)
+
+BASE = 'world/base'
+CAMERA = f'{BASE}/camera'
+KEYFRAME, RIGHT, TIMES, TEXT, ABOUT = 'keyframe', 'right', 'ms', 'log', 'about'
+
+
+@contextmanager
+def open_view(target: str | None) -> Iterator[View | None]:
+    """Open a window, or a file where `target` names one; None: show nothing. A window stays open
+    after the block. Raises SettingsError where rerun is not installed.
+    """
+    if target is None:
+        yield None
+        return
+    try:
+        import rerun
+    except ImportError:
+        raise SettingsError(
+            "to view needs rerun, which is not installed: pip install 'segfloor_ros[view]'"
+        ) from None
+    stream = rerun.RecordingStream('segfloor')
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    is_served = False
+    if target:
+        if not target.endswith(SUFFIX):
+            raise SettingsError(f'{target}: the file of a view ends in {SUFFIX}')
+        check_writable(Path(target), 'view')
+        stream.save(target)
+    elif os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
+        stream.spawn()
+    else:
+        rerun.serve_web_viewer(connect_to=stream.serve_grpc())
+        is_served = True
+    try:
+        yield View(stream, rerun)
+    finally:
+        stream.flush()
+    if target:
+        console.print(f'view: {target}, for the command rerun', highlight=False, soft_wrap=True)
+    if is_served:
+        console.print('the view is there until Ctrl-C')
+        with suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(1.0)
+
+
+class View:
+    """Shows a drive in a stream of rerun, below an entity `root`."""
+
+    def __init__(self, stream: Any, rerun: ModuleType, root: str = '') -> None:
+        self._stream, self._rr, self._root = stream, rerun, root
+        self._start_ns: int | None = None
+        self._next_s: dict[str, float] = {}
+        self._state = ''
+        self._loops_ns: list[int] = []
+        self._shown: list[str] = []
+        self._log(None, 'world', rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if not root:
+            self._lay_out()
+
+    def on_frame(
+        self, frame: StereoFrame, results: Sequence[FrameResult], pipeline: Pipeline
+    ) -> None:
+        """Show a frame of a run and the results that came with it."""
+        self.paced(CAMERA, lambda: self.image(frame.stamp_ns, frame.left))
+        for result in results:
+            self.state(result.stamp_ns, result.state)
+        if results:
+            self.paced(BASE, lambda: self._pose_of(results[-1]))
+        self.loops(frame.stamp_ns, pipeline.slam.back_end.loop_count)
+
+    def _pose_of(self, result: FrameResult) -> None:
+        if result.tracked:
+            self.pose(result.stamp_ns, result.T_map_odom @ result.T_odom_base)
+        if result.moving is not None:
+            self.moving_points(result.stamp_ns, result.moving)
+
+    def on_keyframe(self, keyframe: Keyframe, floor: FloorObservation, pipeline: Pipeline) -> None:
+        """Show a keyframe of a run that has come to the map."""
+        self.paced(KEYFRAME, lambda: self._keyframe(keyframe, floor, pipeline))
+
+    def _keyframe(self, keyframe: Keyframe, floor: FloorObservation, pipeline: Pipeline) -> None:
+        stamp_ns, stages = keyframe.stamp_ns, pipeline.keyframe_stages
+        assert pipeline.mount is not None
+        camera = pipeline.camera
+        self.camera(camera.K, (camera.width, camera.height), pipeline.mount.T_base_left)
+        self.overlay(stamp_ns, mask_overlay(keyframe.left, floor.mask), keyframe.moving)
+        self.path(stamp_ns, keyframe.path)
+        self.cloud(stamp_ns, stages.labelled)
+        self.grid(stamp_ns, stages.grid())
+        for stage, durations_s in pipeline.times.durations_s.items():
+            self.duration(stamp_ns, stage, durations_s[-1])
+
+    def on_result(self, result: RunResult) -> None:
+        """Show what came of a drive, all of it."""
+        stamp_ns, path = int(result.trajectory.stamp_ns[-1]), result.keyframes
+        self.path(stamp_ns, KeyframePath(path.stamp_ns, path.poses))
+        self.cloud(stamp_ns, result.labelled)
+        self.grid(stamp_ns, result.grid)
+        self.about('Result', summary_rows(result.summary))
+
+    def paced(self, what: str, show: Callable[[], None]) -> None:
+        """Show something, unless the last of its kind took too long for that."""
+        if time.perf_counter() >= self._next_s.get(what, 0.0):
+            start_s = time.thread_time()
+            show()
+            pause_s = (time.thread_time() - start_s) / SHARE
+            self._next_s[what] = time.perf_counter() + pause_s
+
+    def image(self, stamp_ns: int, left: NDArray[np.uint8]) -> None:
+        """Show the rectified left image (H, W) of a frame."""
+        self._picture(stamp_ns, CAMERA, left)
+
+    def pair(self, frame: StereoFrame) -> None:
+        """Show both images of a frame; a disparity as grey levels."""
+        self.image(frame.stamp_ns, frame.left)
+        levels = cv2.normalize(frame.right.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX)
+        is_image = frame.right.dtype == np.uint8
+        self._picture(frame.stamp_ns, RIGHT, frame.right if is_image else levels.astype(np.uint8))
+
+    def overlay(
+        self, stamp_ns: int, picture: NDArray[np.uint8], moving: NDArray[np.uint8] | None = None
+    ) -> None:
+        """Show a keyframe (H, W, 3) BGR tinted by its floor, and in it what moves (H, W)."""
+        if moving is not None:
+            picture = picture.copy()
+            picture[moving > 0] = MOVING_RGB[::-1]
+        self._picture(stamp_ns, KEYFRAME, picture)
+
+    def camera(self, K: Array, size: tuple[int, int], T_base_left: Array) -> None:
+        """Show a camera of intrinsics (3, 3) and size (width, height) where it is on the base."""
+        scale = WIDTH_PX / size[0]
+        pinhole = self._rr.Pinhole(
+            image_from_camera=np.diag([scale, scale, 1.0]) @ K,
+            resolution=(WIDTH_PX, round(scale * size[1])),
+            image_plane_distance=CAMERA_M,
+        )
+        self._log(None, CAMERA, pinhole)
+        self._log(None, CAMERA, self._transform(T_base_left))
+
+    def pose(self, stamp_ns: int, T_map_base: Array) -> None:
+        """Show where the base (4, 4) is."""
+        self._log(stamp_ns, BASE, self._transform(T_map_base))
+
+    def _transform(self, T: Array) -> Any:
+        return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+
+    def path(self, stamp_ns: int, path: KeyframePath) -> None:
+        """Show the keyframes as they are now, and where loops were closed."""
+        rr, xyz = self._rr, path.T_map_base[:, :3, 3]
+        self._log(stamp_ns, 'world/path', rr.LineStrips3D([xyz], colors=PATH_RGB, radii=PATH_M))
+        dots = rr.Points3D(xyz, colors=KEYFRAME_RGB, radii=2 * PATH_M)
+        self._log(stamp_ns, 'world/keyframes', dots)
+        closed = np.searchsorted(path.stamp_ns, self._loops_ns).clip(max=len(xyz) - 1)
+        dots = rr.Points3D(xyz[closed.astype(int)], colors=LOOP_RGB, radii=5 * PATH_M)
+        self._log(stamp_ns, 'world/loops', dots)
+
+    def loops(self, stamp_ns: int, count: int) -> None:
+        """Note how many loops are closed."""
+        if count > len(self._loops_ns):
+            self._loops_ns += [stamp_ns] * (count - len(self._loops_ns))
+            self._text(stamp_ns, f'loop {count} closed: the path is corrected')
+
+    def cloud(self, stamp_ns: int, points: LabelledPoints | None) -> None:
+        """Show the labelled cloud: floor green, obstacles by height, others grey."""
+        if points is None:
+            return
+        levels = np.clip(255 / HIGH_M * points.xyz_map[:, 2], 0, 255).astype(np.uint8)
+        rgb = cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA).reshape(-1, 3)[:, ::-1].copy()
+        rgb[points.label != OBSTACLE] = UNKNOWN_RGB
+        rgb[points.label == FLOOR] = FLOOR_RGB
+        cloud = self._rr.Points3D(points.xyz_map, colors=rgb, radii=POINT_M)
+        self._log(stamp_ns, 'world/cloud', cloud)
+
+    def moving_points(self, stamp_ns: int, moving: MovingPoints) -> None:
+        """Show what moves, with the way it moves in a second."""
+        way = np.nan_to_num(moving.velocity_m_s)
+        arrows = self._rr.Arrows3D(origins=moving.xyz_map, vectors=way, colors=MOVING_RGB)
+        self._log(stamp_ns, 'world/moving', arrows)
+
+    def grid(self, stamp_ns: int, grid: OccupancyGrid | None) -> None:
+        """Show the map on the ground."""
+        if grid is None:
+            return
+        rows, columns = grid.cells.shape
+        form = self._rr.components.ImageFormat(
+            width=columns, height=rows, color_model='L', channel_datatype='U8'
+        )
+        drawn = self._rr.GridMap(
+            data=pixels_of(grid.cells).tobytes(),
+            format=form,
+            cell_size=grid.resolution_m,
+            translation=[*grid.origin_xy_m, 0.0],
+        )
+        self._log(stamp_ns, 'world/map', drawn)
+
+    def duration(self, stamp_ns: int, stage: str, duration_s: float) -> None:
+        """Show how long a stage has taken."""
+        self._log(stamp_ns, f'{TIMES}/{stage}', self._rr.Scalars(1e3 * duration_s))
+
+    def state(self, stamp_ns: int, words: str) -> None:
+        """Show the state of tracking where it changes."""
+        if words != self._state:
+            self._state = words
+            self._text(stamp_ns, words, 'WARN' if words.startswith('lost') else 'INFO')
+
+    def about(self, title: str, rows: Sequence[tuple[str, str]]) -> None:
+        """Show what is known of all of the drive."""
+        lines = [f'# {title}', '', '| | |', '|---|---|', *(f'| {a} | {b} |' for a, b in rows)]
+        document = self._rr.TextDocument('\n'.join(lines), media_type='text/markdown')
+        self._log(None, ABOUT, document)
+
+    def recording(self, source: StereoSource) -> None:
+        """Show the images of a recording."""
+        sensors = [(sensor.name, f'{sensor.messages} messages') for sensor in source.sensors]
+        size = f'{source.camera.width} x {source.camera.height}, {source.rate_hz:.1f} Hz'
+        self.about(Path(source.name).name, [('images', size), *sensors])
+        with progress_bar('reading', source.frame_count) as progress:
+            for done, frame in enumerate(source.frames(), 1):
+                self.pair(frame)
+                progress(done)
+
+    def results(self, folder: Path, name: str = '') -> None:
+        """Show what a run has left in a folder, below `name`, with the images of its recording
+        where that is still there. Raises InputError.
+        """
+        shown = View(self._stream, self._rr, name) if name else self
+        if name:
+            self._shown.append(name)
+            self._lay_out()
+        shown._results(folder)
+
+    def _results(self, folder: Path) -> None:
+        summary = read_summary(folder / 'summary.json')
+        times_s, T_map_base = read_trajectory(folder / 'trajectory.txt')
+        keyframe_s, T_map_keyframe = read_trajectory(folder / 'keyframes.txt')
+        stamps_ns, keyframe_ns = (np.rint(1e9 * t).astype(np.int64) for t in (times_s, keyframe_s))
+        first_ns = int(stamps_ns[0])
+        figures = ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'loops')
+        rows = [(figure.replace('_', ' '), str(summary[figure])) for figure in figures]
+        stages = summary['stages'].items()
+        rows += [(stage, f'{times["p50_ms"]:.1f} ms, median') for stage, times in stages]
+        self.about(folder.name, rows)
+        self._loops_ns = [round(1e9 * at_s) for at_s in summary.get('loop_times_s', [])]
+        self.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
+        self.cloud(first_ns, read_ply(folder / 'labelled_cloud.ply'))
+        if (folder / MAP).is_file():
+            self.grid(first_ns, load_map(folder / MAP))
+        for stamp_ns, T in zip(stamps_ns, T_map_base, strict=True):
+            self.pose(int(stamp_ns), T)
+        try:
+            source = open_source(resolve(folder / 'settings.yaml').stereo_camera)
+        except InputError as error:
+            return self._text(first_ns, f'without images: {error}', 'WARN')
+        camera = source.camera
+        mount = Mount(*(summary[name] or 0.0 for name in MOUNT_FIGURES))
+        self.camera(camera.K, (camera.width, camera.height), mount.T_base_left)
+        with progress_bar('reading', source.frame_count) as progress:
+            for done, frame in enumerate(source.frames(), 1):
+                self.image(frame.stamp_ns, frame.left)
+                mask, moving = (
+                    folder / masks / f'{frame.index:06d}.png'
+                    for masks in ('floor_masks', 'moving_masks')
+                )
+                if mask.is_file():
+                    tinted = mask_overlay(frame.left, read_mask(mask))
+                    found = read_mask(moving) if moving.is_file() else None
+                    self.overlay(frame.stamp_ns, tinted, found)
+                progress(done)
+
+    def _picture(self, stamp_ns: int, entity: str, picture: NDArray[np.uint8]) -> None:
+        height = round(WIDTH_PX / picture.shape[1] * picture.shape[0])
+        small = cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_LINEAR)
+        _, jpeg = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        image = self._rr.EncodedImage(contents=jpeg.tobytes(), media_type='image/jpeg')
+        self._log(stamp_ns, entity, image)
+
+    def _text(self, stamp_ns: int, words: str, level: str = 'INFO') -> None:
+        self._log(stamp_ns, TEXT, self._rr.TextLog(words, level=level))
+
+    def _log(self, stamp_ns: int | None, entity: str, what: Any) -> None:
+        """Log something at a stamp, or for all of the drive."""
+        if stamp_ns is not None:
+            self._start_ns = stamp_ns if self._start_ns is None else self._start_ns
+            self._stream.set_time('time', duration=1e-9 * (stamp_ns - self._start_ns))
+        self._stream.log(f'{self._root}/{entity}', what, static=stamp_ns is None)
+
+    def _lay_out(self) -> None:
+        """Lay the panes out: those of every drive behind a tab of its name."""
+        import rerun.blueprint as rrb
+
+        tabs = [_panes(rrb, root) for root in self._shown or ['']]
+        everything = rrb.Tabs(*tabs) if self._shown else tabs[0]
+        time_panel = rrb.TimePanel(timeline='time', state='collapsed')
+        sides = rrb.BlueprintPanel(state='collapsed'), rrb.SelectionPanel(state='collapsed')
+        self._stream.send_blueprint(rrb.Blueprint(everything, *sides, time_panel))
+
+
+def _panes(rrb: ModuleType, root: str) -> Any:
+    """Return the panes of a drive: the map, and beside it what the camera sees."""
+    pictures = rrb.Tabs(
+        rrb.Spatial2DView(origin=f'{root}/{KEYFRAME}', name='Floor of the keyframe'),
+        rrb.Spatial2DView(origin=f'{root}/{RIGHT}', name='Right'),
+        active_tab=0,
+    )
+    words = rrb.Tabs(
+        rrb.TextLogView(origin=f'{root}/{TEXT}', name='State'),
+        rrb.TimeSeriesView(origin=f'{root}/{TIMES}', name='Time per stage [ms]'),
+        rrb.TextDocumentView(origin=f'{root}/{ABOUT}', name='About'),
+    )
+    return rrb.Horizontal(
+        rrb.Spatial3DView(origin=f'{root}/world', name='Map'),
+        rrb.Vertical(rrb.Spatial2DView(origin=f'{root}/{CAMERA}', name='Camera'), pictures, words),
+        column_shares=[2, 1],
+        name=root,
+    )
