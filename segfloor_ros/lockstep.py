@@ -18,7 +18,7 @@ import numpy as np
 
 from segfloor_ros import results_folder
 from segfloor_ros.camera.model import MeasurementLog, Mount, StereoCamera, StereoFrame
-from segfloor_ros.camera.rig_check import SETTLED_FRAMES
+from segfloor_ros.camera.rig.check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError

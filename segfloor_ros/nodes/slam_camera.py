@@ -29,7 +29,7 @@ from segfloor_ros.camera.images import (
     grey_image,
 )
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.camera.rig_check import InputFault
+from segfloor_ros.camera.rig.check import InputFault
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
 from segfloor_ros.messages.diagnostics import LASTS_S, RECENT, Level

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
-from segfloor_ros.camera.rig_check import RigCheck
+from segfloor_ros.camera.rig.check import RigCheck
 from segfloor_ros.files.saved_map import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
@@ -86,7 +86,7 @@ class StereoSlam:
         self._settings = settings
         self._times = times or StageTimes()
         self.sensors = BodyMotion()
-        self.rig_check = RigCheck()
+        self.rig_check = RigCheck(camera)
         self.front_end = FrontEnd(settings, self.map, self.sensors)
         self.back_end = BackEnd(settings, self.map, self.front_end, background)
         self._held = HeldResults()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from camera_recordings import opened
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.camera.rig_check import InputFault, RigCheck
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.rig.check import InputFault, RigCheck
 
 WIDTH, HEIGHT = 640, 480
 FRAME_NS = 33_000_000
@@ -48,7 +48,7 @@ class Boxes:
 
 
 def faults(frames: list[StereoFrame]) -> dict[str, InputFault]:
-    check = RigCheck()
+    check = RigCheck(StereoCamera(WIDTH, HEIGHT, 500.0, 500.0, 320.0, 240.0, 0.075))
     for frame in frames:
         check.see(frame)
     return check.faults

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from stereo_room import StereoRoom, planar_pose
+from stereo_room import CAMERA, StereoRoom, planar_pose
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.camera.rig_check import SETTLED_FRAMES, InputFault, RigCheck
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.rig.check import SETTLED_FRAMES, InputFault, RigCheck
 
 FRAME_S = 0.1
 
@@ -26,8 +27,16 @@ def frames() -> list[StereoFrame]:
     return [room.frame(i, pose(i)) for i in range(SETTLED_FRAMES)]
 
 
-def faults(frames: list[StereoFrame]) -> dict[str, InputFault]:
-    check = RigCheck()
+@pytest.fixture(scope='module')
+def turning() -> list[StereoFrame]:
+    """A turn of 75 degrees on the spot, in the middle of a short way."""
+    room = StereoRoom(seed=5)
+    turn = [planar_pose(0.01 * i, 0.0, np.radians(1.5) * i) for i in range(SETTLED_FRAMES)]
+    return [room.frame(i, pose) for i, pose in enumerate(turn)]
+
+
+def faults(frames: list[StereoFrame], camera: StereoCamera = CAMERA) -> dict[str, InputFault]:
+    check = RigCheck(camera)
     for frame in frames:
         check.see(frame)
     return check.faults
@@ -59,11 +68,11 @@ def test_rows_that_are_off_are_counted(frames, rows) -> None:
 
 
 def test_rows_that_are_off_are_taken_off_the_right_image(frames) -> None:
-    check = RigCheck()
+    check = RigCheck(CAMERA)
     for frame in frames[:11]:
         check.see(frame)
     assert check.corrected(frames[0]) is frames[0]
-    check = RigCheck()
+    check = RigCheck(CAMERA)
     off = [replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames[:11]]
     for frame in off:
         check.see(frame)
@@ -97,12 +106,84 @@ def test_two_faults_are_both_found(frames) -> None:
     assert found['not_simultaneous'].value == pytest.approx(100.0, rel=0.1)
 
 
-def test_images_that_show_nothing_have_no_fault(frames) -> None:
-    blank: Callable[[StereoFrame], StereoFrame] = lambda f: replace(  # noqa: E731
-        f, left=np.zeros_like(f.left), right=np.zeros_like(f.right)
-    )
-    assert faults([blank(f) for f in frames]) == {}
-    assert faults([replace(f, right=np.zeros_like(f.right)) for f in frames]) == {}
+def changed(
+    frames: list[StereoFrame], change: Callable[[np.ndarray], np.ndarray]
+) -> list[StereoFrame]:
+    """Return the frames with both images changed."""
+    return [replace(f, left=change(f.left), right=change(f.right)) for f in frames]
+
+
+def test_images_without_texture_have_no_fault(frames) -> None:
+    assert faults(changed(frames, lambda image: np.full_like(image, 128))) == {}
+    assert faults([replace(f, right=np.full_like(f.right, 128)) for f in frames]) == {}
+
+
+def test_images_that_are_out_of_focus_are_blurred(frames) -> None:
+    found = faults(changed(frames, lambda image: cv2.GaussianBlur(image, (0, 0), 3)))
+    assert set(found) == {'blurred'}
+    assert found['blurred'].value > 5
+    assert 'focus' in found['blurred'].line()
+    one_eye = [replace(f, right=cv2.GaussianBlur(f.right, (0, 0), 3)) for f in frames]
+    assert set(faults(one_eye)) == {'blurred'}
+
+
+def test_a_moment_of_blur_or_darkness_is_no_fault(frames) -> None:
+    for change in (lambda image: cv2.GaussianBlur(image, (0, 0), 3), lambda image: image // 10):
+        assert faults([*changed(frames[:31], change), *frames[31:]]) == {}
+
+
+def test_images_that_are_too_dark_or_too_bright_are_counted(frames) -> None:
+    dark = faults(changed(frames, lambda image: image // 10))
+    assert set(dark) == {'dark'}
+    assert dark['dark'].value <= 25
+    bright = faults(changed(frames, lambda image: np.minimum(image * 2.5, 255).astype(np.uint8)))
+    assert set(bright) == {'saturated'}
+    share = np.mean([frame.left >= 250 / 2.5 for frame in frames])
+    assert bright['saturated'].value == pytest.approx(100 * share, abs=10)
+
+
+@pytest.mark.parametrize('flickers', [False, True])
+def test_eyes_of_different_exposure_are_compared(frames, flickers) -> None:
+    def exposed(frame: StereoFrame) -> StereoFrame:
+        if flickers and frame.index // 12 % 2:
+            return replace(frame, left=np.rint(frame.left / 1.5).astype(np.uint8))
+        return replace(frame, right=np.rint(frame.right / 1.5).astype(np.uint8))
+
+    found = faults([exposed(frame) for frame in frames])
+    assert set(found) == {'eyes_differ'}
+    assert found['eyes_differ'].value == pytest.approx(1.5, abs=0.05)
+
+
+@pytest.mark.parametrize('factor', [1.1, 0.9, 2.0, 0.5])
+def test_a_wrong_focal_length_shows_in_turns(turning, factor) -> None:
+    assert faults(turning) == {}
+    wrong = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
+    found = faults(turning, wrong)
+    assert set(found) == {'focal_length'}
+    assert found['focal_length'].value == pytest.approx(100 * (factor - 1), abs=4)
+    assert 'turns show 1' in found['focal_length'].line()  # 160 px
+
+
+def test_a_wrong_focal_length_is_not_said_of_a_straight_drive() -> None:
+    room = StereoRoom(seed=5)
+    straight = [room.frame(i, planar_pose(0.03 * i, 0.0, 0.0)) for i in range(SETTLED_FRAMES)]
+    assert faults(straight, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy)) == {}
+
+
+def test_an_eye_that_is_rolled_and_zoomed_is_mended(frames) -> None:
+    centre = (CAMERA.cx, CAMERA.cy)
+    M = cv2.getRotationMatrix2D(centre, 2.0, 1.03)  # degrees, and 3 % larger
+    M[1, 2] += 2.5
+    check = RigCheck(CAMERA)
+    off = [replace(f, right=cv2.warpAffine(f.right, M, f.right.shape[::-1])) for f in frames[:11]]
+    for frame in off:
+        check.see(frame)
+    assert set(check.faults) == {'rows_apart'}
+    right = check.corrected(off[10]).right
+    inner = np.s_[30:-30, 30:-30]
+    error = np.abs(right[inner].astype(float) - frames[10].right[inner])
+    assert np.median(error) < 4  # interpolated twice
+    assert np.median(error) < np.median(np.abs(off[10].right[inner] - 1.0 * right[inner])) / 4
 
 
 def test_a_lag_is_said_of_five_looks_and_of_no_fewer(frames) -> None:

@@ -1,0 +1,423 @@
+"""What is wrong with a stereo rig, by its images alone.
+
+Points of the left image are found in the right one and in the left one before. In images that are
+rectified and taken together, both eyes have a point in one row. Row differences that depend on the
+place in the image are those of a wrong rectification: offset, roll, focal length. Those that grow
+with the motion of the points along the columns are those of a lag between the eyes. How wide the
+sharpest edges are, how bright the images and how bright a point is in both of them is seen at once;
+it counts where all of the last looks show it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.images import is_disparity
+from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.rig.depth import DepthCheck
+from segfloor_ros.camera.rig.focal import (
+    LEAST_NOISE_PX,
+    MAX_HAMMING,
+    ROWS_PX,
+    SURE,
+    FocalCheck,
+    Matches,
+    follow,
+)
+from segfloor_ros.geometry import Array
+
+EVERY = 10
+RECENT = 5
+"""Every tenth frame is looked at, and five looks are judged together: what is seen in 50 frames."""
+
+SETTLED_FRAMES = EVERY * RECENT
+
+FEATURES, LEVELS = 500, 2
+MAX_DISPARITY_SHARE = 0.4
+MAX_ROWS_SHARE = 0.15
+MIN_MATCHES = 40
+
+LAG_FRAMES = 0.15
+"""A lag counts where it is more than this share of a frame: what rectification leaves of two real
+cameras, which were triggered together, looked like half of it."""
+
+EDGE_PX = 4.5
+"""Sharp images have edges of 2.2 to 3.2 px, also those of a moving camera, whose blur leaves the
+edges along it; features and disparities come from the scale of the pixel."""
+
+DARK_GREY, WHITE_GREY = 32, 250
+"""Below the one, three of eight bits are unused; above the other, a pixel is no measurement."""
+
+WHITE_SHARE = 1 / 3
+"""Lamps, windows and the sky whiten less."""
+
+EYES_RATIO = 1.25
+"""Two good cameras with exposures of their own differ by up to 1.07."""
+
+PATCH_PX = 11
+
+
+@dataclass(frozen=True)
+class InputFault:
+    """What is wrong with the images: `fault` in a word, a figure with its unit, what was found in
+    words that go on after the name of the images, and what to do.
+    """
+
+    fault: str
+    value: float
+    unit: str
+    finding: str
+    remedy: str
+
+    def line(self, images: str = 'left and right images') -> str:
+        """Return the fault in one line. images: their name."""
+        return f'{images} {self.finding}; {self.remedy}'
+
+
+def _rows_apart(rows_px: float) -> InputFault:
+    return InputFault(
+        'rows_apart',
+        round(rows_px, 2),
+        'px',
+        f'are not rectified: the same points stand {rows_px:.1f} rows apart, which is taken off '
+        'the right image as far as an offset, a roll and another size explain it',
+        'give the raw images (image_raw) with the calibration of this camera, or calibrate again '
+        '(segfloor calibrate)',
+    )
+
+
+def _eyes_swapped(share: float) -> InputFault:
+    return InputFault(
+        'eyes_swapped',
+        round(100 * share, 1),
+        '%',
+        f'are exchanged: {share:.0%} of the disparities are negative',
+        'exchange the two, and their calibrations if these are exchanged, too',
+    )
+
+
+def _depth_unaligned(shift_px: float, scale: float) -> InputFault:
+    return InputFault(
+        'depth_unaligned',
+        round(shift_px, 1),
+        'px',
+        f'are not aligned: the edges of depth lie {shift_px:.0f} px beside those of the image, '
+        f'which is {scale:.2f} times as large',
+        'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
+    )
+
+
+def _not_simultaneous(
+    lag_s: float, frame_s: float, names: tuple[str, str] = ('right', 'left')
+) -> InputFault:
+    late, early = names if lag_s > 0 else names[::-1]
+    return InputFault(
+        'not_simultaneous',
+        round(1e3 * lag_s, 1),
+        'ms',
+        f'are not taken at the same time: the {late} one lags {1e3 * abs(lag_s):.0f} ms '
+        f'({abs(lag_s) / frame_s:.1f} frames) behind the {early} one',
+        'take both at once, and pair them by the time of exposure',
+    )
+
+
+def _wrong_focal(factor: float, camera: StereoCamera) -> InputFault:
+    length = 'long' if factor < 1 else 'short'
+    return InputFault(
+        'focal_length',
+        round(100 * (1 / factor - 1), 1),
+        '%',
+        f'have another focal length than their calibration: turns show {camera.fx * factor:.0f} '
+        f'px, {camera.fx:.0f} px is {abs(100 * (1 / factor - 1)):.0f} % too {length}',
+        'take the calibration of this lens at this resolution, or calibrate again '
+        '(segfloor calibrate)',
+    )
+
+
+def _blurred(edge_px: float) -> InputFault:
+    return InputFault(
+        'blurred',
+        round(edge_px, 1),
+        'px',
+        f'are blurred: their sharpest edges are {edge_px:.1f} px wide',
+        'focus and clean the lenses, expose for a shorter time, or take smaller images',
+    )
+
+
+def _dark(bright_grey: float) -> InputFault:
+    return InputFault(
+        'dark',
+        round(bright_grey),
+        'grey levels',
+        f'are too dark: all but a hundredth of them is below {bright_grey:.0f} of 255',
+        'expose for longer, raise the gain, or switch on a lamp',
+    )
+
+
+def _saturated(share: float) -> InputFault:
+    return InputFault(
+        'saturated',
+        round(100 * share),
+        '%',
+        f'are overexposed: {share:.0%} of them is white',
+        'expose for a shorter time, or lower the gain',
+    )
+
+
+def _eyes_differ(ratio: float) -> InputFault:
+    return InputFault(
+        'eyes_differ',
+        round(ratio, 2),
+        'times',
+        f'are exposed differently: the same points are {ratio:.2f} times as bright in one of them',
+        'set exposure and gain of both to the same values, or let one control both',
+    )
+
+
+GEOMETRIC = {'rows_apart', 'eyes_swapped', 'not_simultaneous'}
+"""Eyes that do not fit bend the world as a wrong focal length does."""
+
+
+class RigCheck:
+    """Looks at some frames of a stereo camera; `faults` is what was found so far, by name. Within
+    `SETTLED_FRAMES` a moving camera has shown one fault from another.
+    """
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self.faults: dict[str, InputFault] = {}
+        self.frames = 0
+        self.rows_px = float('nan')
+        """By how much the same points stand in other rows, in the last looks."""
+        self._camera = camera
+        self._mend: Array | None = None
+        self._looks: deque[Array] = deque(maxlen=RECENT)
+        self._pictures: deque[Array] = deque(maxlen=RECENT)
+        self._before: tuple[NDArray[np.uint8], int] | None = None
+        self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
+        self._frame_s = 0.0
+        self._depth = DepthCheck()
+        self._focal = FocalCheck(camera)
+
+    def see(self, frame: StereoFrame) -> None:
+        """Take in a frame that shows something."""
+        is_look = self.frames % EVERY == 0
+        if is_disparity(frame.right):
+            if is_look:
+                self._pictures.append(_picture([frame.left]))
+                self._judge_depth(frame)
+                self._judge_pictures()
+        elif is_look or (self.frames % EVERY == EVERY // 2 and not self._focal.is_done):
+            matches = self._match(frame.left, frame.right)
+            self._focal.look(frame.left, matches)
+            if is_look:
+                self._looks.append(self._look(frame, matches))
+                self._pictures.append(_picture([frame.left, frame.right]))
+                self._judge()
+                self._judge_pictures()
+        self.frames += 1
+        self._before = (frame.left, frame.stamp_ns) if self.frames % EVERY == 0 else None
+
+    def jump(self) -> None:
+        """Take the next frames, which are of another part of the recording: one, one that is looked
+        at, and what follows until the next jump.
+        """
+        self.frames += EVERY - 1 - self.frames % EVERY
+        self._focal.reset_view()
+
+    def corrected(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame with its right image moved, rolled and scaled by what its rows were found
+        to be off.
+        """
+        if self._mend is None:
+            return frame
+        right = cv2.warpAffine(frame.right, self._mend, frame.right.shape[::-1])
+        return replace(frame, right=right)
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Return fault, value, unit and remedy of all that was found, for summary.json."""
+        names = 'fault', 'value', 'unit', 'remedy'
+        return [{name: getattr(fault, name) for name in names} for fault in self.faults.values()]
+
+    def _look(self, frame: StereoFrame, matches: Matches) -> Array:
+        """Return (N, 7): where points are in the left image, by how much in the right one (column,
+        row), px, how they move in the left one, px/s, NaN where that is not known, and by how much
+        they are brighter in one of them, a logarithm.
+        """
+        left_px = matches.left_px
+        seen = np.full((len(left_px), 7), np.nan)
+        seen[:, :2], seen[:, 2:4] = left_px, left_px - matches.right_px
+        seen[:, 6] = _contrast(frame.left, left_px, frame.right, matches.right_px)
+        if self._before is not None and len(left_px):
+            before, stamp_ns = self._before
+            self._frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
+            before_px, found = follow(frame.left, before, left_px, left_px, levels=3)
+            seen[found, 4:6] = (left_px - before_px)[found] / self._frame_s
+        return seen
+
+    def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Matches:
+        """Return the points of a left image (H, W) that are found in the right one."""
+        none = np.zeros((0, 2), np.float32)
+        nothing = Matches(none, none, np.zeros((0, 32), np.uint8))
+        (left_points, left_words), (right_points, right_words) = (
+            self._orb.detectAndCompute(image, None) for image in (left, right)
+        )
+        if left_words is None or right_words is None:
+            return nothing
+        matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
+        matches = [match for match in matches if match.distance <= MAX_HAMMING]
+        if not matches:
+            return nothing
+        guess = Matches(
+            np.array([left_points[m.queryIdx].pt for m in matches], np.float32),
+            np.array([right_points[m.trainIdx].pt for m in matches], np.float32),
+            np.asarray(left_words[[m.queryIdx for m in matches]], np.uint8),
+        )
+        most = np.array([MAX_DISPARITY_SHARE, MAX_ROWS_SHARE]) * left.shape[::-1]
+        guess = guess.those((np.abs(guess.left_px - guess.right_px) < most).all(axis=1))
+        if not len(guess.words):
+            return nothing
+        right_px, found = follow(left, right, guess.left_px, guess.right_px, levels=0)
+        return guess._replace(right_px=np.asarray(right_px, np.float32)).those(found)
+
+    def _judge(self) -> None:
+        seen = np.concatenate(self._looks)
+        if len(seen) < MIN_MATCHES:
+            return
+        followed = seen[np.isfinite(seen).all(axis=1)]
+        lag_s = self._lag_s(followed)
+        seen = followed if lag_s else seen
+        apart = seen[:, 2:4] - lag_s * np.nan_to_num(seen[:, 4:6])
+        negative = float(np.mean(apart[:, 0] < -ROWS_PX))
+        centre = np.array([self._camera.cx, self._camera.cy])
+        right_px = seen[:, :2] - seen[:, 2:4] - centre
+        (rows, roll, size), *_ = _fit(np.column_stack([np.ones(len(seen)), right_px]), apart[:, 1])
+        bent_px = float(abs(rows) + np.hypot(roll, size) * centre.min())
+        rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), bent_px)
+        found = []
+        if lag_s:
+            for other in ('rows_apart', 'focal_length'):  # it may have been the lag
+                self.faults.pop(other, None)
+            self._mend = None
+            rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
+            found.append(_not_simultaneous(lag_s, self._frame_s))
+        if negative > 0.5:
+            found.append(_eyes_swapped(negative))
+        if rows_px > ROWS_PX and (lag_s or 'not_simultaneous' not in self.faults):
+            found.append(_rows_apart(rows_px))
+            # Roll and size move the columns as well.
+            M = np.array([[size, -roll], [roll, size]])
+            self._mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
+        ratio = float(np.exp(np.median(seen[:, 6])))
+        if ratio > EYES_RATIO and len(self._looks) == RECENT:
+            found.append(_eyes_differ(ratio))
+        factor = self._focal.factor() if len(self._looks) == RECENT else None
+        self.faults.update({fault.fault: fault for fault in found})
+        if factor is not None and not self.faults.keys() & GEOMETRIC:
+            self.faults['focal_length'] = _wrong_focal(factor, self._camera)
+
+    def _judge_pictures(self) -> None:
+        if len(self._pictures) < RECENT:
+            return
+        pictures = np.array(self._pictures)
+        edge_px, white_share = float(pictures[:, 0].min()), float(pictures[:, 2].min())
+        bright_grey = float(pictures[:, 1].max())
+        found = []
+        if bright_grey < DARK_GREY:
+            found.append(_dark(bright_grey))
+        elif edge_px > EDGE_PX:
+            found.append(_blurred(edge_px))
+        if white_share > WHITE_SHARE:
+            found.append(_saturated(white_share))
+        self.faults.update({fault.fault: fault for fault in found})
+
+    def _judge_depth(self, frame: StereoFrame) -> None:
+        if self._before is None:
+            return
+        before, stamp_ns = self._before
+        self._depth.look(frame.left, before, frame.right)
+        misfit = self._depth.misfit()
+        if misfit is None:
+            return
+        frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
+        if misfit.lag and misfit.scale == 1.0:
+            fault = _not_simultaneous(misfit.lag * frame_s, frame_s, ('depth', 'colour'))
+        else:
+            fault = _depth_unaligned(misfit.shift_px, misfit.scale)
+        self.faults[fault.fault] = fault
+
+    def _lag_s(self, seen: Array) -> float:
+        """Return by how much the right images are late, in seconds, by points (N, 7); 0 where that
+        is not sure, or no more than what rectification leaves: a single look cannot tell that from
+        a lag, for points move as they lie in the image.
+        """
+        if len(self._looks) < RECENT or len(seen) < MIN_MATCHES:
+            return 0.0
+        rows_px, moved_px = seen[:, 3], seen[:, 5] * self._frame_s
+        right_px = seen[:, :2] - seen[:, 2:4]
+        A = np.column_stack([np.ones(len(seen)), 1e-3 * right_px, moved_px])
+        x, covariance, noise_px = _fit(A, rows_px)
+        lag, sigma = float(x[3]), noise_px * float(np.sqrt(covariance[3, 3]))
+        is_sure = sigma > 0 and abs(lag) - SURE * sigma > LAG_FRAMES
+        return lag * self._frame_s if is_sure else 0.0
+
+
+def _fit(A: Array, measured: Array) -> tuple[Array, Array, float]:
+    """Return what fits A (N, K) to what was measured (N,) without outliers, its covariance (K, K)
+    for a noise of 1, and the noise.
+    """
+    weight, noise = np.ones(len(A)), LEAST_NOISE_PX
+    for _ in range(10):
+        W = A * weight[:, None]
+        covariance = np.linalg.pinv(W.T @ A)
+        x = covariance @ W.T @ measured
+        error = measured - A @ x
+        noise = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
+        weight = 1.0 / (1.0 + (error / (2 * noise)) ** 2)
+    return x, covariance, noise
+
+
+def _contrast(left: NDArray[np.uint8], left_px: Array, right: Array, right_px: Array) -> Array:
+    """Return by how much the surroundings of points (N, 2) are brighter in one image (H, W) than in
+    the other, (N,), as a logarithm.
+    """
+    seen = []
+    for image, px in ((left, left_px), (right, right_px)):
+        mean = cv2.blur(image, (PATCH_PX, PATCH_PX))
+        u, v = np.clip(np.rint(px).astype(np.intp).T, 0, np.array([image.shape[::-1]]).T - 1)
+        seen.append(mean[v, u] + 1.0)
+    return np.asarray(np.abs(np.log(seen[0] / seen[1])))
+
+
+def _picture(images: Sequence[NDArray[np.uint8]]) -> Array:
+    """Return (3,): how wide the sharpest edges of one or two images (H, W) are, px, the grey level
+    of their brightest hundredth, and the share of white; of the worse one.
+    """
+    return np.array(
+        [
+            max(_edge_px(image) for image in images),
+            min(float(np.percentile(image, 99)) for image in images),
+            max(float(np.mean(image >= WHITE_GREY)) for image in images),
+        ]
+    )
+
+
+def _edge_px(image: NDArray[np.uint8]) -> float:
+    """Return how wide the sharpest edges of an image (H, W) are: how much larger the grey step
+    around the steepest pixels is than that from pixel to pixel; 0 where there are no edges.
+    """
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
+    across, along = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+    slope = cv2.magnitude(across, along)
+    patch = np.ones((15, 15), np.uint8)
+    step = cv2.morphologyEx(smooth, cv2.MORPH_GRADIENT, patch)
+    is_edge = (slope >= np.percentile(slope[::2, ::2], 95)) & (step > 20)
+    if np.count_nonzero(is_edge) < 200:
+        return 0.0
+    return float(np.percentile(step[is_edge] / cv2.dilate(slope, patch)[is_edge], 10))
