@@ -22,6 +22,7 @@ from segfloor_ros.cli.commands import (
     view,
 )
 from segfloor_ros.cli.evaluate import app as evaluate
+from segfloor_ros.cli.info import info
 from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.cli.view import SUFFIX
 from segfloor_ros.errors import MapError, SegfloorError
@@ -34,7 +35,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (run, replay, view, simulate, calibrate, convert, benchmark, demo):
+for command in (run, replay, info, view, simulate, calibrate, convert, benchmark, demo):
     app.command()(command)
 app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')

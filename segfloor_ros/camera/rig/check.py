@@ -39,6 +39,9 @@ RECENT = 5
 
 SETTLED_FRAMES = EVERY * RECENT
 
+BURST = 2 + EVERY // 2
+"""Frames after a jump: one before the look, the look, and those up to the next view of a turn."""
+
 FEATURES, LEVELS = 500, 2
 MAX_DISPARITY_SHARE = 0.4
 MAX_ROWS_SHARE = 0.15
@@ -58,8 +61,8 @@ DARK_GREY, WHITE_GREY = 32, 250
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
-EYES_RATIO = 1.25
-"""Two good cameras with exposures of their own differ by up to 1.07."""
+SAME_EYES, EYES_RATIO = 1.07, 1.25
+"""Two good cameras with exposures of their own differ by up to the one; the other is a fault."""
 
 PATCH_PX = 11
 
@@ -181,7 +184,7 @@ def _eyes_differ(ratio: float) -> InputFault:
     )
 
 
-GEOMETRIC = {'rows_apart', 'eyes_swapped', 'not_simultaneous'}
+MISFITS = {'rows_apart', 'eyes_swapped', 'not_simultaneous', 'eyes_differ'}
 """Eyes that do not fit bend the world as a wrong focal length does."""
 
 
@@ -253,7 +256,7 @@ class RigCheck:
         left_px = matches.left_px
         seen = np.full((len(left_px), 7), np.nan)
         seen[:, :2], seen[:, 2:4] = left_px, left_px - matches.right_px
-        seen[:, 6] = _contrast(frame.left, left_px, frame.right, matches.right_px)
+        seen[:, 6] = np.abs(_contrast(frame.left, left_px, frame.right, matches.right_px))
         if self._before is not None and len(left_px):
             before, stamp_ns = self._before
             self._frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
@@ -284,6 +287,13 @@ class RigCheck:
         if not len(guess.words):
             return nothing
         right_px, found = follow(left, right, guess.left_px, guess.right_px, levels=0)
+        if np.count_nonzero(found):
+            gain = _contrast(left, guess.left_px[found], right, right_px[found])
+            if abs(np.median(gain)) > np.log(SAME_EYES):  # optical flow takes them for equal
+                right = np.asarray(
+                    cv2.convertScaleAbs(right, alpha=float(np.exp(np.median(gain)))), np.uint8
+                )
+                right_px, found = follow(left, right, guess.left_px, guess.right_px, levels=0)
         return guess._replace(right_px=np.asarray(right_px, np.float32)).those(found)
 
     def _judge(self) -> None:
@@ -302,8 +312,7 @@ class RigCheck:
         rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), bent_px)
         found = []
         if lag_s:
-            for other in ('rows_apart', 'focal_length'):  # it may have been the lag
-                self.faults.pop(other, None)
+            self.faults.pop('rows_apart', None)  # it may have been the lag
             self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             found.append(_not_simultaneous(lag_s, self._frame_s))
@@ -317,9 +326,11 @@ class RigCheck:
         ratio = float(np.exp(np.median(seen[:, 6])))
         if ratio > EYES_RATIO and len(self._looks) == RECENT:
             found.append(_eyes_differ(ratio))
-        factor = self._focal.factor() if len(self._looks) == RECENT else None
         self.faults.update({fault.fault: fault for fault in found})
-        if factor is not None and not self.faults.keys() & GEOMETRIC:
+        factor = self._focal.factor() if len(self._looks) == RECENT else None
+        if self.faults.keys() & MISFITS:
+            self.faults.pop('focal_length', None)
+        elif factor is not None:
             self.faults['focal_length'] = _wrong_focal(factor, self._camera)
 
     def _judge_pictures(self) -> None:
@@ -383,16 +394,18 @@ def _fit(A: Array, measured: Array) -> tuple[Array, Array, float]:
     return x, covariance, noise
 
 
-def _contrast(left: NDArray[np.uint8], left_px: Array, right: Array, right_px: Array) -> Array:
-    """Return by how much the surroundings of points (N, 2) are brighter in one image (H, W) than in
-    the other, (N,), as a logarithm.
+def _contrast(
+    left: NDArray[np.uint8], left_px: Array, right: NDArray[np.uint8], right_px: Array
+) -> Array:
+    """Return by how much the surroundings of points (N, 2) are brighter in the left image (H, W)
+    than in the right one, (N,), as a logarithm.
     """
     seen = []
     for image, px in ((left, left_px), (right, right_px)):
         mean = cv2.blur(image, (PATCH_PX, PATCH_PX))
         u, v = np.clip(np.rint(px).astype(np.intp).T, 0, np.array([image.shape[::-1]]).T - 1)
         seen.append(mean[v, u] + 1.0)
-    return np.asarray(np.abs(np.log(seen[0] / seen[1])))
+    return np.asarray(np.log(seen[0] / seen[1]))
 
 
 def _picture(images: Sequence[NDArray[np.uint8]]) -> Array:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -74,9 +75,9 @@ def _open(settings: StereoCameraSettings) -> StereoSource:
         return open_device(settings.input, settings)
     if not path.exists():
         raise InputError(f'{path}: no such file or folder; give {KINDS}')
-    for recognises, open_path in FOLDERS if path.is_dir() else FILES:
-        if recognises(path):
-            return open_path(path, settings)
+    for kind in FOLDERS if path.is_dir() else FILES:
+        if kind.recognises(path):
+            return kind.open(path, settings)
     raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
 
 
@@ -153,17 +154,31 @@ def _halves(image: NDArray[np.uint8]) -> tuple[Grey, Grey]:
     return grey[:, :half].copy(), grey[:, half:].copy()
 
 
-Openers = tuple[
-    tuple[Callable[[Path], bool], Callable[[Path, StereoCameraSettings], StereoSource]], ...
-]
-FOLDERS: Openers = (
-    (is_tum_rgbd, open_tum_rgbd),
-    (is_kitti, open_kitti),
-    (is_euroc, open_euroc),
-    (is_bag, open_bag),
-    (has_image_sides, open_image_folders),
+def kind_of(name: str) -> str:
+    """Return what kind of recording an input is, in words."""
+    path = Path(name).expanduser()
+    if is_device(name) and not path.is_dir():
+        return 'camera device, side by side'
+    kinds = FOLDERS if path.is_dir() else FILES
+    return next((kind.words for kind in kinds if kind.recognises(path)), 'unknown')
+
+
+class Kind(NamedTuple):
+    """A kind of recording: what it is called, what recognises it, and what opens it."""
+
+    words: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, StereoCameraSettings], StereoSource]
+
+
+BAG = Kind('ROS bag', is_bag, open_bag)
+FOLDERS = (
+    Kind('TUM RGB-D folder', is_tum_rgbd, open_tum_rgbd),
+    Kind('KITTI odometry folder', is_kitti, open_kitti),
+    Kind('EuRoC folder', is_euroc, open_euroc),
+    BAG,
+    Kind('folders of images', has_image_sides, open_image_folders),
 )
-FILES: Openers = ((is_bag, open_bag), (is_video, open_video))
-"""What recognises a kind of recording, and what opens it."""
+FILES = (BAG, Kind('video, side by side', is_video, open_video))
 
 VIDEO_SUFFIXES = {'.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.mpg', '.mpeg', '.mjpeg'}

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -161,31 +162,48 @@ class StereoSource:
         if next(self._decoded(), None) is None:
             raise InputError(f'{self.name}: no pair of images in it can be read')
 
-    def _rectified(self) -> Iterator[StereoFrame]:
-        rectifier = StereoRectifier(self.calibration)
-        for pair in self._decoded():
-            left, right = rectifier.rectify(pair.left, pair.right)
-            mask = self.masks.read(pair.index) if self.masks is not None else None
-            excluded = rectifier.rectify_mask(mask) if mask is not None else None
-            yield StereoFrame(pair.index, pair.stamp_ns, left, right, excluded)
-
-    def _decoded(self) -> Iterator[RawPair]:
+    def entries(self) -> Iterator[PairEntry]:
+        """Yield the pairs of `frames()`, not decoded yet."""
         self.skipped_frames = 0
         part = self._part
-        for entry in islice(self._read(self), part.start, part.stop, part.step):
-            try:
-                left, right = entry.load()
-            except CorruptImageError as error:
-                self.skip(entry.index, str(error))
-                continue
-            for image in (left, right):
-                what = f'{self.name}: frame {entry.index}'
-                self.calibration.check_size(image.shape[1], image.shape[0], what)
-            if is_disparity(right):
-                left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
-            else:
-                left, right = self._eight_bit(left, right)
-            yield RawPair(entry.index, entry.stamp_ns, left, right)
+        return islice(self._read(self), part.start, part.stop, part.step)
+
+    def frame(self, entry: PairEntry) -> StereoFrame | None:
+        """Return a pair rectified; None where it is damaged and left out."""
+        pair = self._decoded_pair(entry)
+        return None if pair is None else self._rectified_pair(pair)
+
+    def _rectified(self) -> Iterator[StereoFrame]:
+        return map(self._rectified_pair, self._decoded())
+
+    def _rectified_pair(self, pair: RawPair) -> StereoFrame:
+        left, right = self._rectifier.rectify(pair.left, pair.right)
+        mask = self.masks.read(pair.index) if self.masks is not None else None
+        excluded = self._rectifier.rectify_mask(mask) if mask is not None else None
+        return StereoFrame(pair.index, pair.stamp_ns, left, right, excluded)
+
+    def _decoded(self) -> Iterator[RawPair]:
+        pairs = map(self._decoded_pair, self.entries())
+        return (pair for pair in pairs if pair is not None)
+
+    def _decoded_pair(self, entry: PairEntry) -> RawPair | None:
+        try:
+            left, right = entry.load()
+        except CorruptImageError as error:
+            self.skip(entry.index, str(error))
+            return None
+        for image in (left, right):
+            what = f'{self.name}: frame {entry.index}'
+            self.calibration.check_size(image.shape[1], image.shape[0], what)
+        if is_disparity(right):
+            left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
+        else:
+            left, right = self._eight_bit(left, right)
+        return RawPair(entry.index, entry.stamp_ns, left, right)
+
+    @cached_property
+    def _rectifier(self) -> StereoRectifier:
+        return StereoRectifier(self.calibration)
 
     def skip(self, index: int, reason: str) -> None:
         """Count a pair that is left out, with a warning."""
