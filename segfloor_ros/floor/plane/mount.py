@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, Up
 from segfloor_ros.floor.disparity.matching import (
+    BLOCK_PX,
     DisparityMatcher,
     TwoScaleMatcher,
     disparity_range,
@@ -31,7 +32,7 @@ from segfloor_ros.floor.disparity.photometric import (
     texture_grey,
 )
 from segfloor_ros.floor.disparity.profile import pixels_where
-from segfloor_ros.floor.disparity.view import surface_above
+from segfloor_ros.floor.disparity.view import column_step, surface_above
 from segfloor_ros.floor.plane.plane import (
     LEVEL_SIGMA,
     SAMPLES,
@@ -76,10 +77,6 @@ _TILT_TOLERANCE_DEG = 1.0
 MAX_KEYFRAMES = 20
 """Where so many do not show the floor well enough, nothing is said."""
 
-_LEAST_HALVED_PX = 480
-"""Images less wide than this are never matched at half the resolution alone."""
-_ENOUGH_GREY = 0.3
-"""Gradient along the row, per pixel, that is no noise."""
 _COLUMN_STEP_PX = 2
 """Every other column is searched for the base of things."""
 _BASE_WEIGHT = 8.0
@@ -151,10 +148,12 @@ class MountEstimator:
         self._poses.append(T_world_left)
         right, measured = stereo_view(left, right)
         disparity = self._viewer.disparity(left, right) if measured is None else measured
-        surfaces = self._viewer.surfaces(left, disparity, measured is not None, T_world_left)
+        enough = enough_texture(noise_grey(left))
+        needed = enough if measured is None else None
+        surfaces = self._viewer.surfaces(left, disparity, needed, T_world_left)
         prior = level_prior(up_world)
         if not self._settles(self._surfaces, self._surfaces.add(surfaces, prior, [])):
-            bases = self._viewer.bases(left, disparity, T_world_left)
+            bases = self._viewer.bases(left, disparity, enough, T_world_left)
             fit = self._bases.add(bases, prior, self._surfaces.frames)
             self._settles(self._bases, fit)
 
@@ -309,7 +308,7 @@ class MountViewer:
         searched = disparity_range(camera, None)
         self._first: DisparityMatcher | None = DisparityMatcher(searched)
         self._matcher = TwoScaleMatcher(searched)
-        self._fine_rows = 0 if camera.width >= _LEAST_HALVED_PX else camera.height
+        self._fine_rows = camera.height if column_step(camera) == 1 else 0
 
     def disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the disparities (H, W) of a pair, 0 where there is no match."""
@@ -322,33 +321,43 @@ class MountViewer:
         self,
         left: NDArray[np.uint8],
         disparity: NDArray[np.float32],
-        is_measured: bool,
+        enough: float | None,
         T_world_left: Array,
     ) -> Samples:
-        """Return samples of all that has texture; a depth camera needs none."""
-        step = max(2, round(math.sqrt(left.size / 2 / SAMPLES)))
+        """Return samples of all that has texture. enough: what is no noise; None where depth is
+        measured, which needs none.
+        """
+        # Matched at half the resolution two rows share a disparity: odd steps meet both alike.
+        step = max(2, round(math.sqrt(left.size / 2 / SAMPLES))) | 1
         part = np.s_[step // 2 :: step, step // 2 :: step]
-        rows, columns = pixels_where(disparity[part] >= 1)
+        at = pixels_where(disparity[part] >= 1)
+        rows, columns = (step // 2 + step * index for index in at)
         weight: Array = np.ones(len(rows))
-        if not is_measured:
-            smooth = cv2.GaussianBlur(left.astype(np.float32), (0, 0), 1.0)
-            gradient = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8))
-            texture = cv2.blur(gradient, (9, 9))[part][rows, columns]
-            weight = texture_weight(texture, _ENOUGH_GREY)
-        rows, columns = (step // 2 + step * index for index in (rows, columns))
-        return self._placed(rows, columns, disparity[rows, columns], weight, T_world_left)
+        shown_at: NDArray[np.number] = rows
+        if enough is not None:
+            slope, block = texture_grey(left, 1), (BLOCK_PX, BLOCK_PX)
+            texture = cv2.blur(slope, block)[rows, columns]
+            weight = texture_weight(texture, enough)
+            # A disparity is that of the texture in its block, and belongs where that is.
+            slope *= np.arange(len(left), dtype=np.float32)[:, None]
+            shown_at = cv2.blur(slope, block)[rows, columns] / np.maximum(texture, 1e-6)
+        return self._placed(shown_at, columns, disparity[rows, columns], weight, T_world_left)
 
     def bases(
-        self, left: NDArray[np.uint8], disparity: NDArray[np.float32], T_world_left: Array
+        self,
+        left: NDArray[np.uint8],
+        disparity: NDArray[np.float32],
+        enough: float,
+        T_world_left: Array,
     ) -> Samples:
         """Return samples of where upright things stand on blank floor."""
-        rows, columns, found_px = find_bases(left, disparity)
+        rows, columns, found_px = find_bases(left, disparity, enough)
         weight = np.full(len(rows), _BASE_WEIGHT)
         return self._placed(rows, columns, found_px, weight, T_world_left)
 
     def _placed(
         self,
-        rows: NDArray[np.integer],
+        rows: NDArray[np.number],
         columns: NDArray[np.integer],
         disparity_px: NDArray[np.floating],
         weight: Array,
@@ -360,13 +369,12 @@ class MountViewer:
 
 
 def find_bases(
-    left: NDArray[np.uint8], disparity_px: NDArray[np.float32]
+    left: NDArray[np.uint8], disparity_px: NDArray[np.float32], enough: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.floating]]:
     """Return rows, columns (N,) and disparities (N,) of where upright things stand on blank floor
-    in an image (H, W) of known disparities (H, W), 0 for none.
+    in an image (H, W) of known disparities (H, W), 0 for none. enough: texture that is no noise.
     """
     image, disparity = left[:, ::_COLUMN_STEP_PX], disparity_px[:, ::_COLUMN_STEP_PX]
-    enough = enough_texture(noise_grey(left))
     texture = texture_grey(left, TEXTURE_WINDOW_PX)[:, ::_COLUMN_STEP_PX]
     slope = row_slope(image)
     strongest = cv2.dilate(slope, np.ones((_AROUND_ROWS, 1), np.uint8))
