@@ -25,7 +25,7 @@ from segfloor_ros.benchmark.stages import (
     run_apart,
 )
 from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.commands import stage_table, workload_table, write_json
+from segfloor_ros.cli.commands import stage_table, workload_table
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve
@@ -181,10 +181,7 @@ def benchmark_published(
     threads: Annotated[
         int, typer.Option(min=1, help='Threads of OpenCV; one compares machines best.')
     ] = 1,
-    json_file: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option('--json', help='Write all figures to this file.'),
-    ] = None,
+    as_json: options.Json = False,
     params: options.Params = None,
     assignments: options.Set = None,
 ) -> None:
@@ -201,7 +198,8 @@ def benchmark_published(
     console.print(published_table(results))
     if workdir is not None:
         console.print(f'maps on the truth: {workdir}/*/overlay.png', highlight=False)
-    write_json(json_file, as_document(results))
+    if as_json:
+        options.print_json(as_document(results))
 
 
 if __name__ == '__main__':

@@ -83,7 +83,12 @@ def check_suite(
     ] = False,
     view: View = None,
 ) -> None:
-    """Map recordings and hold the results against bounds. Status 1: a bound failed."""
+    """Map recordings and hold the results against bounds. Status 1: a bound failed.
+
+    \b
+    segfloor check suite.yaml --out checked --jobs 4
+    segfloor check suites/euroc.yaml --data ~/euroc --out checked
+    """
     described = read_suite(suite, data)
     for name in described.missing:
         print_error(f'{name}: is not in {data}, skipped')

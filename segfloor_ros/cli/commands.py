@@ -5,14 +5,13 @@ benchmark.
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib import resources, util
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -32,13 +31,21 @@ from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
-from segfloor_ros.cli.terminal import DriveOptions, console, figure_table, value_table, within
+from segfloor_ros.cli.terminal import (
+    DriveOptions,
+    console,
+    figure_table,
+    print_json,
+    value_table,
+    within,
+)
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings, resolve
 from segfloor_ros.errors import MapError, SettingsError, about
 from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.files.results import add_files, check_writable, write_file
+from segfloor_ros.files.results import add_files
+from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
@@ -64,7 +71,13 @@ def run(
         ),
     ] = False,
 ) -> None:
-    """Map a recording: every frame, no ROS graph, the same result byte for byte."""
+    """Map a recording: every frame, no ROS graph, the same result byte for byte.
+
+    \b
+    segfloor run drive.mcap --out result --report
+    segfloor run drive.mcap --out result --view
+    segfloor run sequences/06 --params kitti --frames 200 --out map06
+    """
     _run(options, save_debug)
 
 
@@ -134,7 +147,12 @@ def replay(
         ),
     ] = 1.0,
 ) -> None:
-    """Map a recording with the five ROS 2 nodes over DDS."""
+    """Map a recording with the five ROS 2 nodes over DDS.
+
+    \b
+    segfloor replay drive.mcap --out result
+    segfloor replay drive.mcap --rate 0 --view --out result
+    """
     _replay(options, rate)
 
 
@@ -203,7 +221,12 @@ def demo(
         bool, typer.Option('--lockstep', help='Without ROS: one process in place of five nodes.')
     ] = False,
 ) -> None:
-    """Map a recorded drive through a corridor with the five nodes and score the map."""
+    """Map a recorded drive through a corridor with the five nodes and score the map.
+
+    \b
+    segfloor demo
+    segfloor demo --lockstep --out demo
+    """
     drive = str(DRIVE / 'drive.mcap')
     if lockstep or util.find_spec('rclpy') is None:
         console.print('mapping a simulated drive through a corridor, in one process without ROS')
@@ -244,7 +267,13 @@ def view(
         Path | None, typer.Option('--out', metavar='FILE.rrd', help='Write a file, open no window.')
     ] = None,
 ) -> None:
-    """Show the results folder of a run, a recording or the nodes that run."""
+    """Show the results folder of a run, a recording or the nodes that run.
+
+    \b
+    segfloor view result
+    segfloor view drive.mcap --every 5
+    segfloor view / --live
+    """
     folder = Path(options.input)
     with open_view(str(out or '')) as shown:
         assert shown is not None
@@ -258,6 +287,38 @@ def view(
             shown.results(folder)
         else:
             shown.recording(open_source(options.configuration().stereo_camera))
+
+
+def params() -> None:
+    """List the parameter files that `--params NAME` finds.
+
+    \b
+    segfloor params
+    segfloor run sequences/06 --params kitti --out map06
+    """
+    shipped = terminal.shipped_params()
+    folder = next((f' in {path.parent}' for path in shipped.values()), '')
+    console.print(_described(f'file{folder}', {n: p.read_text() for n, p in shipped.items()}))
+
+
+def _described(name: str, texts: Mapping[str, str]) -> Table:
+    """Return a table of names, each with the first sentence of its text."""
+    table = Table(name, 'is for')
+    for key, text in texts.items():
+        sentence = re.split(r'[.:](?=\s)', text, maxsplit=1)[0]
+        table.add_row(key, ' '.join(sentence.replace('#', ' ').split()))
+    return table
+
+
+def _list_scenes(is_asked: bool) -> None:
+    if not is_asked:
+        return
+    from segfloor_ros.simulation.scene_file import shipped
+
+    scenes = {name: read_yaml(path, 'a scene') for name, path in shipped().items()}
+    texts = {name: str(scene['description']) for name, scene in scenes.items()}
+    console.print(_described('scene', texts))
+    raise typer.Exit
 
 
 def simulate(
@@ -286,8 +347,21 @@ def simulate(
     supersampling: Annotated[
         int, typer.Option(callback=within(1, 4), help='Render so many times finer than the image.')
     ] = 1,
+    list_scenes: Annotated[
+        bool,
+        typer.Option(
+            '--list', help='List the shipped scenes.', callback=_list_scenes, is_eager=True
+        ),
+    ] = False,
 ) -> None:
-    """Render a drive with exact truth: images, calibration, poses, map and floor masks."""
+    """Render a drive with exact truth: images, calibration, poses, map and floor masks.
+
+    \b
+    segfloor simulate --list
+    segfloor simulate corridor1 --out corridor1
+    segfloor simulate hall --camera realsense --set seed=7 --out hall
+    segfloor simulate floor_plan.yaml --out office
+    """
     # Imported here: the simulator takes time that other commands should not wait for.
     from segfloor_ros.simulation.drive_files import RecordingOptions, record
     from segfloor_ros.simulation.scene_file import open_scene
@@ -317,7 +391,11 @@ def convert(
         ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
     ] = ImageCoding.raw,
 ) -> None:
-    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured."""
+    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.
+
+    \b
+    segfloor convert sequences/06 drive.mcap --images png
+    """
     settings = options.configuration().stereo_camera
     source = open_source(settings)
     terminal.print_sensors(source.sensors)
@@ -345,7 +423,11 @@ def calibrate(
         typer.Option('--out', help="Folder for left.yaml and right.yaml; else the pictures'."),
     ] = None,
 ) -> None:
-    """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files."""
+    """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files.
+
+    \b
+    segfloor calibrate pictures --square 0.03 --board 9x6
+    """
     sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
     if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')
@@ -391,28 +473,32 @@ def benchmark(
     rate: Annotated[
         float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
     ] = 1.0,
-    json_file: Annotated[
-        Path | None, typer.Option('--json', help='Write all figures of the stages to this file.')
-    ] = None,
+    as_json: terminal.Json = False,
     params: terminal.Params = None,
     assignments: terminal.Set = None,
 ) -> None:
-    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload."""
+    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload.
+
+    \b
+    segfloor benchmark --json > figures.json
+    segfloor benchmark --nodes drive.mcap
+    """
     if nodes is not None:
-        print_node_figures(terminal.configuration(params, assignments, nodes), rate)
-        return
+        configuration = terminal.configuration(params, assignments, nodes)
+        return print_node_figures(configuration, rate, as_json=as_json)
     configuration = resolve(params, assignments or ())
-    if json_file is not None:
-        check_writable(json_file, '--json')
     plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
     with terminal.announcing() as announce:
         workloads = run_benchmark(plan, configuration, announce)
+    if as_json:
+        return print_json(as_document(plan, workloads))
     console.print(stage_table(workloads))
     console.print(workload_table(workloads))
-    write_json(json_file, as_document(plan, workloads))
 
 
-def print_node_figures(configuration: Configuration, rate: float, lossless: bool = False) -> None:
+def print_node_figures(
+    configuration: Configuration, rate: float, lossless: bool = False, as_json: bool = False
+) -> None:
     """Play the recording of the configuration through the nodes and print what it cost. lossless:
     lose no frame, as opposed to keeping to the clock.
     """
@@ -423,15 +509,10 @@ def print_node_figures(configuration: Configuration, rate: float, lossless: bool
     frames = open_source(configuration.stereo_camera).frame_count
     with terminal.progress_bar('playing', frames) as progress:
         figures = measure_nodes(configuration, rate, lossless, progress)
-    console.print(value_table('figure', figure_rows(figures)))
-
-
-def write_json(path: Path | None, document: dict[str, Any]) -> None:
-    """Write figures to a file and say where."""
-    if path is None:
-        return
-    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
-    console.print(f'figures: {path}', highlight=False, soft_wrap=True)
+    rows = figure_rows(figures)
+    if as_json:
+        return print_json(dict(rows))
+    console.print(value_table('figure', rows))
 
 
 def stage_table(workloads: list[Workload]) -> Table:

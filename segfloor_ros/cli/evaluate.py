@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli.terminal import console, figure_table, value_table, within
+from segfloor_ros.cli.terminal import Json, console, figure_table, print_json, value_table, within
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import (
@@ -36,8 +35,6 @@ from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
-
-JsonOption = Annotated[bool, typer.Option('--json', help='Print JSON in place of the table.')]
 
 
 @app.command('map')
@@ -66,7 +63,7 @@ def evaluate_map(
         ),
     ] = 0,
     min_distance: Annotated[
-        float, typer.Option(callback=within(0.0), help='Between nodes of a road map [m].')
+        float, typer.Option(callback=within(0.0), help='Between nodes of a road map, in m.')
     ] = 0.25,
     repetitions: Annotated[
         int, typer.Option(callback=within(1), help='Road maps to average.')
@@ -74,17 +71,23 @@ def evaluate_map(
     seed: Annotated[int, typer.Option(callback=within(0), help='Of the random nodes.')] = 0,
     sight: Annotated[
         float,
-        typer.Option(callback=within(0.1, 1000.0), help='How far the camera counts as seeing [m].'),
+        typer.Option(callback=within(0.1, 1000.0), help='How far the camera is said to see, in m.'),
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
         float | None,
         typer.Option(
-            callback=within(1.0, 360.0), help='Horizontal field of view [deg]; else from the scene.'
+            callback=within(1.0, 360.0),
+            help="Horizontal field of view, in degrees; else the scene's.",
         ),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: Json = False,
 ) -> None:
-    """Road-map precision and recall, raw and after opening, and precision and recall per cell."""
+    """Road-map precision and recall, raw and after opening, and precision and recall per cell.
+
+    \b
+    segfloor evaluate map result corridor1 --overlay overlay.png
+    segfloor evaluate map result truth.yaml --align found --json
+    """
     grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
     known = load_truth(truth)
     pose = resolve_alignment(align, grid, known)
@@ -94,8 +97,7 @@ def evaluate_map(
     if overlay is not None:
         save_overlay(compare(grid, known, pose, sight), overlay)
     if as_json:
-        _print_json(dataclasses.asdict(score))
-        return
+        return print_json(dataclasses.asdict(score))
     console.print(map_table(score))
     if overlay is not None:
         typer.echo(f'overlay: {overlay}')
@@ -114,9 +116,13 @@ def evaluate_trajectory(
         typer.Option(callback=within(1), help='Frames of the recording; else one per true pose.'),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
-    as_json: JsonOption = False,
+    as_json: Json = False,
 ) -> None:
-    """ATE and RPE after rigid alignment, with the share of frames that were tracked."""
+    """ATE and RPE after rigid alignment, with the share of frames that were tracked.
+
+    \b
+    segfloor evaluate trajectory result corridor1 --plot path.png
+    """
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.evaluation.trajectory import (
         match_files,
@@ -129,8 +135,7 @@ def evaluate_trajectory(
     if plot is not None:
         save_trajectory_plot(matched, plot)
     if as_json:
-        _print_json(dataclasses.asdict(score))
-        return
+        return print_json(dataclasses.asdict(score))
     rows = [
         ('frames tracked', f'{100 * score.tracked:.1f} % of {score.frames}'),
         ('path length', f'{score.path_length_m:.2f} m'),
@@ -155,13 +160,17 @@ def evaluate_floor(
             metavar='TRUTH', help='Folder of masks, a scene folder, or a file of outlines (.yaml).'
         ),
     ],
-    as_json: JsonOption = False,
+    as_json: Json = False,
 ) -> None:
-    """Precision, recall, intersection over union and coverage of floor masks."""
+    """Precision, recall, intersection over union and coverage of floor masks.
+
+    \b
+    segfloor evaluate floor result corridor1
+    segfloor evaluate floor result outlines.yaml --json
+    """
     score = score_floor_folders(estimate, truth)
     if as_json:
-        _print_json(score.as_dict())
-        return
+        return print_json(score.as_dict())
     shares = ('precision', 'recall', 'false_floor_share', 'iou', 'coverage')
     rows = [(name.replace('_', ' '), f'{100 * getattr(score, name):.2f} %') for name in shares]
     rows.append(('masks scored', str(score.masks)))
@@ -176,7 +185,11 @@ def evaluate_report(
         Path | None, typer.Option(help='Scene folder or map.yaml to score against.')
     ] = None,
 ) -> None:
-    """Write report.html, one page with all pictures of a run, into its folder."""
+    """Write report.html, one page with all pictures of a run, into its folder.
+
+    \b
+    segfloor evaluate report result --truth corridor1
+    """
     from segfloor_ros.evaluation.report import write_report
 
     typer.echo(f'report: {write_report(run, truth)}')
@@ -243,7 +256,3 @@ def _with_drive(
 
 def _percent(spread: Spread) -> str:
     return f'{100 * spread.mean:.2f} ± {100 * spread.std:.2f}'
-
-
-def _print_json(values: dict[str, Any]) -> None:
-    typer.echo(json.dumps(values, indent=2))

@@ -16,6 +16,7 @@ from segfloor_ros.cli.commands import (
     calibrate,
     convert,
     demo,
+    params,
     replay,
     run,
     simulate,
@@ -30,12 +31,8 @@ from segfloor_ros.files.images import own_standard_error
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.processes import terminated_like_interrupted
 
-app = typer.Typer(
-    help='Occupancy maps for ground robots from a stereo camera alone.',
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-for command in (run, replay, info, view, simulate, calibrate, convert, benchmark, demo):
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+for command in (run, replay, info, view, simulate, calibrate, convert, benchmark, demo, params):
     app.command()(command)
 app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')
@@ -56,7 +53,14 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Occupancy maps for ground robots from a stereo camera alone."""
+    """Occupancy maps for ground robots from a stereo camera alone.
+
+    \b
+    segfloor demo
+    segfloor run drive.mcap --out result --report
+    segfloor view result
+    segfloor simulate corridor1 --out corridor1
+    """
 
 
 def main() -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -111,6 +112,11 @@ def print_summary(title: str, summary: RunSummary) -> None:
     console.print(stages)
 
 
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print figures as JSON."""
+    typer.echo(json.dumps(document, indent=2))
+
+
 def print_error(message: str) -> None:
     """Print one line on standard error."""
     error_console.print(f'segfloor: {printable(message)}', highlight=False)
@@ -188,8 +194,8 @@ Params = Annotated[
         '--params',
         callback=lambda path: path and params_file(path),
         metavar='FILE|NAME',
-        help='ROS parameter file (YAML) for all stages, or the name of one that comes with the '
-        'package (segfloor params).',
+        help='ROS parameter file (YAML) for all stages, or the name of a shipped one: '
+        'see segfloor params.',
     ),
 ]
 Set = Annotated[
@@ -318,13 +324,18 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_all
 
 
+NAV2 = 'nav2'
+"""The one of the shipped parameter files that is for the nodes of others."""
+
+
 def shipped_params() -> dict[str, Path]:
-    """Return the parameter files that come with the package, by name."""
+    """Return the parameter files of this package that come with it, by name."""
     package = Path(segfloor_ros.__file__).parent
     # Of a checkout, and of an installation by pip or colcon, which is lib/python3/site-packages.
     places = package.parent, package.parents[3] / 'share' / package.name
     found = next((place / 'params' for place in places if (place / 'params').is_dir()), package)
-    return {path.stem: path for path in sorted(found.glob('*.yaml'))}
+    files = sorted(found.glob('*.yaml'))
+    return {path.stem: path for path in files if path.stem != NAV2}
 
 
 def params_file(path: Path) -> Path:

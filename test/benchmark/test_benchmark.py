@@ -20,7 +20,7 @@ from segfloor_ros.benchmark.stages import (
 )
 from segfloor_ros.cli.commands import benchmark
 from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError, MapError, SegfloorError, SettingsError
+from segfloor_ros.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.evaluation.maps import sample_states, states
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert, transform_points
@@ -228,12 +228,8 @@ def run(*arguments, fails=False):
 
 
 @pytest.mark.slow
-def test_benchmark_prints_tables_and_writes_json(tmp_path):
-    file = tmp_path / 'new' / 'figures.json'
-    output = run('--sizes', '5,20', '--frames', '8', '--seed', '2', '--json', file)
-    for words in ('5 keyframes', '20 keyframes', 'floor_segmentation', 'reference', 'MB/update'):
-        assert words in output
-    document = json.loads(file.read_text())
+def test_benchmark_prints_json_in_place_of_tables():
+    document = json.loads(run('--sizes', '5,20', '--frames', '8', '--seed', '2', '--json'))
     assert document['version'] == 1
     assert document['plan'] == {'sizes': [5, 20], 'frames': 8, 'seed': 2, 'threads': 1}
     assert set(document['machine']) == {'system', 'processor', 'python', 'numpy', 'opencv'}
@@ -266,12 +262,14 @@ def test_benchmark_prints_tables_and_writes_json(tmp_path):
         assert workload['memory_mb']['peak'] >= workload['memory_mb']['start'] > 0
 
 
+@pytest.mark.slow
+def test_benchmark_prints_tables():
+    output = run('--sizes', '3,5', '--frames', '3')
+    for words in ('3 keyframes', '5 keyframes', 'floor_segmentation', 'reference', 'MB/update'):
+        assert words in output
+
+
 @pytest.mark.parametrize('sizes', ['10,many', '', '10,0'])
 def test_bad_sizes(sizes):
     with pytest.raises(SettingsError, match=r'--sizes .*expected numbers'):
         run('--sizes', sizes, fails=True)
-
-
-def test_what_cannot_be_done_is_said_at_once(tmp_path):
-    with pytest.raises(InputError, match='give the name of a file'):
-        run('--json', tmp_path, fails=True)
