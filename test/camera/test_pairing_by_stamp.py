@@ -7,11 +7,11 @@ import logging
 import pytest
 from camera_recordings import MS
 
-from segfloor_ros.camera.sources.source import StampPairing
+from segfloor_ros.camera.sources.pairing import StampPairing
 from segfloor_ros.errors import InputError
 
 
-def pairing(tolerance_ms: float = 10.0, limit: int | None = 64) -> StampPairing[int]:
+def pairing(tolerance_ms: float = 10.0, limit: int = 64) -> StampPairing[int]:
     return StampPairing(tolerance_ms / 1000, ('/left', '/right'), limit)
 
 

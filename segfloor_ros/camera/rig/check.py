@@ -51,7 +51,7 @@ LAG_FRAMES = 0.15
 """A lag counts where it is more than this share of a frame: what rectification leaves of two real
 cameras, which were triggered together, looked like half of it."""
 
-EDGE_PX = 4.5
+EDGE_PX = 4.0
 """Sharp images have edges of 2.2 to 3.2 px, also those of a moving camera, whose blur leaves the
 edges along it; features and disparities come from the scale of the pixel."""
 
@@ -307,9 +307,12 @@ class RigCheck:
         negative = float(np.mean(apart[:, 0] < -ROWS_PX))
         centre = np.array([self._camera.cx, self._camera.cy])
         right_px = seen[:, :2] - seen[:, 2:4] - centre
-        (rows, roll, size), *_ = _fit(np.column_stack([np.ones(len(seen)), right_px]), apart[:, 1])
-        bent_px = float(abs(rows) + np.hypot(roll, size) * centre.min())
-        rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), bent_px)
+        A = np.column_stack([np.ones(len(seen)), right_px])
+        (rows, roll, size), covariance, noise_px = _fit(A, apart[:, 1])
+        sigma = noise_px * np.sqrt(np.diag(covariance))
+        bent_px = abs(rows) - SURE * sigma[0]
+        bent_px += (np.hypot(roll, size) - SURE * sigma[1:].max()) * centre.min()
+        rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), float(bent_px))
         found = []
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,14 +17,8 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.model import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
-from segfloor_ros.camera.sources.source import (
-    DEFAULT_RATE_HZ,
-    PairEntry,
-    Stamped,
-    StampPairing,
-    StereoSource,
-    check_forward,
-)
+from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, check_forward
+from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
@@ -188,12 +183,13 @@ def pairs_by_stamp(
     """Return the images of two lists that belong together. names: of both, for messages. Raises
     InputError where there are none.
     """
-    pairing: StampPairing[Path] = StampPairing(tolerance_s, names, limit=None)
-    matches = [
-        *(pair for image in left for pair in pairing.add(0, image.stamp_ns, image.item)),
-        *(pair for image in right for pair in pairing.add(1, image.stamp_ns, image.item)),
-        *pairing.finish(),
-    ]
+    pairing: StampPairing[Path] = StampPairing(tolerance_s, names)
+    # A right image comes once all left ones are there that may be nearer.
+    images = [(one.stamp_ns, 0, one) for one in left]
+    images += [(one.stamp_ns + round(1e9 * tolerance_s), 1, one) for one in right]
+    images.sort(key=lambda image: image[:2])
+    found = (pairing.add(side, one.stamp_ns, one.item) for _, side, one in images)
+    matches = [*chain.from_iterable(found), *pairing.finish()]
     pairing.report()
     return [
         FilePair(i, one.stamp_ns, one.item, other.item) for i, (one, other) in enumerate(matches)

@@ -4,7 +4,6 @@ stereo pair, joined by their stamps.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from segfloor_ros.geometry import MAX_DISORDER_NS
+from segfloor_ros.camera.sources.pairing import StampJoiner
 from segfloor_ros.messages.topics import TOPICS, stamp_of, to_ns
 from segfloor_ros.nodes.shared.reporter import Reporter
 
@@ -26,113 +25,6 @@ LEAST_PERIOD_S, LOOK_S, CHECK_S = 0.005, 0.05, 0.1
 
 DISCOVERY_S = 4.0
 """Publishers of one process are seen one after the other, the last ones after so long."""
-
-
-@dataclass(frozen=True)
-class Dropped:
-    """A set that was given up: its stamp, and the parts that never came."""
-
-    stamp_ns: int
-    missing: tuple[str, ...]
-
-
-class StampJoiner:
-    """Collects one value per part and stamp, and hands out complete sets.
-
-    Every topic delivers in order, so once a set is complete, the sets that were begun before it
-    cannot be completed any more: they are dropped and what they lacked is kept for the report. At
-    most `capacity` sets wait. A stamp that was handed out recently is not taken again, unless time
-    has jumped back meanwhile. With a tolerance, stamps that differ by no more are one set.
-    optional: parts that a set waits for only while the function says that they may come.
-    """
-
-    def __init__(
-        self,
-        parts: Sequence[str],
-        capacity: int = 100,
-        tolerance_ns: int = 0,
-        optional: Mapping[str, Callable[[], bool]] | None = None,
-    ) -> None:
-        self.parts = tuple(parts)
-        self._optional = dict(optional or {})
-        self._latest: dict[str, int] = {}
-        self._capacity = capacity
-        self._tolerance_ns = tolerance_ns
-        self._waiting: OrderedDict[int, dict[str, Any]] = OrderedDict()
-        self._done: OrderedDict[int, None] = OrderedDict()
-        self._dropped: list[Dropped] = []
-
-    @property
-    def all_parts(self) -> tuple[str, ...]:
-        """All parts, the optional ones last."""
-        return (*self.parts, *(part for part in self._optional if part not in self.parts))
-
-    def add(self, part: str, stamp_ns: int, value: Any) -> dict[str, Any] | None:
-        """Take in one part; returns the values by part when its set is complete with it."""
-        self._note_time(part, stamp_ns)
-        key = self._set_for(part, stamp_ns)
-        if key is None:
-            return None
-        parts = self._waiting.setdefault(key, {})
-        parts[part] = value
-        if not self._missing(parts):
-            return self._complete(key)
-        if len(self._waiting) > self._capacity:
-            self._drop(next(iter(self._waiting)))
-        return None
-
-    def take_dropped(self) -> list[Dropped]:
-        """Return the sets given up since the last call."""
-        dropped, self._dropped = self._dropped, []
-        return dropped
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._waiting.clear()
-        self._done.clear()
-        self._dropped.clear()
-        self._latest.clear()
-
-    def _note_time(self, part: str, stamp_ns: int) -> None:
-        latest_ns = self._latest.get(part, stamp_ns)
-        if stamp_ns < latest_ns - MAX_DISORDER_NS:
-            self._done.clear()
-            self._latest.clear()
-        self._latest[part] = max(stamp_ns, self._latest.get(part, stamp_ns))
-
-    def _missing(self, parts: Mapping[str, Any]) -> tuple[str, ...]:
-        needed = (*self.parts, *(part for part, may_come in self._optional.items() if may_come()))
-        return tuple(part for part in needed if part not in parts)
-
-    def _set_for(self, part: str, stamp_ns: int) -> int | None:
-        if self._near(self._done, stamp_ns) is not None:
-            return None
-        near = self._near(self._waiting, stamp_ns, part)
-        return stamp_ns if near is None else near
-
-    def _near(self, sets: OrderedDict[int, Any], stamp_ns: int, part: str = '') -> int | None:
-        """Return the nearest set within the tolerance; of the waiting ones, one lacking `part`."""
-        if self._tolerance_ns == 0:
-            return stamp_ns if stamp_ns in sets else None
-        near = [
-            key
-            for key, parts in sets.items()
-            if abs(key - stamp_ns) <= self._tolerance_ns and not (parts and part in parts)
-        ]
-        return min(near, key=lambda key: abs(key - stamp_ns), default=None)
-
-    def _complete(self, key: int) -> dict[str, Any]:
-        while (first := next(iter(self._waiting))) != key:
-            self._drop(first)
-        self._done[key] = None
-        while len(self._done) > self._capacity:
-            self._done.popitem(last=False)
-        return self._waiting.pop(key)
-
-    def _drop(self, key: int) -> None:
-        parts = self._waiting.pop(key)
-        missing = self._missing(parts) or tuple(p for p in self._optional if p not in parts)
-        self._dropped.append(Dropped(key, missing))
 
 
 @dataclass

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
+from segfloor_ros.camera.sources.pairing import Dropped, StampJoiner
 from segfloor_ros.geometry import MAX_DISORDER_NS
-from segfloor_ros.nodes.shared.inputs import Dropped, StampJoiner
 
 
 def test_a_set_is_complete_with_its_last_part_in_any_order() -> None:
