@@ -154,12 +154,19 @@ class StereoFrame:
 class StereoCameraSettings(StageSettings):
     """Where images come from and how left and right are paired."""
 
-    input: str = setting('', 'Recording or device to read: folder, bag, video or device.')
+    input: str = setting(
+        '', 'Recording or device to read: folder, bag, video, device, or two devices (0,2).'
+    )
     start: int = setting(0, 'First frame of a recording that is read.', within=(0, 10**9))
     frames: int = setting(0, 'Frames that are read; 0: to the end.', within=(0, 10**9))
     every: int = setting(1, 'Read every n-th frame only.', within=(1, 10**6))
     rate_hz: float = setting(
-        0.0, 'Frame rate of a recording without time stamps; 0 takes 10 Hz.', within=(0.0, 1000.0)
+        0.0,
+        'Frame rate of a recording without time stamps, or asked of a device; 0 takes 10 Hz.',
+        within=(0.0, 1000.0),
+    )
+    exposure_s: float = setting(
+        0.0, 'Exposure that is asked of a device; 0 leaves it to the camera.', within=(0.0, 1.0)
     )
     pairing_tolerance_s: float = setting(
         0.01,

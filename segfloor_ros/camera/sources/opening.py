@@ -1,11 +1,9 @@
-"""Guessing what kind of recording an input is; videos and devices, whose frames show the left image
-beside the right one.
+"""Guessing what kind of recording an input is; videos, whose frames show the left image beside the
+right one, and devices.
 """
 
 from __future__ import annotations
 
-import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -14,15 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import find_calibration
-from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.images import to_grey
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources.bag import open_bag
 from segfloor_ros.camera.sources.bag_file import is_bag
+from segfloor_ros.camera.sources.device import ColourPair, StereoDevice, halves, is_device
 from segfloor_ros.camera.sources.image_folders import (
     has_image_sides,
     is_euroc,
@@ -86,72 +82,62 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def is_device(name: str) -> bool:
-    """Whether `name` is a camera device: its number, or /dev/video with its number."""
-    return re.fullmatch('(/dev/video)?[0-9]{1,3}', name) is not None
+def open_device(name: str, settings: StereoCameraSettings) -> StereoSource:
+    """Open a camera, or two, with the calibration of the settings or of the current folder. Raises
+    InputError or CalibrationError.
+    """
+    calibration = find_calibration(f'device {name}', (Path.cwd(),), settings)
+    left = calibration.left
+    device = StereoDevice(name, (left.width, left.height), settings.rate_hz, settings.exposure_s)
+
+    def entries(source: StereoSource) -> Iterator[PairEntry]:
+        for index, (stamp_ns, images) in enumerate(device.pairs()):
+            yield PairEntry(index, stamp_ns, partial(_grey_pair, images))
+
+    rate_hz = settings.rate_hz or DEFAULT_RATE_HZ
+    return StereoSource(name, calibration, entries, frame_count=None, rate_hz=rate_hz)
 
 
 def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
-    """Open a side-by-side video with the calibration beside it or in the settings.
+    """Open a side-by-side video with the calibration beside it or in the settings, stamped by its
+    frame rate.
 
     Raises InputError or CalibrationError.
     """
     check_file(path)
     calibration = find_calibration(str(path), (path.parent,), settings)
-    return _video_source(str(path), calibration, settings, is_live=False)
-
-
-def open_device(name: str, settings: StereoCameraSettings) -> StereoSource:
-    """Open a side-by-side camera device. Raises InputError or CalibrationError."""
-    calibration = find_calibration(f'device {name}', (Path.cwd(),), settings)
-    return _video_source(name, calibration, settings, is_live=True)
-
-
-def _video_source(
-    name: str, calibration: StereoCalibration, settings: StereoCameraSettings, is_live: bool
-) -> StereoSource:
-    """Return the frames of a video, stamped by their number and the frame rate, or of a device,
-    stamped on arrival.
-    """
-    size = (2 * calibration.left.width, calibration.left.height)
 
     def entries(source: StereoSource) -> Iterator[PairEntry]:
-        with _opened(name, size, is_live) as video:
+        with _opened_video(path) as video:
             for index in count():
                 with silent_libraries():
                     ok, image = video.read()
                 if not ok:
                     return
-                stamp_ns = time.time_ns() if is_live else round(index * 1e9 / source.rate_hz)
-                yield PairEntry(index, stamp_ns, partial(_halves, image))
+                stamp_ns = round(index * 1e9 / source.rate_hz)
+                yield PairEntry(index, stamp_ns, partial(_grey_pair, halves(image)))
 
-    with _opened(name, size, is_live) as video:
+    with _opened_video(path) as video:
         frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         rate_hz = settings.rate_hz or video.get(cv2.CAP_PROP_FPS) or DEFAULT_RATE_HZ
-    frame_count = None if is_live or frames <= 0 else frames
-    return StereoSource(name, calibration, entries, frame_count=frame_count, rate_hz=rate_hz)
+    frame_count = frames if frames > 0 else None
+    return StereoSource(str(path), calibration, entries, frame_count=frame_count, rate_hz=rate_hz)
 
 
 @contextmanager
-def _opened(name: str, size: tuple[int, int], is_live: bool) -> Iterator[cv2.VideoCapture]:
+def _opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
     with silent_libraries():
-        video = cv2.VideoCapture(int(name.removeprefix('/dev/video')) if is_live else name)
+        video = cv2.VideoCapture(str(path))
     try:
         if not video.isOpened():
-            what = 'the device' if is_live else 'the video'
-            raise InputError(f'{name}: cannot open {what}; is it there and readable?')
-        if is_live:
-            video.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-            video.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+            raise InputError(f'{path}: cannot open the video; is it there and readable?')
         yield video
     finally:
         video.release()
 
 
-def _halves(image: NDArray[np.uint8]) -> tuple[Grey, Grey]:
-    grey = to_grey(image)
-    half = grey.shape[1] // 2
-    return grey[:, :half].copy(), grey[:, half:].copy()
+def _grey_pair(images: ColourPair) -> tuple[Grey, Grey]:
+    return to_grey(images[0]), to_grey(images[1])
 
 
 def kind_of(name: str) -> str:
