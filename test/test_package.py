@@ -20,8 +20,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
 IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
                  'python3-yaml': 'yaml', 'python3-typer': 'typer', 'python3-rich': 'rich',
-                 'python3-matplotlib': 'matplotlib', 'python3-rosbags-pip': 'rosbags'}  # fmt: skip
-OF_EXTRAS = {'evo', 'mujoco', 'junitparser', 'fsspec', 'distributed', 'rerun'}
+                 'python3-matplotlib': 'matplotlib'}  # fmt: skip
+OF_EXTRAS = {'evo', 'rosbags', 'mujoco', 'junitparser', 'fsspec', 'distributed', 'rerun'}
 """What has no key of rosdep: commands that need one of them say so in one line."""
 START_S = 60.0
 

@@ -5,6 +5,7 @@ install.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from enum import Enum
@@ -31,6 +32,9 @@ JPEG_QUALITY = 90
 WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
 WHEELS_FRAME = 'wheel_odom'
 END_NS = 2**62
+
+RESERVE_S, LEAST_FREE_BYTES = 10.0, 64_000_000
+"""A recording ends while there is space for what comes in this time, so that its file is whole."""
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 IMU = 'sensor_msgs/msg/Imu'
@@ -96,31 +100,22 @@ def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
     return take
 
 
-class BagWriter:
-    """A new bag of stereo pairs: one file where its name ends in `.mcap`, else a rosbag2 folder.
+class NewBag:
+    """A new bag of serialised messages: one file where its name ends in `.mcap`, else a rosbag2
+    folder. compressed: in zstd chunks. bytes: of the messages so far.
 
     It appears when it is complete; after an error nothing is left. Raises
     InputError when `out` exists or cannot be written.
     """
 
-    def __init__(
-        self, out: Path, calibration: StereoCalibration, coding: ImageCoding = ImageCoding.raw
-    ) -> None:
+    def __init__(self, out: Path, compressed: bool = False) -> None:
         self._out = out
-        self._calibration = calibration
-        self._coding = coding
-        self._encoders: dict[ImageCoding, tuple[str, list[int]]] = {
-            ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
-            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
-        }
+        self._compressed = compressed
         self._stack = ExitStack()
-        self._staging = Path()
-        self._writer: Any = None
-        self._typestore: Any = None
         self._connections: dict[str, Any] = {}
-        self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
+        self.bytes = 0
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> NewBag:
         if os.path.lexists(self._out):
             raise InputError(f'{self._out}: exists already; remove it or choose another name')
         try:
@@ -131,16 +126,15 @@ class BagWriter:
         with os_errors(f'{self._out}: cannot be written'):
             self._out.parent.mkdir(parents=True, exist_ok=True)
             self._staging = self._stack.enter_context(scratch_folder(self._out.parent))
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self.typestore = get_typestore(Stores.ROS2_JAZZY)
         self._writer = rosbag2.Writer(
             self._staging / self._out.stem, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
         )
-        if self._coding is ImageCoding.raw:
+        if self._compressed:
             self._writer.set_compression(
                 rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
             )
         self._writer.open()
-        self.messages = BagMessages(self._typestore.types)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
@@ -155,6 +149,54 @@ class BagWriter:
             bag.rename(self._out)
         finally:
             self._stack.close()
+
+    def knows(self, kind: str) -> bool:
+        """Whether messages of a type can be written: those of ROS 2 Jazzy."""
+        return kind in self.typestore.types
+
+    def has(self, topic: str) -> bool:
+        """Whether a message of a topic was written."""
+        return topic in self._connections
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message of a type, in CDR, recorded at stamp_ns."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self.typestore
+            )
+        self._writer.write(self._connections[topic], stamp_ns, data)
+        self.bytes += len(data)
+
+    def is_disk_full(self, elapsed_s: float) -> bool:
+        """Whether the space that is left is short for the next seconds, if messages go on to come
+        as fast as in the seconds so far.
+        """
+        next_bytes = RESERVE_S * self.bytes / max(elapsed_s, 1.0)
+        return shutil.disk_usage(self._staging).free < LEAST_FREE_BYTES + next_bytes
+
+
+class BagWriter:
+    """A new bag of stereo pairs."""
+
+    def __init__(
+        self, out: Path, calibration: StereoCalibration, coding: ImageCoding = ImageCoding.raw
+    ) -> None:
+        self.file = NewBag(out, compressed=coding is ImageCoding.raw)
+        self._calibration = calibration
+        self._coding = coding
+        self._encoders: dict[ImageCoding, tuple[str, list[int]]] = {
+            ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
+            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
+        }
+        self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
+
+    def __enter__(self) -> BagWriter:
+        self.file.__enter__()
+        self.messages = BagMessages(self.file.typestore.types)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.file.__exit__(*error)
 
     def write(self, pair: RawPair) -> None:
         """Append one pair, recorded at its own stamp; of a depth camera, image and depth."""
@@ -195,7 +237,7 @@ class BagWriter:
         """Return the frame of an IMU, which is written before its first sample."""
         if not sample.place_m.any():
             return FRAME_IDS[0]
-        if TF_TOPIC not in self._connections:
+        if not self.file.has(TF_TOPIC):
             T_raw_imu = make_transform(np.eye(3), self._turn_imu @ sample.place_m)
             transform = self.messages.transform(FRAME_IDS[0], IMU_FRAME, T_raw_imu)
             self.write_message(TF_TOPIC, TF, sample.stamp_ns, transform)
@@ -203,12 +245,8 @@ class BagWriter:
 
     def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
         """Append a message of a type to a topic, recorded at stamp_ns."""
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._typestore
-            )
-        data = self._typestore.serialize_cdr(message, kind)
-        self._writer.write(self._connections[topic], stamp_ns, data)
+        data = self.file.typestore.serialize_cdr(message, kind)
+        self.file.write(topic, kind, stamp_ns, data)
 
     def _image_topic(self, side: str) -> str:
         image = 'image_rect' if self._calibration.is_rectified else 'image_raw'

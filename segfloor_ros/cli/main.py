@@ -24,6 +24,7 @@ from segfloor_ros.cli.commands import (
 )
 from segfloor_ros.cli.evaluate import app as evaluate
 from segfloor_ros.cli.info import info
+from segfloor_ros.cli.record import record
 from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.cli.view import SUFFIX
 from segfloor_ros.errors import MapError, SegfloorError
@@ -32,7 +33,19 @@ from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.processes import terminated_like_interrupted
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-for command in (run, replay, info, view, simulate, calibrate, convert, benchmark, demo, params):
+for command in (
+    run,
+    replay,
+    info,
+    view,
+    simulate,
+    calibrate,
+    convert,
+    record,
+    benchmark,
+    demo,
+    params,
+):
     app.command()(command)
 app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')

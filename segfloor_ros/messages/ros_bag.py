@@ -33,7 +33,7 @@ def open_rosbag2(path: Path) -> tuple[dict[str, Topic], ReadMessages]:
     def read(names: Sequence[str]) -> Iterator[tuple[str, Any]]:
         reader = _reader(path)
         reader.set_filter(StorageFilter(topics=[name for name in names if name in topics]))
-        kinds = {name: _message_class(topics[name].msgtype) for name in names if name in topics}
+        kinds = {name: message_class(topics[name].msgtype) for name in names if name in topics}
         while reader.has_next():
             name, data, _ = reader.read_next()
             yield name, deserialize_message(data, kinds[name])
@@ -50,7 +50,7 @@ def _reader(path: Path) -> Any:
     return reader
 
 
-def _message_class(name: str) -> Any:
+def message_class(name: str) -> Any:
     """Return the class of a message type, e.g. `sensor_msgs/msg/Image`."""
     package, _, kind = name.split('/')
     return getattr(importlib.import_module(f'{package}.msg'), kind)
