@@ -84,9 +84,9 @@ def test_a_stage_knows_nothing_of_the_stages_behind_it(room) -> None:
             assert not rooms_imported(path) & behind, path.relative_to(PACKAGE)
 
 
-def test_ros_in_the_commands_is_for_the_replay_alone() -> None:
+def test_ros_in_the_commands_is_for_the_replay_and_the_recorder_alone() -> None:
     for path in MODULES:
-        if room_of(path) == 'cli' and not path.stem.startswith('replay_'):
+        if room_of(path) == 'cli' and not path.stem.startswith(('replay_', 'topic_recorder')):
             ros = {name for name in imports_of(path) if is_ros(name)}
             assert not ros, path.relative_to(PACKAGE)
 

@@ -57,7 +57,7 @@ def _record_topics(out: Path, topics: str | None, seconds: float, interrupt: Int
     """Return whether the disk became full."""
     if util.find_spec('rclpy') is None:
         raise InputError('topics are recorded with rclpy (extra ros), or name a camera by --device')
-    from segfloor_ros.nodes.topic_recorder import PICTURES, TopicRecord, record_topics
+    from segfloor_ros.cli.topic_recorder import PICTURES, TopicRecord, record_topics
 
     def show(records: dict[str, TopicRecord]) -> None:
         pictures = [r for r in records.values() if r.kind in PICTURES and r.messages > 1]

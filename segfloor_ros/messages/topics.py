@@ -10,7 +10,10 @@ everywhere outside messages.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path as FilePath
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -30,6 +33,15 @@ from sensor_msgs.msg import (
 )
 from std_msgs.msg import Header, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
+
+PROFILES = FilePath(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))
+"""Shared memory for stereo images and prompt repetition of what was lost, for Fast DDS, the
+default middleware of ROS 2 Jazzy. Other middlewares do not read it.
+"""
+
+NAMED_BY = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_OTHERS = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
+_IN_FOLDER = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 CAMERA, SLAM = 'stereo_camera', 'stereo_slam'
 FLOOR, CLOUD, GRID = 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'
@@ -236,3 +248,12 @@ def stamp_of(message: Any) -> int:
     """Return the stamp of a message or of a header in ns; 0 for what carries none."""
     header = message if isinstance(message, Header) else getattr(message, 'header', None)
     return 0 if header is None else to_ns(header.stamp)
+
+
+def prepare_middleware() -> None:
+    """Let Fast DDS take `PROFILES` in this process, unless the user has chosen otherwise. Before
+    `rclpy.init`.
+    """
+    is_chosen = any(os.environ.get(name) for name in (NAMED_BY, *_OTHERS))
+    if not is_chosen and not any(FilePath(name).exists() for name in _IN_FOLDER):
+        os.environ[NAMED_BY] = str(PROFILES)

@@ -8,12 +8,10 @@ import contextlib
 import ctypes
 import itertools
 import logging
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -37,16 +35,8 @@ from segfloor_ros.configuration import (
 )
 from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.files.whole import yaml_value
+from segfloor_ros.messages.topics import prepare_middleware
 from segfloor_ros.settings import SettingSpec, suggestion
-
-PROFILES = Path(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))
-"""Shared memory for stereo images and prompt repetition of what was lost, for Fast DDS, the
-default middleware of ROS 2 Jazzy. Other middlewares do not read it.
-"""
-
-NAMED_BY = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-_OTHERS = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
-_IN_FOLDER = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 INTERRUPT_HEARD_S = 0.2
 
@@ -56,15 +46,6 @@ M_ARENA_MAX = -8
 """Of glibc's malloc.h."""
 
 Settings = TypeVar('Settings', bound=NodeSettings)
-
-
-def prepare_middleware() -> None:
-    """Let Fast DDS take `PROFILES` in this process, unless the user has chosen otherwise. Before
-    `rclpy.init`.
-    """
-    is_chosen = any(os.environ.get(name) for name in (NAMED_BY, *_OTHERS))
-    if not is_chosen and not any(Path(name).exists() for name in _IN_FOLDER):
-        os.environ[NAMED_BY] = str(PROFILES)
 
 
 def run_node(make_node: Callable[[], Node]) -> None:

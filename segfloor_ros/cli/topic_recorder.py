@@ -24,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from segfloor_ros.camera.bag_writer import IMU, ODOMETRY, TF, NewBag
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.messages.ros_bag import message_class
-from segfloor_ros.nodes.shared.running import prepare_middleware
+from segfloor_ros.messages.topics import prepare_middleware
 from segfloor_ros.processes import Interrupt
 
 RECORDED = (IMAGE, COMPRESSED, CAMERA_INFO, IMU, ODOMETRY, TF)
