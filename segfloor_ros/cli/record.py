@@ -40,6 +40,11 @@ def record(
     """Record topics of the live graph, or a camera of this machine, to a rosbag2 (mcap).
 
     Ctrl-C, and a disk that becomes full, leave a whole file.
+
+    \b
+    segfloor record drive.mcap
+    segfloor record drive.mcap --topics "/camera/.*|/imu" --seconds 60
+    segfloor record drive.mcap --device 0,2 --images jpeg --set stereo_camera.exposure_s=0.005
     """
     with first_interrupt_noted() as interrupt:
         if device is None:
