@@ -137,7 +137,7 @@ class View:
         assert pipeline.mount is not None
         camera = pipeline.camera
         self.camera(camera.K, (camera.width, camera.height), pipeline.mount.T_base_left)
-        self.overlay(stamp_ns, mask_overlay(keyframe.left, floor.mask), keyframe.moving)
+        self.overlay(stamp_ns, mask_overlay(keyframe.left, floor.mask, keyframe.moving))
         self.path(stamp_ns, keyframe.path)
         self.cloud(stamp_ns, stages.labelled)
         self.grid(stamp_ns, stages.grid())
@@ -171,13 +171,8 @@ class View:
         is_image = frame.right.dtype == np.uint8
         self._picture(frame.stamp_ns, RIGHT, frame.right if is_image else levels.astype(np.uint8))
 
-    def overlay(
-        self, stamp_ns: int, picture: NDArray[np.uint8], moving: NDArray[np.uint8] | None = None
-    ) -> None:
-        """Show a keyframe (H, W, 3) BGR tinted by its floor, and in it what moves (H, W)."""
-        if moving is not None:
-            picture = picture.copy()
-            picture[moving > 0] = MOVING_RGB[::-1]
+    def overlay(self, stamp_ns: int, picture: NDArray[np.uint8]) -> None:
+        """Show a keyframe (H, W, 3) BGR tinted by its floor and what moves."""
         self._picture(stamp_ns, KEYFRAME, picture)
 
     def camera(self, K: Array, size: tuple[int, int], T_base_left: Array) -> None:
@@ -316,9 +311,9 @@ class View:
                     for masks in ('floor_masks', 'moving_masks')
                 )
                 if mask.is_file():
-                    tinted = mask_overlay(frame.left, read_mask(mask))
                     found = read_mask(moving) if moving.is_file() else None
-                    self.overlay(frame.stamp_ns, tinted, found)
+                    tinted = mask_overlay(frame.left, read_mask(mask), found)
+                    self.overlay(frame.stamp_ns, tinted)
                 progress(done)
 
     def _picture(self, stamp_ns: int, entity: str, picture: NDArray[np.uint8]) -> None:

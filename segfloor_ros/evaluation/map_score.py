@@ -27,7 +27,7 @@ from segfloor_ros.evaluation.maps import (
     states,
 )
 from segfloor_ros.files.results import write_file
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN_PIXEL, OccupancyGrid
 
 DEFAULT_RANGE_M = 5.0
 
@@ -38,7 +38,7 @@ COLOURS = {
     'occupied, but is free': (190, 70, 190),
     'floor missed': (245, 200, 130),
     'obstacle missed': (0, 165, 255),
-    'nothing': (214, 214, 214),
+    'no evidence': (UNKNOWN_PIXEL,) * 3,
 }
 """Blue, green, red of each class in the picture."""
 
@@ -307,7 +307,7 @@ def save_overlay(maps: Comparison, path: Path) -> None:
 def _coloured(maps: Comparison) -> NDArray[np.uint8]:
     estimate, truth = maps.estimate, maps.truth
     free, occupied = estimate == FREE, estimate == OCCUPIED
-    picture = np.full((*truth.shape, 3), COLOURS['nothing'], np.uint8)
+    picture = np.full((*truth.shape, 3), COLOURS['no evidence'], np.uint8)
     picture[maps.wanted_floor & ~free] = COLOURS['floor missed']
     picture[maps.wanted_obstacles & ~occupied] = COLOURS['obstacle missed']
     picture[free & (truth == FREE)] = COLOURS['free, agree']
@@ -318,7 +318,7 @@ def _coloured(maps: Comparison) -> NDArray[np.uint8]:
 
 
 def _legend(width: int) -> NDArray[np.uint8]:
-    legend = [item for item in COLOURS.items() if item[0] != 'nothing']
+    legend = list(COLOURS.items())
     columns = max(1, width // 240)
     rows = -(-len(legend) // columns)
     strip = np.full((rows * LEGEND_ROW_PX + 6, width, 3), 250, np.uint8)

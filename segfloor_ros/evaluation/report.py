@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from segfloor_ros.errors import os_errors
 from segfloor_ros.evaluation.map_score import MapScore, compare, draw_overlay, score_map
 from segfloor_ros.evaluation.report_pictures import (
     ReportData,
     cloud_picture,
-    floor_pictures,
+    keyframe_pictures,
     map_picture,
     memory_picture,
-    moving_pictures,
     read_run,
     v_disparity_picture,
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import add_files
+from segfloor_ros.floor.segmentation import MASK_COLOURS
 from segfloor_ros.results_folder import REPORT
 
 STYLE = Path(__file__).with_name('report.css')
@@ -45,6 +47,7 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
 def _page(data: ReportData) -> str:
     sections = [
         _facts(data),
+        _section('What to do next', _list(advice(data))),
         _maps(data),
         _keyframes(data),
         _section('Floor profile', _v_disparity(data)),
@@ -75,12 +78,66 @@ def _facts(data: ReportData) -> str:
     facts = [
         (f'{summary["frames"]}', 'frames'),
         (f'{tracked:.1f} %', 'of them tracked'),
+        (f'{_length_m(data):.1f} m', 'of path'),
         (f'{summary["keyframes"]}', 'keyframes'),
+        (f'{summary["loops"]}', 'loops closed'),
         (f'{summary["map_updates"]}', 'map updates'),
         (f'{summary["frames_per_s"]:.1f}', 'frames per second'),
-        *([] if height_m is None else [(f'{100 * height_m:.1f} cm', 'camera above the floor')]),
+        *([] if height_m is None else [(f'{height_m:.3f} m', 'camera above the floor')]),
     ]
     return _fact_row(facts) + _scores(data)
+
+
+def _length_m(data: ReportData) -> float:
+    return float(np.linalg.norm(np.diff(data.trajectory[:, :3, 3], axis=0), axis=1).sum())
+
+
+def advice(data: ReportData) -> list[str]:
+    """Return what the figures of a run ask for, the gravest first, each in a line."""
+    summary = data.summary
+    lines = [
+        f'{fault["fault"].replace("_", " ")} ({fault["value"]:g} {fault["unit"]}): '
+        f'{fault["remedy"]}'
+        for fault in summary.get('input_faults', [])
+    ]
+    lines += summary.get('sensor_remarks', [])
+    if summary['camera_height_m'] is None:
+        lines.append(
+            'the mount of the camera stayed unknown, so there is no map: let it see level floor at '
+            'the start, or give stereo_slam.camera_height_m, camera_pitch_rad and camera_roll_rad'
+        )
+    lost = ', '.join(f'{first} to {last}' for first, last in summary['lost_intervals'])
+    if lost:
+        lines.append(
+            f'lost in the frames {lost}: look at these images; slower turns, more light, and '
+            'walls with something on them in view help, and so do wheels or an IMU'
+        )
+    for submap in summary.get('submaps', []):
+        if not submap['merged']:
+            lines.append(
+                f'the frames {submap["first_frame"]} to {submap["last_frame"]} are in no map: end '
+                'the drive where it has been before, looking the same way'
+            )
+    if blind := summary.get('blind_frames', 0):
+        lines.append(
+            f'{blind} frames show too few features for a pose, which then came from wheels or '
+            'gyroscope: more light, or a camera that sees more than plain walls'
+        )
+    if repeated := summary.get('repeated_frames', 0):
+        lines.append(f'{repeated} images are the one before: the driver or the recorder is late')
+    if skipped := summary.get('skipped_frames', 0):
+        lines.append(f'{skipped} frames could not be read: is the recording whole?')
+    failed = summary.get('failed_frames', 0) + summary.get('failed_keyframes', 0)
+    if failed:
+        lines.append(f'{failed} frames or keyframes failed: the log of the run says why')
+    rate_hz = (len(data.times_s) - 1) / max(float(np.ptp(data.times_s)), 1e-9)
+    if summary['frames_per_s'] < rate_hz:
+        lines.append(
+            f'{summary["frames_per_s"]:.1f} frames per second are fewer than the {rate_hz:.1f} of '
+            'the camera: this machine would skip some on a robot; smaller images or fewer features '
+            '(stereo_slam.num_features) are faster'
+        )
+    return lines or ['nothing: the figures are sound']
 
 
 def _scores(data: ReportData) -> str:
@@ -90,9 +147,7 @@ def _scores(data: ReportData) -> str:
     facts = _map_facts(score_map(data.grid, data.truth))
     if data.truth_folder is not None and (data.truth_folder / 'poses.txt').is_file():
         path = score_trajectory(match_files(data.folder, data.truth_folder))
-        facts.append(
-            (f'{100 * path.ate_rmse_m:.1f} cm', f'path error over {path.path_length_m:.1f} m')
-        )
+        facts.append((f'{path.ate_rmse_m:.3f} m', f'path error over {path.path_length_m:.1f} m'))
     return '<h2>Against the truth</h2>' + _fact_row(facts)
 
 
@@ -111,21 +166,31 @@ def _maps(data: ReportData) -> str:
         overlay = draw_overlay(compare(data.grid, data.truth))
         png = bytes(cv2.imencode('.png', overlay)[1])
         figures.append(_figure(png, 'Map laid on the true one'))
-    figures.append(_figure(cloud_picture(data), 'Labelled cloud from above: floor in green'))
+    figures.append(_figure(cloud_picture(data), 'Labelled cloud from above'))
     return f'<h2>Map</h2><div class="row">{"".join(figures)}</div>'
 
 
 def _keyframes(data: ReportData) -> str:
-    return _strip('Keyframes', 'green: floor; yellow: no evidence', floor_pictures(data)) + _strip(
-        'What moves', 'red: left out of the pose, the map and the floor', moving_pictures(data)
+    figures = [_figure(picture, name, 'jpeg') for name, picture in keyframe_pictures(data)]
+    if not figures:
+        return ''
+    return f'<h2>Keyframes</h2>{_legend(MASK_COLOURS)}<div class="strip">{"".join(figures)}</div>'
+
+
+def _legend(colours: Mapping[str, tuple[int, int, int]]) -> str:
+    """Return what colours (BGR) stand for."""
+    return '<p class="sub">{}</p>'.format(
+        ' '.join(
+            f'<span class="colour" style="background: rgb{colour[::-1]}"></span>{name}'
+            for name, colour in colours.items()
+        )
     )
 
 
-def _strip(title: str, legend: str, pictures: list[tuple[str, bytes]]) -> str:
-    figures = [_figure(picture, name, 'jpeg') for name, picture in pictures]
-    if not figures:
-        return ''
-    return f'<h2>{title}</h2><p class="sub">{legend}</p><div class="strip">{"".join(figures)}</div>'
+def _list(lines: Sequence[str]) -> str:
+    return '<ul class="next">{}</ul>'.format(
+        ''.join(f'<li>{html.escape(line)}</li>' for line in lines)
+    )
 
 
 def _v_disparity(data: ReportData) -> str:
@@ -144,7 +209,7 @@ def _stages(summary: dict[str, Any]) -> str:
     )
     names = ('stage', 'calls', 'median ms', 'p95 ms', 'max ms', '')
     head = '<tr>' + ''.join(f'<th>{name}</th>' for name in names) + '</tr>'
-    return f'<table>{head}{rows}</table>' if rows else ''
+    return f'<div class="scroll"><table>{head}{rows}</table></div>' if rows else ''
 
 
 def _memory(summary: dict[str, Any]) -> str:

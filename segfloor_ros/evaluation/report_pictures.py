@@ -16,33 +16,38 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labelled_cloud import FLOOR as FLOOR_POINT
 from segfloor_ros.cloud.labelled_cloud import OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.cloud.labelled_cloud import UNKNOWN as UNKNOWN_POINT
 from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.maps import MapTruth, load_truth, states
+from segfloor_ros.evaluation.maps import MapTruth, load_truth
 from segfloor_ros.files.images import check_same_size, read_mask
 from segfloor_ros.files.whole import read_text
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorSegmentationSettings
-from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.floor.observation import FloorSegmentationSettings
+from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import (
-    FREE,
     FREE_PIXEL,
-    OCCUPIED,
     OCCUPIED_PIXEL,
     UNKNOWN_PIXEL,
     OccupancyGrid,
     load_map,
+    pixels_of,
 )
 from segfloor_ros.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.trajectory import read_trajectory
 
-FLOOR_TINT, NO_EVIDENCE_TINT, MOVING_TINT = (80, 190, 60), (60, 200, 240), (60, 60, 230)
-MOVING = 255
+FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
+"""Of points; what nothing is known of has the grey that it has in a map."""
+
+STEPS = 1, 2, 5
+"""Lengths of a scale bar, times a power of ten."""
+
 STRIP_WIDTH_PX = 480
 MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
@@ -52,41 +57,41 @@ STRIP_LENGTH = 6
 
 
 def map_picture(data: ReportData) -> bytes:
-    """Draw the map with the path of the base and its keyframes."""
+    """Draw the map with the path of the base, its keyframes and the loops that were closed."""
     figure, axes = _figure(data.grid)
     _show_grid(axes, data.grid)
     axes.plot(*data.trajectory[:, :2, 3].T, color='tab:blue', linewidth=1.6, label='path')
     axes.plot(*data.keyframes[:, :2, 3].T, '.', color='tab:orange', markersize=4, label='keyframes')
-    axes.plot(*data.trajectory[0, :2, 3], 'o', color='tab:green', label='start')
-    axes.legend(loc='upper right', fontsize=8, framealpha=0.9)
+    if len(data.loops_xy):
+        axes.plot(*data.loops_xy.T, 'o', color='tab:red', markersize=7, label='loop closed')
+    _show_ends(axes, data)
+    grey = {'free': FREE_PIXEL, 'occupied': OCCUPIED_PIXEL, 'no evidence': UNKNOWN_PIXEL}
+    _legend(axes, {name: f'{level / 255}' for name, level in grey.items()})
     return _png(figure)
 
 
 def cloud_picture(data: ReportData) -> bytes:
     """Draw the labelled cloud from above: floor green, obstacles by height."""
     figure, axes = _figure(data.grid)
-    floor, obstacles = (_some(data.cloud, label) for label in (FLOOR_POINT, OBSTACLE))
-    axes.scatter(floor[:, 0], floor[:, 1], s=1.0, color='#3aa655', label='floor', linewidths=0)
-    drawn = axes.scatter(
-        obstacles[:, 0], obstacles[:, 1], s=1.6, c=obstacles[:, 2], cmap='plasma',
-        vmin=0, vmax=2, linewidths=0, label='obstacle',
-    )  # fmt: skip
-    axes.plot(*data.trajectory[:, :2, 3].T, color='black', linewidth=0.8)
-    figure.colorbar(drawn, ax=axes, label='height [m]', shrink=0.7, pad=0.02)
     axes.set_facecolor('#f4f4f4')
+    for label, colour in ((UNKNOWN_POINT, NO_EVIDENCE), (FLOOR_POINT, FLOOR)):
+        points = _some(data.cloud, label)
+        axes.scatter(points[:, 0], points[:, 1], s=1.0, color=colour, linewidths=0)
+    points = _some(data.cloud, OBSTACLE)
+    drawn = axes.scatter(
+        points[:, 0], points[:, 1], s=1.6, c=points[:, 2], cmap='plasma', vmin=0, vmax=2,
+        linewidths=0,
+    )  # fmt: skip
+    axes.plot(*data.trajectory[:, :2, 3].T, color='tab:blue', linewidth=0.8, label='path')
+    _show_ends(axes, data)
+    figure.colorbar(drawn, ax=axes, label='height of obstacles [m]', shrink=0.7, pad=0.02)
+    _legend(axes, {'floor': FLOOR, 'no evidence': NO_EVIDENCE})
     return _png(figure)
 
 
-def floor_pictures(data: ReportData) -> list[tuple[str, bytes]]:
-    """Return keyframes with their floor tinted, each with a caption."""
-    tints = {FLOOR: FLOOR_TINT, NO_EVIDENCE: NO_EVIDENCE_TINT}
-    return [(f'frame {item.frame.index}', _tinted(item, tints)) for item in data.strip]
-
-
-def moving_pictures(data: ReportData) -> list[tuple[str, bytes]]:
-    """Return keyframes with what moves tinted, each with a caption."""
-    tints = {MOVING: MOVING_TINT}
-    return [(f'frame {item.frame.index}', _tinted(item, tints)) for item in data.moving]
+def keyframe_pictures(data: ReportData) -> list[tuple[str, bytes]]:
+    """Return keyframes tinted by their floor and by what moves, each with a caption."""
+    return [(f'frame {item.frame.index}', _tinted(item)) for item in data.strip]
 
 
 def v_disparity_picture(data: ReportData) -> bytes | None:
@@ -129,15 +134,40 @@ def memory_picture(memory: dict[str, Any]) -> bytes | None:
     return _png(figure)
 
 
-def _tinted(item: MaskedFrame, tints: dict[int, tuple[int, int, int]]) -> bytes:
-    picture = cv2.cvtColor(item.frame.left, cv2.COLOR_GRAY2BGR).astype(np.float32)
-    for value, tint in tints.items():
-        pixels = item.mask == value
-        picture[pixels] = 0.62 * picture[pixels] + 0.38 * np.array(tint, np.float32)
+def _tinted(item: MaskedFrame) -> bytes:
+    picture = mask_overlay(item.frame.left, item.mask, item.moving)
     scale = STRIP_WIDTH_PX / picture.shape[1]
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode('.jpg', small.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    return bytes(encoded)
+    return bytes(cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+
+
+def _show_ends(axes: Axes, data: ReportData) -> None:
+    """Mark where the drive starts and ends, and how long a metre is."""
+    start, end = data.trajectory[[0, -1], :2, 3]
+    axes.plot(*start, 'o', color='tab:green', label='start')
+    axes.plot(*end, 's', color='tab:purple', label='end')
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    longest = (right - left) / 4
+    tens = 10.0 ** np.floor(np.log10(longest))
+    length = max(step * tens for step in STEPS if step * tens <= longest)
+    x, y = left + (right - left) / 40, bottom + (top - bottom) / 40
+    axes.plot([x, x + length], [y, y], color='black', linewidth=3, solid_capstyle='butt')
+    axes.annotate(f'{length:g} m', (x + length / 2, y), (0, 4), textcoords='offset points',
+                  ha='center', fontsize=8)  # fmt: skip
+
+
+def _legend(axes: Axes, colours: dict[str, str]) -> None:
+    """Name every colour, below the axes: of lines by their labels, and of areas."""
+    areas = [Patch(facecolor=c, edgecolor='grey', label=name) for name, c in colours.items()]
+    lines = axes.get_legend_handles_labels()[0]
+    axes.legend(
+        handles=[*lines, *areas],
+        loc='upper center',
+        bbox_to_anchor=(0.5, -0.12),
+        ncols=4,
+        fontsize=9,
+        frameon=False,
+    )
 
 
 def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
@@ -161,14 +191,11 @@ def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
 
 
 def _show_grid(axes: Axes, grid: OccupancyGrid) -> None:
-    state = states(grid)
-    shades = [FREE_PIXEL, OCCUPIED_PIXEL]
-    grey = np.select([state == FREE, state == OCCUPIED], shades, UNKNOWN_PIXEL)
-    rows, columns = state.shape
+    rows, columns = grid.cells.shape
     x, y = grid.origin_xy_m
     extent = (x, x + columns * grid.resolution_m, y, y + rows * grid.resolution_m)
     axes.imshow(
-        grey, extent=extent, origin='lower', cmap='gray', vmin=0, vmax=255, interpolation='nearest'
+        pixels_of(grid.cells), extent=extent, cmap='gray', vmin=0, vmax=255, interpolation='nearest'
     )
 
 
@@ -186,16 +213,18 @@ def _png(figure: Figure) -> bytes:
 
 @dataclass(frozen=True)
 class MaskedFrame:
-    """A keyframe's rectified pair with a mask (H, W) uint8 of what was found in it."""
+    """A keyframe's rectified pair with masks (H, W) uint8 of its floor, and of what moves."""
 
     frame: StereoFrame
     mask: NDArray[np.uint8]
+    moving: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
 class ReportData:
-    """A run as its files tell it. trajectory, keyframes: base poses (N, 4, 4) in `map`. strip,
-    moving: keyframes with their floor, and with what moves, evenly over the drive. settings_text:
+    """A run as its files tell it. times_s: (N,) stamps of the trajectory. trajectory, keyframes:
+    base poses (N, 4, 4) in `map`. loops_xy: (L, 2) where loops were closed. strip: keyframes with
+    their floor, evenly over the drive, and those in which something moves, likewise. settings_text:
     settings.yaml as it is. truth: None where nobody knows it.
     """
 
@@ -207,11 +236,12 @@ class ReportData:
     camera: StereoCamera
     mount: Mount
     grid: OccupancyGrid
+    times_s: Array
     trajectory: Array
     keyframes: Array
+    loops_xy: Array
     cloud: LabelledPoints
     strip: list[MaskedFrame]
-    moving: list[MaskedFrame]
     truth: MapTruth | None
     truth_folder: Path | None
 
@@ -225,7 +255,9 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
     settings = folder / 'settings.yaml'
     parameters = resolve(settings)
     source = open_source(parameters.stereo_camera)
-    trajectory = read_trajectory(folder / 'trajectory.txt')[1]
+    times_s, trajectory = read_trajectory(folder / 'trajectory.txt')
+    keyframe_s, keyframes = read_trajectory(folder / 'keyframes.txt')
+    closed = np.searchsorted(keyframe_s, summary.get('loop_times_s', []))
     return ReportData(
         folder=folder,
         name=Path(source.name).name,
@@ -235,11 +267,12 @@ def read_run(folder: Path, truth: Path | None = None) -> ReportData:
         camera=source.camera,
         mount=Mount(*(summary[name] or 0.0 for name in MOUNT_FIGURES)),
         grid=_grid(folder / 'map.yaml', trajectory),
+        times_s=times_s,
         trajectory=trajectory,
-        keyframes=read_trajectory(folder / 'keyframes.txt')[1],
+        keyframes=keyframes,
+        loops_xy=keyframes[closed.clip(max=len(keyframes) - 1).astype(int), :2, 3],
         cloud=read_ply(folder / 'labelled_cloud.ply'),
-        strip=_masked_frames(folder / 'floor_masks', source.frames()),
-        moving=_masked_frames(folder / 'moving_masks', source.frames()),
+        strip=_masked_frames(folder, source.frames()),
         truth=load_truth(truth) if truth is not None else None,
         truth_folder=truth if truth is not None and truth.is_dir() else None,
     )
@@ -256,16 +289,30 @@ def _grid(path: Path, trajectory: Array) -> OccupancyGrid:
 
 
 def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFrame]:
-    """Return some frames that have a mask, evenly over the drive."""
-    files = sorted(folder.glob('[0-9]' * 6 + '.png')) if folder.is_dir() else []
-    chosen = np.unique(np.linspace(0, len(files) - 1, STRIP_LENGTH).round().astype(int))
-    wanted = {int(files[i].stem): files[i] for i in chosen} if files else {}
+    """Return some keyframes evenly over the drive, and some of those in which something moves."""
+    floors, moving = (_masks(folder / name) for name in ('floor_masks', 'moving_masks'))
+    both = {index: path for index, path in floors.items() if index in moving}
+    wanted = _evenly(floors) | _evenly(both)
     strip: list[MaskedFrame] = []
     for frame in frames:
         if len(strip) == len(wanted):
             break
         if frame.index in wanted:
-            mask = read_mask(wanted[frame.index])
-            check_same_size(mask, frame.left, wanted[frame.index])
-            strip.append(MaskedFrame(frame, mask))
+            paths = [masks[frame.index] for masks in (floors, moving) if frame.index in masks]
+            found = [read_mask(path) for path in paths]
+            for mask, path in zip(found, paths, strict=True):
+                check_same_size(mask, frame.left, path)
+            strip.append(MaskedFrame(frame, *found))
     return strip
+
+
+def _masks(folder: Path) -> dict[int, Path]:
+    """Return the masks of a folder by the index of their frame."""
+    return {int(path.stem): path for path in sorted(folder.glob('[0-9]' * 6 + '.png'))}
+
+
+def _evenly(masks: dict[int, Path]) -> set[int]:
+    """Return a few of the frames, evenly over the drive."""
+    frames = list(masks)
+    rows = np.linspace(0, len(frames) - 1, STRIP_LENGTH).round().astype(int)
+    return {frames[row] for row in rows} if frames else set()

@@ -83,6 +83,15 @@ _BOARD = 2
 """Table tops are thinner than what stands: so many times what is seen of them counts."""
 
 _COLOURS_BGR = {FLOOR: (60, 200, 60), NO_EVIDENCE: (200, 120, 40), NOT_FLOOR: (60, 60, 200)}
+_MOVING_BGR = (200, 40, 225)
+
+MASK_COLOURS = {
+    'floor': _COLOURS_BGR[FLOOR],
+    'not floor': _COLOURS_BGR[NOT_FLOOR],
+    'no evidence': _COLOURS_BGR[NO_EVIDENCE],
+    'moving': _MOVING_BGR,
+}
+"""Blue, green, red of what `mask_overlay` tints."""
 
 
 class FloorSegmentation:
@@ -331,13 +340,17 @@ def clear_hidden(
         mask[hidden[columns] > 0] = NO_EVIDENCE
 
 
-def mask_overlay(left: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def mask_overlay(
+    left: NDArray[np.uint8], mask: NDArray[np.uint8], moving: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
     """Return the left image (H, W) uint8 tinted by the mask (H, W), as (H, W, 3) BGR: green is
-    floor, blue no evidence, red not floor.
+    floor, blue no evidence, red not floor, and magenta what moves, the mask (H, W) of which is 255.
     """
     tint = np.zeros((*mask.shape, 3), np.uint8)
     for value, colour in _COLOURS_BGR.items():
         tint[mask == value] = colour
+    if moving is not None:
+        tint[moving > 0] = _MOVING_BGR
     return cv2.addWeighted(cv2.cvtColor(left, cv2.COLOR_GRAY2BGR), 0.65, tint, 0.35, 0)
 
 

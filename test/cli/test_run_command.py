@@ -1,6 +1,7 @@
 """`segfloor run` for real: a small recording to a results folder, and every kind of bad input."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from command_line import segfloor, segfloor_process
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.evaluation.report import write_report
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.slam.results import StereoSlamSettings
 
@@ -375,3 +377,42 @@ def test_a_report_on_a_cloud_that_cannot_be_read_ends_with_status_2(result, tmp_
         assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1
         assert 'labelled_cloud.ply' in done.stderr
+
+
+FAULT = {'fault': 'rows_apart', 'value': 3.2, 'unit': 'px', 'remedy': 'calibrate again'}
+SUBMAP = {'first_frame': 4, 'last_frame': 9, 'merged': False}
+
+
+@pytest.mark.parametrize(
+    ('figures', 'words'),
+    [
+        ({}, 'nothing: the figures are sound'),
+        ({'input_faults': [FAULT]}, 'rows apart (3.2 px): calibrate again'),
+        ({'lost_intervals': [[3, 5], [7, 7]]}, 'lost in the frames 3 to 5, 7 to 7'),
+        ({'submaps': [SUBMAP]}, 'the frames 4 to 9 are in no map'),
+        ({'submaps': [SUBMAP | {'merged': True}]}, 'nothing: the figures are sound'),
+        ({'blind_frames': 2}, '2 frames show too few features'),
+        ({'frames_per_s': 4.0}, '4.0 frames per second are fewer than the 10.0 of the camera'),
+        ({'sensor_remarks': ['imu: upside down']}, 'imu: upside down'),
+    ],
+)
+def test_a_report_says_what_to_do_next(result, tmp_path, figures, words):
+    """Of a drive at 10 Hz."""
+    run = tmp_path / 'run'
+    shutil.copytree(result[0], run, ignore=shutil.ignore_patterns('*_masks', 'floor_debug'))
+    summary = json.loads((run / 'summary.json').read_text()) | {'frames_per_s': 20.0} | figures
+    (run / 'summary.json').write_text(json.dumps(summary))
+    page = write_report(run).read_text()
+    (box,) = re.findall('<h2>What to do next</h2><ul class="next">(.*?)</ul>', page)
+    assert box.startswith(f'<li>{words}')
+    assert box.count('<li>') == 1
+
+
+def test_a_report_names_its_colours_and_the_length_of_the_path(result, tmp_path):
+    run = tmp_path / 'run'
+    shutil.copytree(result[0], run)
+    page = write_report(run).read_text()
+    for name in ('floor', 'not floor', 'no evidence', 'moving'):
+        assert re.search(f'<span class="colour" style="background: rgb[^"]*"></span>{name}', page)
+    # room_drive: 6 cm a frame.
+    assert f'<b>{0.06 * (FRAMES - 1):.1f} m</b><span>of path' in page
