@@ -31,7 +31,6 @@ TF_TOPIC = '/tf_static'
 JPEG_QUALITY = 90
 WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
 WHEELS_FRAME = 'wheel_odom'
-END_NS = 2**62
 
 RESERVE_S, LEAST_FREE_BYTES = 10.0, 64_000_000
 """A recording ends while there is space for what comes in this time, so that its file is whole."""
@@ -79,7 +78,7 @@ def convert(
                 bag.write_depth(other, depth.camera.disparity_times_depth)
             done += 1
             on_progress(done)
-        for measurement in log.until(END_NS):
+        for measurement in log.until(np.iinfo(np.int64).max):
             bag.write_measurement(measurement)
     return done
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
-from typing import Annotated
 
-import typer
 from rich.table import Table
 
 from segfloor_ros.camera.sources import open_source
@@ -20,9 +17,7 @@ from segfloor_ros.results_folder import read_summary
 
 def info(
     input: terminal.Input,
-    as_json: Annotated[
-        bool, typer.Option('--json', help='Print JSON in place of the tables.')
-    ] = False,
+    as_json: terminal.Json = False,
     start: terminal.Start = None,
     frames: terminal.Frames = None,
     every: terminal.Every = None,
@@ -41,7 +36,10 @@ def info(
     """
     known = _known_output(Path(input).expanduser())
     if known:
-        typer.echo(json.dumps({'name': input, 'kind': known}) if as_json else f'{input}: {known}')
+        if as_json:
+            terminal.print_json({'name': input, 'kind': known})
+        else:
+            console.print(f'{input}: {known}', highlight=False, soft_wrap=True)
         return
     part = {'start': start, 'frames': frames, 'every': every}
     configuration = terminal.configuration(
@@ -51,7 +49,7 @@ def info(
     with terminal.progress_bar('reading', source.frame_count) as progress:
         found = inspect_recording(source, input, progress)
     if as_json:
-        typer.echo(json.dumps(dataclasses.asdict(found), indent=2))
+        terminal.print_json(dataclasses.asdict(found))
         return
     console.print(value_table('recording', _rows(found), found.name))
     console.print(_stream_table(found.streams))

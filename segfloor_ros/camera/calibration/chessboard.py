@@ -25,8 +25,6 @@ MIN_PAIRS = 5
 
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 
-SUBPIX_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-
 FILES = ('left.yaml', 'right.yaml')
 
 logger = logging.getLogger(__name__)
@@ -191,5 +189,5 @@ def find_corners(
     grid = corners.reshape(board[1], board[0], 2)
     spacing_px = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min())
     half = int(np.clip(spacing_px / 3, 2, 11))
-    cv2.cornerSubPix(image, corners, (half, half), (-1, -1), SUBPIX_END)
+    cv2.cornerSubPix(image, corners, (half, half), (-1, -1), SOLVER_END)
     return corners, (image.shape[1], image.shape[0])

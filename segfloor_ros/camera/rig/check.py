@@ -25,8 +25,10 @@ from segfloor_ros.camera.rig.depth import DepthCheck
 from segfloor_ros.camera.rig.focal import (
     LEAST_NOISE_PX,
     MAX_HAMMING,
+    MIN_MATCHES,
     ROWS_PX,
     SURE,
+    WINDOW_PX,
     FocalCheck,
     Matches,
     follow,
@@ -43,9 +45,8 @@ BURST = 2 + EVERY // 2
 """Frames after a jump: one before the look, the look, and those up to the next view of a turn."""
 
 FEATURES, LEVELS = 500, 2
-MAX_DISPARITY_SHARE = 0.4
-MAX_ROWS_SHARE = 0.15
-MIN_MATCHES = 40
+REACH_SHARE = 0.4, 0.15
+"""Of width and height: a point is no further from its place in the other eye."""
 
 LAG_FRAMES = 0.15
 """A lag counts where it is more than this share of a frame: what rectification leaves of two real
@@ -56,15 +57,14 @@ EDGE_PX = 4.0
 edges along it; features and disparities come from the scale of the pixel."""
 
 DARK_GREY, WHITE_GREY = 32, 250
-"""Below the one, three of eight bits are unused; above the other, a pixel is no measurement."""
+"""Below the one, three of eight bits are unused, and a step is no edge; above the other, a pixel is
+no measurement."""
 
 WHITE_SHARE = 1 / 3
 """Lamps, windows and the sky whiten less."""
 
 SAME_EYES, EYES_RATIO = 1.07, 1.25
 """Two good cameras with exposures of their own differ by up to the one; the other is a fault."""
-
-PATCH_PX = 11
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ class RigCheck:
             np.array([right_points[m.trainIdx].pt for m in matches], np.float32),
             np.asarray(left_words[[m.queryIdx for m in matches]], np.uint8),
         )
-        most = np.array([MAX_DISPARITY_SHARE, MAX_ROWS_SHARE]) * left.shape[::-1]
+        most = np.array(REACH_SHARE) * left.shape[::-1]
         guess = guess.those((np.abs(guess.left_px - guess.right_px) < most).all(axis=1))
         if not len(guess.words):
             return nothing
@@ -405,7 +405,7 @@ def _contrast(
     """
     seen = []
     for image, px in ((left, left_px), (right, right_px)):
-        mean = cv2.blur(image, (PATCH_PX, PATCH_PX))
+        mean = cv2.blur(image, (WINDOW_PX, WINDOW_PX))
         u, v = np.clip(np.rint(px).astype(np.intp).T, 0, np.array([image.shape[::-1]]).T - 1)
         seen.append(mean[v, u] + 1.0)
     return np.asarray(np.log(seen[0] / seen[1]))
@@ -431,9 +431,9 @@ def _edge_px(image: NDArray[np.uint8]) -> float:
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
     across, along = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     slope = cv2.magnitude(across, along)
-    patch = np.ones((15, 15), np.uint8)
+    patch = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
     step = cv2.morphologyEx(smooth, cv2.MORPH_GRADIENT, patch)
-    is_edge = (slope >= np.percentile(slope[::2, ::2], 95)) & (step > 20)
-    if np.count_nonzero(is_edge) < 200:
+    is_edge = (slope >= np.percentile(slope[::2, ::2], 95)) & (step > DARK_GREY)
+    if np.count_nonzero(is_edge) < MIN_MATCHES:
         return 0.0
     return float(np.percentile(step[is_edge] / cv2.dilate(slope, patch)[is_edge], 10))

@@ -9,7 +9,6 @@ with both eyes).
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,25 +19,23 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, se3_exp, skew, transform_points
 
 WINDOW_PX = 15
+"""What is around a point: of optical flow, of an edge, of brightness."""
+
 RETURN_PX = 0.5
-"""A point that is followed to another image and back comes back as near as this."""
+"""A point that is followed to another image and back comes back as near as this; where points fit
+no motion better, the scene is not a rigid one."""
 
 MAX_HAMMING = 64
 
 ROWS_PX = 1.5
 """Matching along rows bears no more; nor are disparities wrong by more because they are noisy."""
 
-MIN_DISPARITY_PX = 1.0
+LEAST_NOISE_PX = 0.1
+"""Positions of points are not known better."""
 
-LEAST_NOISE_PX, MOST_NOISE_PX = 0.1, 0.5
-"""Positions of points are not known better; where they are worse, it is not one rigid scene."""
-
-MIN_POINTS = 30
+MIN_MATCHES = 40
 MIN_TURN_RAD = 0.03
 """A smaller turn does not show the focal length, but whatever else moves in the scene."""
-
-PAIRS = 20
-"""Turns that are judged; after as many the focal length is known."""
 
 SURE = 4.0
 """So many standard deviations are no accident."""
@@ -73,12 +70,12 @@ class FocalCheck:
         self._camera = camera
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._before: tuple[NDArray[np.uint8], Matches] | None = None
-        self._logs: deque[tuple[float, float]] = deque(maxlen=PAIRS)
+        self._logs: list[tuple[float, float]] = []
 
     @property
     def is_done(self) -> bool:
-        """Whether no more turns are needed."""
-        return len(self._logs) == PAIRS
+        """Whether no more turns are needed: the focal length is known."""
+        return SURE * self._estimate()[1] < FOCAL_SHARE
 
     def reset_view(self) -> None:
         """The next look is not at what the last one showed."""
@@ -90,20 +87,20 @@ class FocalCheck:
             return
         apart = matches.left_px - matches.right_px
         rows = np.abs(apart[:, 1] - np.median(apart[:, 1])) if len(apart) else apart[:, 1]
-        matches = matches.those((apart[:, 0] > MIN_DISPARITY_PX) & (rows < ROWS_PX))
+        matches = matches.those((apart[:, 0] > ROWS_PX) & (rows < ROWS_PX))
         before, self._before = self._before, (left, matches)
-        if before is None or min(len(before[1].words), len(matches.words)) < MIN_POINTS:
+        if before is None or min(len(before[1].words), len(matches.words)) < MIN_MATCHES:
             return
         found = self._matcher.match(before[1].words, matches.words)
         found = [match for match in found if match.distance <= MAX_HAMMING]
         then = before[1].those(np.array([match.queryIdx for match in found], np.intp))
         now = matches.those(np.array([match.trainIdx for match in found], np.intp))
-        if len(found) < MIN_POINTS:
+        if len(found) < MIN_MATCHES:
             return
         now_px, is_found = follow(before[0], left, then.left_px, now.left_px, levels=0)
         uvd_then = np.column_stack([then.left_px, (then.left_px - then.right_px)[:, 0]])
         uvd_now = np.column_stack([now_px, (now.left_px - now.right_px)[:, 0]])
-        if np.count_nonzero(is_found) >= MIN_POINTS:
+        if np.count_nonzero(is_found) >= MIN_MATCHES:
             log = _log_factor(self._camera, uvd_then[is_found], uvd_now[is_found])
             self._logs.extend([log] if log is not None else [])
 
@@ -111,14 +108,18 @@ class FocalCheck:
         """Return the focal length that turns show, as a share of that of the calibration, where it
         is sure that it is another one.
         """
+        log, sigma = self._estimate()
+        return float(np.exp(log)) if abs(log) - SURE * sigma > FOCAL_SHARE else None
+
+    def _estimate(self) -> tuple[float, float]:
+        """Return the logarithm of the factor, and its standard deviation."""
         if not self._logs:
-            return None
+            return 0.0, np.inf
         logs, information = np.array(self._logs).T
         weight = 1 / (1 / information + PAIR_SIGMA**2)
         log = float(logs @ weight / weight.sum())
         spread = float(np.sqrt(np.square(weight * (logs - log)).sum())) / weight.sum()
-        sigma = max(spread, float(weight.sum() ** -0.5))
-        return float(np.exp(log)) if abs(log) - SURE * sigma > FOCAL_SHARE else None
+        return log, max(spread, float(weight.sum() ** -0.5))
 
 
 def _log_factor(camera: StereoCamera, then: Array, now: Array) -> tuple[float, float] | None:
@@ -140,10 +141,10 @@ def _log_factor(camera: StereoCamera, then: Array, now: Array) -> tuple[float, f
         size = 6 if step < 5 else 7  # first the motion alone
         change = np.zeros(7)
         change[:size] = np.linalg.lstsq(H[:size, :size], g[:size], rcond=None)[0]
-        T, x = se3_exp(change[:6]) @ T, x + float(np.clip(change[6], -0.3, 0.3))
+        T, x = se3_exp(change[:6]) @ T, x + float(np.clip(change[6], -PRIOR_SIGMA, PRIOR_SIGMA))
         information = float(H[6, 6] - H[6, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6])
     turn_rad = np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
-    is_rigid = noise_px < MOST_NOISE_PX
+    is_rigid = noise_px < RETURN_PX
     return (x, information) if is_rigid and turn_rad > MIN_TURN_RAD else None
 
 

@@ -52,14 +52,14 @@ from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.files.whole import checked_ns
 from segfloor_ros.geometry import Array, FrameTree, make_transform
 
-STAMPS_FOR_RATE = 20
+FIRST_MESSAGES = 50
+"""Of a topic: enough for its rate, or for gravity."""
 
 ODOMETRY_TYPE, IMU_TYPE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu'
 TF_TYPE, STATIC_TF = 'tf2_msgs/msg/TFMessage', '/tf_static'
 NOT_WHEELS = ('truth', 'visual', 'vio', 'slam', 'keyframe', 'lidar', 'laser', 'icp', 'gps', 'map')
 """Words in the names of odometry that is not the wheels'."""
 
-GRAVITY_SAMPLES = 50
 GLOBAL_FRAMES = ('map', 'world', 'earth')
 """Frames that wheels know nothing of."""
 
@@ -82,7 +82,7 @@ def open_bag(path: Path, settings: StereoCameraSettings) -> StereoSource:
             )
             calibration = given_calibration(settings) or _read_calibration(path, bag, topics)
         count = min(bag.topics[topic].num_messages for topic in (topics.left, topics.right))
-        first = islice(bag.messages([topics.left]), STAMPS_FOR_RATE)
+        first = islice(bag.messages([topics.left]), FIRST_MESSAGES)
         stamps = sorted(_stamp_ns(message, f'{path}, {topics.left}') for _, message in first)
         rate_hz = rate_of(stamps)
         if topics.is_rectified:
@@ -259,7 +259,7 @@ def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
     T_left_imu = _fixed_transforms(bag).lookup(*frames)
     if T_left_imu is not None:
         return T_left_imu
-    some = islice(bag.messages([imu_topic]), GRAVITY_SAMPLES)
+    some = islice(bag.messages([imu_topic]), FIRST_MESSAGES)
     felt = np.nanmedian([xyz(message.linear_acceleration) for _, message in some], axis=0)
     return np.eye(4) if is_upright(felt) else None
 

@@ -65,10 +65,11 @@ TUM_CAMERAS = {
     'freiburg1': (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     'freiburg2': (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     'freiburg3': (535.4, 539.2, 320.1, 247.6, (0.0,) * 5),
+    '': (525.0, 525.0, 319.5, 239.5, (0.0,) * 5),
 }
-"""Intrinsics fx, fy, cx, cy and distortion of the benchmark's colour cameras, as published."""
+"""Intrinsics fx, fy, cx, cy and distortion of the benchmark's colour cameras by a part of the
+folder's name, as published."""
 
-TUM_ANY_CAMERA = (525.0, 525.0, 319.5, 239.5, (0.0,) * 5)
 CALIBRATIONS = ('left.yaml', 'rgb.yaml', 'color.yaml', 'camera.yaml', 'camera_info.yaml')
 MONO = (
     'one camera alone does not tell how far away anything is: it takes a right image or a depth '
@@ -386,8 +387,9 @@ def _tum_camera(folder: Path, images: Sequence[Path]) -> EyeCalibration:
     for name in CALIBRATIONS:
         if (folder / name).exists():
             return read_eye_calibration(folder / name)
-    published = [value for key, value in TUM_CAMERAS.items() if key in folder.resolve().name]
-    fx, fy, cx, cy, distortion = (*published, TUM_ANY_CAMERA)[0]
+    fx, fy, cx, cy, distortion = next(
+        value for key, value in TUM_CAMERAS.items() if key in folder.resolve().name
+    )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     width, height = files.first_image_size(images, str(folder))
     P = np.hstack([K, np.zeros((3, 1))])
