@@ -32,21 +32,6 @@ if 'install' in sys.argv or 'develop' in sys.argv:
     # pip does not run them and makes bin/segfloor itself.
     data_files.append(('bin', ['resource/segfloor']))
 
-EXTRAS = {
-    'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-    'cli': [
-        'typer>=0.12',
-        'rich>=13',
-        'rosbags>=0.10',
-        'evo>=1.28',
-        'matplotlib>=3.6',
-        'junitparser>=3',
-    ],
-    'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
-    'sim': ['mujoco>=3.3'],
-    'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
-}
-
 setup(
     name=PACKAGE,
     version=VERSION,
@@ -75,8 +60,19 @@ setup(
     # which those of pip must not shadow.
     install_requires=['numpy>=1.26', 'scipy>=1.11', 'pyyaml>=6.0', 'opencv-python-headless>=4.6'],
     extras_require={
-        **EXTRAS,
-        'all': [requirement for extra in EXTRAS.values() for requirement in extra],
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        'cli': [
+            'typer>=0.12',
+            'rich>=13',
+            'rosbags>=0.10',
+            'evo>=1.28',
+            'matplotlib>=3.6',
+            'junitparser>=3',
+        ],
+        'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
+        'sim': ['mujoco>=3.3'],
+        'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
+        'all': ['segfloor_ros[ros,cli,cluster,sim,view]'],
         # colcon takes the tests to be pytest's by this name.
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
