@@ -197,7 +197,12 @@ def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
     half = math.ceil(_RISE_PX / slope / 2)
     rise = np.zeros_like(disparity)
     rise[half:-half] = disparity[2 * half :] - disparity[: -2 * half]
-    return np.abs(rise / np.float32(2 * half * slope) - 1) < _RISE_TOLERANCE
+    return is_rise(rise / np.float32(2 * half), slope)
+
+
+def is_rise(rise: NDArray[np.floating], slope: float) -> NDArray[np.bool_]:
+    """Tell which of how much disparities grow per row are, more or less, a floor's `slope`."""
+    return np.abs(rise / slope - 1) < _RISE_TOLERANCE
 
 
 def filtered_v_disparity(

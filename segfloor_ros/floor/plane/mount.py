@@ -341,7 +341,11 @@ class MountViewer:
             # A disparity is that of the texture in its block, and belongs where that is.
             slope *= np.arange(len(left), dtype=np.float32)[:, None]
             shown_at = cv2.blur(slope, block)[rows, columns] / np.maximum(texture, 1e-6)
-        return self._placed(shown_at, columns, disparity[rows, columns], weight, T_world_left)
+        above, below = (
+            disparity[np.clip(rows + by, 0, len(left) - 1), columns] for by in (-BLOCK_PX, BLOCK_PX)
+        )
+        rise = np.where((above > 0) & (below > 0), (below - above) / (2 * BLOCK_PX), 0.0)
+        return self._placed(shown_at, columns, disparity[rows, columns], weight, T_world_left, rise)
 
     def bases(
         self,
@@ -362,10 +366,11 @@ class MountViewer:
         disparity_px: NDArray[np.floating],
         weight: Array,
         T_world_left: Array,
+        rise: Array | None = None,
     ) -> Samples:
         uv_px = np.stack([columns, rows], axis=1).astype(np.float64)
         found_px = disparity_px.astype(np.float64)
-        return Samples.of(self._camera, uv_px, found_px, weight, T_world_left)
+        return Samples.of(self._camera, uv_px, found_px, weight, T_world_left, rise)
 
 
 def find_bases(

@@ -9,7 +9,7 @@ the plane where m . X + 1 = 0, so the ray q from a camera at t meets it at the i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from segfloor_ros.floor.disparity.profile import (
     FloorLine,
     pixels_where,
 )
-from segfloor_ros.floor.disparity.view import column_step, rising
+from segfloor_ros.floor.disparity.view import column_step, is_rise, rising
 from segfloor_ros.geometry import Array
 
 MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])
@@ -59,6 +59,8 @@ _FLAT_WEIGHT = 0.1
 class Samples:
     """Disparities of one frame: rays (N, 3) turned into the world, the camera's position (3,) in
     the world in metres, disparities (N,) in pixels, weights (N,). disparity_m: fx * baseline.
+    rise: (N,), by how much disparities grow per row around the samples, None where that is not
+    known; down: (3,), by how much rays change per row.
     """
 
     rays: Array
@@ -66,6 +68,8 @@ class Samples:
     disparity_px: Array
     weight: Array
     disparity_m: float
+    rise: Array | None = None
+    down: Array | None = None
 
     @classmethod
     def of(
@@ -75,17 +79,32 @@ class Samples:
         disparity_px: Array,
         weight: Array,
         T_world_left: Array,
+        rise: Array | None = None,
     ) -> Samples:
         """Return the samples at pixels (N, 2), seen from a pose (4, 4)."""
         rays = camera.back_project(uv_px, np.ones(len(uv_px))) @ T_world_left[:3, :3].T
         position_m = T_world_left[:3, 3].astype(np.float64)
-        return cls(rays, position_m, disparity_px, weight, camera.disparity_times_depth)
+        down = T_world_left[:3, 1] / camera.fy
+        return cls(rays, position_m, disparity_px, weight, camera.disparity_times_depth, rise, down)
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
-        rays, disparity_px = self.rays[::step], self.disparity_px[::step]
-        weight = self.weight[::step] * step
-        return Samples(rays, self.position_m, disparity_px, weight, self.disparity_m)
+        return replace(
+            self,
+            rays=self.rays[::step],
+            disparity_px=self.disparity_px[::step],
+            weight=self.weight[::step] * step,
+            rise=None if self.rise is None else self.rise[::step],
+        )
+
+    def weight_on(self, plane: Array) -> Array:
+        """Return the weights (N,) for a plane (3,): little where disparities do not rise down the
+        image as those of the plane do.
+        """
+        if self.rise is None or self.down is None:
+            return self.weight
+        slope = -self.disparity_m * float(plane @ self.down) / (1 + float(plane @ self.position_m))
+        return self.weight * np.where(is_rise(self.rise, slope), 1.0, _FLAT_WEIGHT)
 
 
 @dataclass(frozen=True)
@@ -275,7 +294,7 @@ def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tupl
         toward = samples.rays @ plane
         expected = -samples.disparity_m * toward / along
         error = samples.disparity_px - expected
-        weight = samples.weight * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
+        weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
         weight = np.where(expected > _INLIER_PX, weight, 0)
         weight /= _CORRELATED_SAMPLES * NOISE_PX**2
         jacobian = samples.rays @ by_state

@@ -53,3 +53,22 @@ def test_a_floor_that_is_plain_to_see_counts_more_than_what_was_felt() -> None:
     ramp = plane_of(np.array([TRUE[0] + math.radians(4.0), 0.0, 1.0]))
     angles = found([frame] * 4, Up(ramp, math.radians(0.5)))
     assert np.degrees(angles[:2]) == pytest.approx(np.degrees(TRUE[:2]), abs=0.2)
+
+
+@pytest.mark.parametrize('rises_are_known', [True, False])
+def test_what_stands_far_away_does_not_tilt_the_floor(rises_are_known: bool) -> None:
+    """The feet of far things lie a little above the floor, and do not rise down the image."""
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(-0.8, 0.8, 900), rng.uniform(0.1, 0.5, 900)
+    rays = np.stack([u, v, np.ones(900)], axis=1)
+    down = np.array([0.0, 1.0, 0.0]) / 300
+    level = np.array([0.0, 0.0, 0.5])
+    slope = -DISPARITY_M * float(down @ plane_of(level))
+    is_thing = v < 0.2
+    disparity = -DISPARITY_M * rays @ plane_of(level) + rng.normal(0, 0.1, 900)
+    disparity[is_thing] += 1.5
+    rise = np.where(is_thing, 0.0, slope) if rises_are_known else None
+    weight = np.where(is_thing, 4.0, 1.0)
+    frame = Samples(rays, np.zeros(3), disparity, weight, DISPARITY_M, rise, down)
+    height_m = found([frame] * 4, None)[2]
+    assert (abs(height_m - 0.5) < 0.01) == rises_are_known
