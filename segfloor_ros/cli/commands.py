@@ -1,6 +1,4 @@
-"""The commands that map, make recordings and measure: run, demo, simulate, convert, calibrate,
-benchmark.
-"""
+"""The commands that map, make recordings and measure: run, replay, demo, simulate, benchmark."""
 
 from __future__ import annotations
 
@@ -24,10 +22,6 @@ from segfloor_ros.benchmark.stages import (
     parse_sizes,
     run_benchmark,
 )
-from segfloor_ros.camera.bag_writer import ImageCoding
-from segfloor_ros.camera.bag_writer import convert as write_bag
-from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
-from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
@@ -78,10 +72,6 @@ def run(
     segfloor run drive.mcap --out result --view
     segfloor run sequences/06 --params kitti --frames 200 --out map06
     """
-    _run(options, save_debug)
-
-
-def _run(options: DriveOptions, save_debug: bool = False) -> None:
     maps = options.maps
     configuration, source = options.open()
     with open_view(options.view) as view:
@@ -153,10 +143,6 @@ def replay(
     segfloor replay drive.mcap --out result
     segfloor replay drive.mcap --rate 0 --view --out result
     """
-    _replay(options, rate)
-
-
-def _replay(options: DriveOptions, rate: float) -> None:
     try:
         from segfloor_ros.cli.replay_session import ReplaySession
     except ImportError as error:
@@ -230,10 +216,10 @@ def demo(
     drive = str(DRIVE / 'drive.mcap')
     if lockstep or util.find_spec('rclpy') is None:
         console.print('mapping a simulated drive through a corridor, in one process without ROS')
-        _run(DriveOptions(drive, out=out))
+        run(input=drive, out=out)
     else:
         console.print('replaying a simulated drive through a corridor through the five nodes')
-        _replay(DriveOptions(drive, out=out), rate)
+        replay(input=drive, out=out, rate=rate)
     _print_scores(out)
 
 
@@ -255,38 +241,6 @@ def _print_scores(out: Path) -> None:
     add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
     console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
     console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)
-
-
-@terminal.with_options
-def view(
-    options: terminal.InputOptions,
-    live: Annotated[
-        bool, typer.Option('--live', help='Show running nodes; INPUT is their namespace, e.g. /.')
-    ] = False,
-    out: Annotated[
-        Path | None, typer.Option('--out', metavar='FILE.rrd', help='Write a file, open no window.')
-    ] = None,
-) -> None:
-    """Show the results folder of a run, a recording or the nodes that run.
-
-    \b
-    segfloor view result
-    segfloor view drive.mcap --every 5
-    segfloor view / --live
-    """
-    folder = Path(options.input)
-    with open_view(str(out or '')) as shown:
-        assert shown is not None
-        if live:
-            try:
-                from segfloor_ros.cli.replay_recorder import watch
-            except ImportError as error:
-                raise SettingsError(f'--live needs ROS 2 ({error})') from None
-            watch(shown, options.input)
-        elif (folder / 'summary.json').is_file():
-            shown.results(folder)
-        else:
-            shown.recording(open_source(options.configuration().stereo_camera))
 
 
 def params() -> None:
@@ -381,72 +335,6 @@ def simulate(
             f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
         )
     console.print(f'{facts}: {out}', highlight=False)
-
-
-@terminal.with_options
-def convert(
-    options: terminal.InputOptions,
-    out: Annotated[Path, typer.Argument(help='New bag, e.g. drive.mcap.', metavar='OUT.mcap')],
-    images: Annotated[
-        ImageCoding, typer.Option(help='How images are kept; raw and png are exact.')
-    ] = ImageCoding.raw,
-) -> None:
-    """Convert a recording to a rosbag2 (mcap) with images, CameraInfo and what was measured.
-
-    \b
-    segfloor convert sequences/06 drive.mcap --images png
-    """
-    settings = options.configuration().stereo_camera
-    source = open_source(settings)
-    terminal.print_sensors(source.sensors)
-    has_depth = any(sensor.name == DEPTH and not sensor.used for sensor in source.sensors)
-    depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
-    with terminal.progress_bar('converting', source.frame_count) as progress:
-        pairs = write_bag(source, out, images, progress, depth)
-    size_mb = sum(f.stat().st_size for f in [out, *out.rglob('*')] if f.is_file()) / 1e6
-    console.print(f'{pairs} pairs, {size_mb:.1f} MB: {out}', highlight=False)
-
-
-def calibrate(
-    folder: Annotated[
-        Path, typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.')
-    ],
-    square_m: Annotated[
-        float,
-        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
-    ],
-    board: Annotated[
-        str, typer.Option(help='Inner corners along the long and the short side.')
-    ] = '9x6',
-    out: Annotated[
-        Path | None,
-        typer.Option('--out', help="Folder for left.yaml and right.yaml; else the pictures'."),
-    ] = None,
-) -> None:
-    """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files.
-
-    \b
-    segfloor calibrate pictures --square 0.03 --board 9x6
-    """
-    sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
-    if sides is None:
-        raise SettingsError(f'--board {board}: expected e.g. 9x6')
-    with terminal.progress_bar('searching boards', None) as progress:
-        result = calibrate_folder(folder, square_m, (int(sides[1]), int(sides[2])), out, progress)
-    _print_result(result, out or folder)
-
-
-def _print_result(result: CalibrationResult, folder: Path) -> None:
-    camera = result.calibration.camera
-    rows = [
-        ('pairs used', f'{result.pairs_used} of {result.pairs_total}'),
-        ('reprojection error', f'{result.rms_px:.3f} px RMS'),
-        ('row difference after rectification', f'{result.epipolar_rms_px:.3f} px RMS'),
-        ('focal length, rectified', f'{camera.fx:.1f} px'),
-        ('baseline', f'{camera.baseline_m:.4f} m'),
-    ]
-    console.print(terminal.value_table('calibration', rows, str(folder)))
-    console.print(f'{folder / "left.yaml"}\n{folder / "right.yaml"}', highlight=False)
 
 
 def benchmark(

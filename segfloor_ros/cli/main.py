@@ -11,20 +11,9 @@ import typer
 
 import segfloor_ros
 from segfloor_ros.cli.check import check_suite
-from segfloor_ros.cli.commands import (
-    benchmark,
-    calibrate,
-    convert,
-    demo,
-    params,
-    replay,
-    run,
-    simulate,
-    view,
-)
+from segfloor_ros.cli.commands import benchmark, demo, params, replay, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
-from segfloor_ros.cli.info import info
-from segfloor_ros.cli.record import record
+from segfloor_ros.cli.recordings import calibrate, convert, info, record, view
 from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.cli.view import SUFFIX
 from segfloor_ros.errors import MapError, SegfloorError

@@ -305,11 +305,11 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def with_all(**values: Any) -> None:
-        options = group(**{field.name: values.pop(field.name) for field in fields})
-        command(options, **values)
+        given = {field.name for field in fields} & values.keys()
+        command(group(**{name: values.pop(name) for name in given}), **values)
 
     keyword = inspect.Parameter.KEYWORD_ONLY
-    given = [(field.name, field.default) for field in fields] + [(p.name, p.default) for p in own]
+    all_of_them = [(f.name, f.default) for f in fields] + [(p.name, p.default) for p in own]
     parameters = [
         inspect.Parameter(
             name,
@@ -317,7 +317,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
             default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
             annotation=hints[name],
         )
-        for name, default in given
+        for name, default in all_of_them
     ]
     with_all.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_all.__annotations__ = hints
