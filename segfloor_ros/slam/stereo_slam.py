@@ -277,7 +277,7 @@ class StereoSlam:
         if observed is None:
             return None
         self._take_adjustment(wait=True)
-        self.back_end.mapper.measure_stereo(frame, images, observed.observations)
+        self.back_end.mapper.measure_stereo(frame, images, observed)
         motion = self.front_end.motion
         keyframe = KeyframeRecord(
             len(self.map.keyframes),

@@ -23,8 +23,15 @@ from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust, gather
 from segfloor_ros.slam.mapping.normal_equations import factors_of
-from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MAJORITY, NO_POINT, PROOF
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX, Observations
+from segfloor_ros.slam.results import (
+    CHANCE_SHARE,
+    ENOUGH,
+    MAJORITY,
+    NO_POINT,
+    PROOF,
+    ObservedFeatures,
+)
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX, Images
 from segfloor_ros.slam.tracking.map_tracking import predict_points
@@ -82,12 +89,16 @@ class LocalMapper:
         self._camera = sparse_map.rig.camera
 
     def measure_stereo(
-        self, frame: StereoFrame, images: Images, observations: Observations
+        self, frame: StereoFrame, images: Images, observed: ObservedFeatures
     ) -> None:
-        """Add a disparity, in place, to every feature that has none yet and is found in the
-        right image.
+        """Add a disparity, in place, to every feature that is found in the right image and shows no
+        point of the map: that of a point was looked for where it should be, and what is elsewhere
+        is something else, which hides the point from one eye.
         """
-        missing = np.flatnonzero(np.isnan(observations.uvd_px[:, 2]))
+        observations = observed.observations
+        missing = np.flatnonzero(
+            np.isnan(observations.uvd_px[:, 2]) & (observed.point_id == NO_POINT)
+        )
         uv_px = observations.uvd_px[missing, :2]
         guess: Array = np.zeros(len(missing))
         if not images.depth_scale:
