@@ -73,9 +73,9 @@ SLAM: dict[str, Mechanism] = {
     'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
     'disparity offset': Mechanism({'slam.rig.EXPECTED_SIGMA_PX': 0.0}),
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
-    'known views': Mechanism({'slam.places.known_views.KNOWN_SHARE': 2.0}),
+    'known views': Mechanism({'slam.places.known_views.COVERED_SHARE': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
-    'keyframes where few points are found': Mechanism({'slam.places.known_views.FEW_FOUND': 0.0}),
+    'keyframes where few points are found': Mechanism({'slam.places.known_views.MAJORITY': 0.0}),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
         {

@@ -52,7 +52,8 @@ MOST = 0.6
 
 PROOF = 3
 """Keyframes that must show something for it to be believed: that a point stands still, or is gone,
-that a view adds nothing, that a place is seen again. What moves fits hardly two."""
+that a view adds nothing, that a place is seen again; and corners of a thing that moves. By chance
+hardly two agree."""
 
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images; of more, every second one goes without."""

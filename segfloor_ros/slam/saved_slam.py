@@ -22,13 +22,14 @@ from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Retirement
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud
 from segfloor_ros.slam.rig import Observations
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.tracking.features import Features
 
 if TYPE_CHECKING:  # which uses this module
     from segfloor_ros.slam.stereo_slam import StereoSlam
 
 PART = 'slam'
-BEFORE_ALL_NS = -1_000_000_000
+BEFORE_ALL_NS = -MOMENT_NS
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')

@@ -22,6 +22,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.moving.scene_flow import (
+    MAX_MOVING_SHARE,
     TOLERANCE_PX,
     Disparity,
     FlowView,
@@ -32,7 +33,7 @@ from segfloor_ros.slam.moving.scene_flow import (
     SmallCamera,
     static_scale,
 )
-from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.results import CHANCE_SHARE, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.images import Region
 
@@ -43,9 +44,6 @@ P1, P2 = 100, 400
 
 SPECKLE_PX = 40
 MAX_PARALLAX_RAD = float(np.radians(30.0))
-FAR_PERCENT = 80
-"""What is farther than most of the image stands behind what moves."""
-
 COMPARED_VIEWS = 5
 KEPT_VIEWS = 30
 MIN_HEIGHT_M = 0.05
@@ -67,9 +65,8 @@ NOISE_GREY = 1.0
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
 
-MIN_AREA_PX = BLOCK_PX**2
-SHARE_OF_REGION = 0.1
-"""So much of a region must have been seen through for all of it to move."""
+MIN_AREA_PX = BLOCK_PX * BLOCK_PX
+"""Less is a single wrong match."""
 
 SEARCH_EVERY = 3
 """Frames between two searches where no keyframe asks for one, e.g. while the robot stands."""
@@ -255,7 +252,7 @@ class MovingRegions:
         through, solid = (np.zeros(points.shape[1], np.uint8) for _ in range(2))
         background = disparity.copy()
         T_world_camera = invert(T_camera_world)
-        for view in self._chosen(T_world_camera, float(np.percentile(points[2], FAR_PERCENT))):
+        for view in self._chosen(T_world_camera, float(np.quantile(points[2], MAX_MOVING_SHARE))):
             T = (view.keyframe.T_camera_world @ T_world_camera).astype(np.float32)
             x, y, z = T[:3, :3] @ points + T[:3, 3:]
             depth = np.maximum(z, 0.01)
@@ -344,7 +341,7 @@ class MovingRegions:
         _, labels = cv2.connectedComponents(parts)
         area = np.bincount(labels.ravel())
         seeded = np.bincount(labels.ravel(), weights=seeds.ravel())
-        whole = (seeded > SHARE_OF_REGION * area) & (seeded >= MIN_AREA_PX)
+        whole = (seeded > CHANCE_SHARE * area) & (seeded >= MIN_AREA_PX)
         whole[0] = False
         moving = whole[labels] | ((seeds > 0) & (seeded[labels] >= MIN_AREA_PX))
         # As far as blocks reach beyond the edge of what moves.

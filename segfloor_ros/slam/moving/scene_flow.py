@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.map.sparse_map import MAX_PATCH_ZOOM
-from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.results import PROOF, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.tracking.features import spread
@@ -56,11 +56,11 @@ STATIC_SIGMAS, QUARTER_SIGMAS = 3.0, 0.319
 second."""
 
 NEIGHBOUR_PX = 15.0
-MIN_MOVING = 3
-"""Fewest corners of a thing that moves."""
+"""Corners so near to each other, at the same depth, are on one thing."""
 
 MAX_MOVING_SHARE = 0.8
-"""Where more of all corners seem to move the pose is in doubt: what moved before still does."""
+"""Where more of all corners seem to move the pose is in doubt: what moved before still does. What
+is farther than so much of the image stands behind what moves."""
 
 TOLERANCE_PX = 0.6
 """Disparities of the shrunk images that differ by more do not show the same thing."""
@@ -220,7 +220,7 @@ def _outvoting(
     for i in np.flatnonzero(moved):
         near = np.array(tree.query_ball_point(uv[i], NEIGHBOUR_PX))
         near = near[np.abs(disparity[near] - disparity[i]) < 2 * TOLERANCE_PX]
-        result[i] = moved[near].sum() >= MIN_MOVING and moved[near].sum() > still[near].sum()
+        result[i] = moved[near].sum() >= PROOF and moved[near].sum() > still[near].sum()
     return result
 
 
@@ -321,7 +321,7 @@ class MovingPointMeter:
         of = label[v, u]
         for thing in np.unique(of):
             followed = (of == thing) & np.isfinite(own[:, 0])
-            if followed.sum() >= MIN_MOVING:
+            if followed.sum() >= PROOF:
                 velocity[of == thing] = np.median(own[followed], axis=0)
         return MovingPoints(xyz, velocity)
 

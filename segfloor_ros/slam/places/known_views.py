@@ -5,7 +5,8 @@ A place that is seen again is recognised by them, as long as the path has drifte
 what patches are searched within, and needs few keyframes and no points again: the map follows the
 space covered, not the time driven.
 
-When a frame becomes a keyframe: B and (A1 or A2 or A3) of the ORB-SLAM2 / OpenVSLAM design.
+When a frame becomes a keyframe: A1, A2 or A3 of the ORB-SLAM2 / OpenVSLAM design. Their condition
+B, enough points for a pose, holds for every frame that is tracked.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.rig import MIN_DEPTH_M
+from segfloor_ros.slam.results import MAJORITY
+from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
@@ -28,31 +30,23 @@ some tens of pixels, and their patches still look alike."""
 MIN_FRAMES = 3
 """Frames between keyframes while the mapper is idle (condition A2)."""
 
-REACH_RATIO = 0.5
-"""Distance, as a share of the depth of what is seen, up to which a keyframe sees much the same."""
-
-REACH_RAD = 0.5
-
-RECENT = 20
-"""The latest keyframes, which a path leaves behind it; earlier ones were made on another visit."""
+REACH = 0.5, 0.5
+"""Up to which a keyframe sees much the same: distance, as a share of the depth of what is seen, and
+turn in rad."""
 
 ALIKE_SHARE = 0.3
-"""Share of what is tracked that a keyframe must have seen to count as a view of the same."""
-
-KNOWN_SHARE = 0.3
-"""Share of what is tracked that the views of an earlier visit must have seen together."""
+"""Share of what is tracked that a keyframe, or those of an earlier visit together, must have seen
+to count as a view of the same."""
 
 SECOND_VISIT = 3.0
 """On a first visit known views lie behind, on a second one on all sides: they may be so many times
-as far."""
-
-LOOK_AGAIN = 6.0
-"""What is known may have changed: on a second visit keyframes so many times as far apart as new
-ones keep the map of it up to date, and twice as far apart with every visit that made one.
-"""
+as far. What is known may have changed: so far and as far again from the latest keyframe the map is
+kept up to date, and twice as far with every visit that made a keyframe."""
 
 COVERED_SHARE = 0.95
-COLUMNS, ROWS = 8, 6
+COLUMNS, ROWS = 4, 3
+"""Parts of an image, in each of which something is asked for."""
+
 DEPTH_FACTORS = (0.5, 1.0, 2.0)
 
 SEEN_BY_SEVERAL = 2
@@ -61,12 +55,9 @@ SEEN_BY_SEVERAL = 2
 TRACKED_RATIO = 0.25
 """Condition A3 as published: a keyframe is due when fewer of the reliable points are tracked."""
 
-MIN_TRACKED = 15
-"""Condition B as published: with fewer points the pose is too poor to make points from."""
-
-MUCH_NEW, FEW_FOUND = 2.5, 0.5
-"""Novelty, and share of the points that are found again, at which condition A2 does not count
-frames any more: the next frame finds fewer still.
+MUCH_NEW = 2.5
+"""Novelty at which condition A2 does not count frames any more, as where the smaller part of the
+points is found again: the next frame finds fewer still.
 """
 
 
@@ -79,7 +70,7 @@ def views_near(
     relative = _from_views(sparse_map, T_camera_world)
     turned_rad = rotation_angle(relative[:, :3, :3])
     moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
-    distance = np.maximum(moved_m / (REACH_RATIO * depth_m), turned_rad / REACH_RAD)
+    distance = np.maximum(moved_m / (REACH[0] * depth_m), turned_rad / REACH[1])
     distance[[k.retired is not None for k in sparse_map.keyframes]] = np.inf
     order = np.argsort(distance, kind='stable')
     return order[distance[order] < 1.0][:limit]
@@ -99,21 +90,21 @@ def view_novelty(
     """
     latest = len(sparse_map.keyframes) - 1
     recent, shared = sparse_map.covisible(ids)
-    recent = recent[(recent > latest - RECENT) & (shared >= ALIKE_SHARE * len(ids))]
+    recent = recent[(recent > latest - NEIGHBOURS) & (shared >= ALIKE_SHARE * len(ids))]
     around = views_near(sparse_map, T_camera_world, depth_m, len(sparse_map.keyframes))
     new = novelty(_from_views(sparse_map, T_camera_world), depth_m)
     nearest = float(new[np.append(recent, latest)].min())
-    earlier = around[(around <= latest - RECENT) & (new[around] < SECOND_VISIT)]
+    earlier = around[(around <= latest - NEIGHBOURS) & (new[around] < SECOND_VISIT)]
     if nearest <= 1 or len(earlier) == 0:
         return nearest
     known = np.isin(ids, sparse_map.points_of(earlier)).mean()
     views = [sparse_map.keyframes[k].T_camera_world for k in earlier]
     covered = covered_share(sparse_map.rig.camera, views, T_camera_world, depth_m)
-    if known < KNOWN_SHARE or covered < COVERED_SHARE:
+    if known < ALIKE_SHARE or covered < COVERED_SHARE:
         return nearest
     # The keyframes of one visit follow each other, also those that are retired by now.
     visits = 1 + (np.diff(np.flatnonzero(new < SECOND_VISIT)) > 1).sum()
-    again = nearest / (LOOK_AGAIN * 2.0 ** (visits - 1))
+    again = nearest / (SECOND_VISIT * 2.0**visits)
     return max(float(new[earlier].min()) / SECOND_VISIT, again)
 
 
@@ -170,12 +161,11 @@ def is_keyframe(view: View, max_frames: int) -> bool:
     """
     new_view = view.novelty > 1
     due = view.frames_since >= MIN_FRAMES
-    due |= view.novelty > MUCH_NEW or view.found_share < FEW_FOUND
+    due |= view.novelty > MUCH_NEW or view.found_share < MAJORITY
     a1 = view.frames_since >= max_frames and new_view
     a2 = view.mapper_idle and due and new_view
     a3 = view.num_tracked < TRACKED_RATIO * view.num_reliable
-    b = view.num_tracked > MIN_TRACKED
-    return b and (a1 or a2 or a3)
+    return a1 or a2 or a3
 
 
 def novelty(T_known_now: Array, median_depth_m: float) -> Array:

@@ -50,9 +50,6 @@ of a loop matters, and how far from each other they stand does not."""
 LOOP_FACTOR = 2.0
 """Error of a loop in that of the motion between two keyframes."""
 
-MIN_LOOP_WEIGHT = 0.25
-"""A loop that switches an earlier one off contradicts it, and is not closed."""
-
 STEPS = 20
 
 TIMES_A_LOOP = 2
@@ -109,10 +106,10 @@ def solve_closing(closing: Closing) -> tuple[Array, Array]:
 
 def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, Array]) -> bool:
     """Bring a closed loop into the map, which has had no new keyframe since. False, and nothing
-    moves, where the loop contradicts the rest of the map.
+    moves, where the loop contradicts the rest of the map: it switches an earlier one off.
     """
     poses, weight = result
-    if weight.min() < MIN_LOOP_WEIGHT:
+    if weight.min() < _robust_share(chi2_limit(6)) ** 2:
         return False
     move_keyframes(sparse_map, poses)
     sparse_map.loops += closing.edges
@@ -200,10 +197,15 @@ def _errors(graph: PoseGraph, poses: Array) -> Array:
 def _robust(graph: PoseGraph, error: Array, poses: Array) -> tuple[Array, float]:
     """Return the weights (M,) of the edges and the cost (Geman-McClure for the robust ones)."""
     chi2 = (error**2).sum(axis=1)
-    share = chi2_limit(6) / (chi2_limit(6) + chi2)
+    share = _robust_share(chi2)
     weight = np.where(graph.is_robust, share**2, 1.0)
     cost = float(np.where(graph.is_robust, share * chi2, chi2).sum())
     return weight, cost
+
+
+def _robust_share(chi2: Array | float) -> Array:
+    """Return the root (...) of the weight of edges with a squared error."""
+    return np.asarray(chi2_limit(6) / (chi2_limit(6) + chi2))
 
 
 def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping: float) -> Array:

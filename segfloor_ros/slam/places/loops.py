@@ -19,18 +19,15 @@ from scipy.spatial import cKDTree
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.map.records import KeyframeRecord, Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.known_views import RECENT, views_near
+from segfloor_ros.slam.places.known_views import ALIKE_SHARE, views_near
 from segfloor_ros.slam.places.place_recognition import (
     BEST_GROUPS,
     PlaceRecognition,
     greatest_speed_mps,
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M, SAME_PX
+from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX
 from segfloor_ros.slam.tracking.images import Images
-
-MIN_SHARED_SHARE = 0.25
-"""Keyframes that share so many points are linked already; fewer are shared by chance."""
 
 MAX_MISSES = 1
 REMEMBERED = 1000
@@ -141,8 +138,8 @@ class LoopDetector:
         keyframes = self._map.keyframes
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         linked, shared = self._map.covisible(own)
-        near = np.arange(len(keyframes)) > keyframe.index - RECENT
-        near[linked[shared > max(ENOUGH, MIN_SHARED_SHARE * len(own))]] = True
+        near = np.arange(len(keyframes)) > keyframe.index - NEIGHBOURS
+        near[linked[shared > max(ENOUGH, ALIKE_SHARE * len(own))]] = True
         retired = np.array([k.retired is not None for k in keyframes])
         return near, ~near & ~retired & self._within_drift(keyframe, lengths)
 
@@ -185,7 +182,7 @@ class LoopDetector:
         around = views_near(
             self._map, pose, median_depth_m(self._map, keyframe), len(self._map.keyframes)
         )
-        around = around[far[around]][:RECENT]
+        around = around[far[around]][:NEIGHBOURS]
         ids = np.setdiff1d(self._map.points_of(around), known).astype(np.int32)
         track = self._places.confirm(images, keyframe.features, ids, pose)
         return None if track is None else self._match(keyframe, track, far)

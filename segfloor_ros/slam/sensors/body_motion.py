@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Measurement, WheelPose, is_sound
 from segfloor_ros.geometry import Array, adjoint, invert, is_within, make_transform
+from segfloor_ros.slam.results import ENOUGH
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
@@ -36,9 +37,6 @@ SLIP_M_S = 0.5
 
 WINDOW = 0.1, 0.1
 """A stretch of the drive to learn from ends after so many metres or radians, or a moment."""
-
-WINDOWS_TO_JUDGE = 25
-"""Stretches after which something is said of the wheels; the slip of a few of them is not it."""
 
 SLIP_REMARK = 'wheel odometry and images disagreed; the wheels slip, or the images show what moves'
 
@@ -251,7 +249,7 @@ class BodyMotion:
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
             if in_a_row:
                 self._remark({'slip': SLIP_REMARK})
-        if len(self._calibrator) >= WINDOWS_TO_JUDGE:
+        if len(self._calibrator) >= ENOUGH:  # the slip of a few is not worth a word
             self._remark(self._calibrator.current.remarks())
 
     def _remark(self, remarks: Mapping[str, str]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import Array, rotation_angle
-from segfloor_ros.slam.results import PROOF
+from segfloor_ros.slam.results import PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
 
@@ -47,7 +47,6 @@ SIGMA_LIFT_M_S2 = 0.08
 SIGMA_BIAS_M_S2 = 0.2
 """Bias of a cheap accelerometer."""
 
-SIGMA_ANY_M_S2 = 100.0
 GRAVITY_M_S2, MAX_OFF_M_S2 = 9.81, 1.0
 """An accelerometer with another gravity measures something else, or nothing."""
 
@@ -160,8 +159,8 @@ class Gravity:
         self._latest: tuple[Array, Array] | None = None
         self._measured = 0
         self._state: Array = np.zeros(6)
-        sigma = np.repeat([SIGMA_ANY_M_S2, SIGMA_BIAS_M_S2], 3)
-        self._covariance: Array = np.diag(sigma**2)
+        variance = np.repeat([UNKNOWN_COVARIANCE, SIGMA_BIAS_M_S2**2], 3)
+        self._covariance: Array = np.diag(variance)
 
     @property
     def up_world(self) -> Up | None:

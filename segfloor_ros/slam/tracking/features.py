@@ -10,6 +10,7 @@ Matching of binary descriptors: guided by a predicted pixel, or without guidance
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -28,9 +29,6 @@ CELL_SIZE_PX = 16
 PYRAMID_LEVELS = 8
 PYRAMID_SCALE = 1.2
 """The pyramid of ORB as published: sizes up to 3.6 times as large are recognised."""
-
-_BITS = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
-_BITS16 = (_BITS[:, None] + _BITS[None, :]).ravel()
 
 MAX_HAMMING = 80
 """Largest distance of a match, of 256 bits: descriptors of different corners are about 128 apart,
@@ -139,7 +137,14 @@ def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
         # A sum over so short an axis takes longer than its terms.
         return np.asarray(sum((bits[..., k] for k in range(1, 4)), bits[..., 0].astype(np.int32)))
     pairs = np.bitwise_xor(a.view(np.uint16), b.view(np.uint16))
-    return np.asarray(_BITS16[pairs].sum(axis=-1, dtype=np.int32))
+    return np.asarray(_bits()[pairs].sum(axis=-1, dtype=np.int32))
+
+
+@cache
+def _bits() -> NDArray[np.uint8]:
+    """Return how many bits of each number (65536,) of 16 are set."""
+    halves = np.arange(1 << 16, dtype=np.uint16).view(np.uint8).reshape(-1, 2)
+    return np.unpackbits(halves, axis=1).sum(axis=1, dtype=np.uint8)
 
 
 def match_predicted(

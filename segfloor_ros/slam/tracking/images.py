@@ -30,7 +30,9 @@ from segfloor_ros.camera.images import blank_border, is_disparity
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, make_transform, transform_points
 
-WINDOW_PX = 11
+SIDE_PX = 11
+"""Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
+
 LEVELS = 3
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
@@ -91,7 +93,7 @@ def follow_pixels(
     width_px: int,
     uv_last_px: Array,
     uv_guess_px: Array,
-    window_px: int = WINDOW_PX,
+    window_px: int = SIDE_PX,
     steps: tuple[int, int, float] = STEPS,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Find pixels (N, 2) of one image in the next one, starting from a guess (N, 2).

@@ -54,14 +54,9 @@ SIGMA_PIXEL = 0.6
 level.
 """
 
-MATCH_RADIUS_PX = 15.0
-"""Search radius around a predicted pixel, at the finest pyramid level."""
-
-WIDE_SEARCH = 3.0
-"""Factor on the search radius when the first search finds too little."""
-
-NARROW_SEARCH = 0.4
-"""Factor on the search radius once a pose is known from this very frame."""
+NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
+"""Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
+this very frame; by a prediction; and when that finds too little."""
 
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
@@ -124,7 +119,7 @@ class Tracker:
         observations, offset_px = self.pixel_observations(features), self._map.rig.offset.value_px
         seen = predict_points(self._map, local_ids, T_camera_world, images.excluded)
         tree = cKDTree(features.uv_px)
-        points, rows = self._search(features, tree, seen, NARROW_SEARCH)
+        points, rows = self._search(features, tree, seen, NARROW_PX)
         if len(rows) < (ENOUGH if known is None else 1):
             return None
         ids = seen.ids[points]
@@ -162,10 +157,10 @@ class Tracker:
         predictions: Sequence[Array],
     ) -> PoseEstimate | None:
         """Search around the predictions, then wider around the first, then without any."""
-        attempts = [(T, 1.0) for T in predictions] + [(T, WIDE_SEARCH) for T in predictions[:1]]
-        for T_predicted, factor in attempts:
+        attempts = [(T, USUAL_PX) for T in predictions] + [(T, WIDE_PX) for T in predictions[:1]]
+        for T_predicted, radius_px in attempts:
             seen = predict_points(self._map, local_ids, T_predicted)
-            points, rows = self._search(features, tree, seen, factor)
+            points, rows = self._search(features, tree, seen, radius_px)
             estimate = self._believable(observations, seen.ids[points], rows, T_predicted)
             if estimate is not None:
                 return estimate
@@ -184,7 +179,7 @@ class Tracker:
         if found is None or found[1].sum() < ENOUGH // 2:
             return None
         seen = predict_points(self._map, ids, found[0])
-        points, rows = self._search(features, tree, seen, 1.0)
+        points, rows = self._search(features, tree, seen, USUAL_PX)
         return self._believable(observations, seen.ids[points], rows, found[0])
 
     def _believable(
@@ -204,7 +199,7 @@ class Tracker:
         return found.agreeing >= ENOUGH and found.share >= MAJORITY
 
     def _search(
-        self, features: Features, tree: cKDTree, seen: Prediction, radius_factor: float
+        self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float
     ) -> Matches:
         scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
         return match_predicted(
@@ -213,7 +208,7 @@ class Tracker:
             seen.uvd_px[:, :2],
             seen.octave,
             self._map.descriptor[seen.ids],
-            radius_factor * MATCH_RADIUS_PX * scale,
+            radius_px * scale,
         )
 
 

@@ -12,6 +12,7 @@ itself, a plain face not at all. Patches that overlap hold the same pixels and e
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,10 +25,9 @@ from segfloor_ros.camera.images import disparity_at
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import MAJORITY
 from segfloor_ros.slam.rig import Observations
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import SIDE_PX, Images
 
-HALF_PATCH_PX = 5
-SIDE_PX = 2 * HALF_PATCH_PX + 1
+HALF_PATCH_PX = SIDE_PX // 2
 STEPS = 4
 """Gauss-Newton steps; a start within reach converges in three."""
 
@@ -45,8 +45,9 @@ ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
 MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 """No patch is measured better: lenses, rectification and the shape of things are not perfect."""
 
-MIN_CORRELATION = 0.7
-"""Of the patches of one point in both images."""
+MIN_CORRELATION = math.sqrt(MAJORITY)
+"""Of the patches of one point in both images: its square is the share of the one's variance that
+the other explains."""
 
 Patches = NDArray[np.float32]
 

@@ -1,10 +1,17 @@
-"""The first guess of disparities, on images whose disparity is known by construction."""
+"""Disparities of what shows no point yet, on images whose disparity is known by construction."""
 
 import cv2
 import numpy as np
 import pytest
+from hand_made_maps import CAMERA
 
-from segfloor_ros.slam.mapping.keyframe_mapping import guess_disparity
+from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper, guess_disparity
+from segfloor_ros.slam.results import NO_POINT, ObservedFeatures
+from segfloor_ros.slam.rig import Observations, Rig
+from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Images
 
 
 def shifted_pair(width, height, disparity):
@@ -38,3 +45,24 @@ def test_nothing_is_guessed_where_there_is_nothing_to_see():
     grey = np.full((240, 640), 90, np.uint8)
     uv = np.array([[100.0, 100.0], [500.0, 30.0]])
     assert np.isnan(guess_disparity(grey, grey, uv)).all()
+
+
+def test_what_hides_a_point_from_one_eye_does_not_give_it_a_disparity():
+    left, right = shifted_pair(640, 240, 9.0)
+    uv = np.random.default_rng(2).uniform([100, 30], [540, 210], (200, 2))
+    is_known = np.arange(len(uv)) % 2 == 0
+    observed = ObservedFeatures(
+        Features(
+            uv.astype(np.float32), np.zeros(len(uv), np.uint8), np.zeros((len(uv), 32), np.uint8)
+        ),
+        Observations(np.column_stack([uv, np.full(len(uv), np.nan)]), np.ones((len(uv), 3))),
+        np.where(is_known, 0, NO_POINT).astype(np.int32),
+    )
+    frame = StereoFrame(0, 0, left, right)
+    mapper = LocalMapper(SparseMap(Rig(CAMERA)))
+    mapper.measure_stereo(frame, Images.of(frame, CAMERA), observed)
+    disparity = observed.observations.uvd_px[:, 2]
+    assert np.isnan(disparity[is_known]).all()
+    found = disparity[~is_known]
+    assert np.isfinite(found).mean() > 0.8
+    np.testing.assert_allclose(found[np.isfinite(found)], 9.0, atol=0.2)

@@ -36,7 +36,6 @@ def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
         (View(500, 200, 300, 0.0), False),  # standing still adds nothing
         (View(1, 74, 300, 0.0), True),  # A3: 74 < 0.25 · 300
         (View(1, 76, 300, 0.0), False),
-        (View(1, 15, 300, 1.5), False),  # B: not more than 15 tracked
     ],
 )
 def test_conditions(view, expected):

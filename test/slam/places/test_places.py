@@ -7,13 +7,13 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import se3_exp
 from segfloor_ros.slam.places.known_views import (
-    LOOK_AGAIN,
-    RECENT,
+    SECOND_VISIT,
     covered_share,
     view_novelty,
     views_near,
 )
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
+from segfloor_ros.slam.rig import NEIGHBOURS
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE = np.eye(4)
@@ -54,7 +54,7 @@ def test_near_views_come_nearest_first_and_not_beyond_reach():
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
 def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
     ids = np.arange(10, dtype=np.int32)
-    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.01 * depth_m, xyz)
+    sparse_map = row_of_views(NEIGHBOURS + 5, list(range(10)), 0.01 * depth_m, xyz)
     # 0.12 m beside keyframe 0 at a depth of 2 m is 1.5 times what makes a view new.
     beside = camera_at(-0.06 * depth_m)
     new = view_novelty(sparse_map, ids, beside, depth_m)
@@ -69,26 +69,26 @@ def test_views_of_an_earlier_visit_count_from_three_times_as_far(depth_m, xyz):
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
 def test_a_known_place_is_looked_at_again_now_and_then(depth_m, xyz):
     ids = np.arange(10, dtype=np.int32)
-    sparse_map = row_of_views(RECENT + 5, list(range(10)), 0.1 * depth_m, xyz)
+    sparse_map = row_of_views(NEIGHBOURS + 5, list(range(10)), 0.1 * depth_m, xyz)
     # The nearest of the latest keyframes stands at half the depth, 12.5 times as far as a new view.
     new = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
-    assert new == pytest.approx(12.5 / LOOK_AGAIN)
+    assert new == pytest.approx(12.5 / (2 * SECOND_VISIT))
 
 
 @pytest.mark.parametrize('is_retired', [False, True])
 def test_every_visit_that_made_a_keyframe_doubles_the_way_to_the_next(is_retired):
     depth_m, ids = 2.0, np.arange(10, dtype=np.int32)
-    sparse_map = row_of_views(RECENT + 15, list(range(10)), 0.1 * depth_m)
+    sparse_map = row_of_views(NEIGHBOURS + 15, list(range(10)), 0.1 * depth_m)
     nearest = 15 * 0.1 / 0.04
     first = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
-    assert first == pytest.approx(nearest / LOOK_AGAIN)
+    assert first == pytest.approx(nearest / (2 * SECOND_VISIT))
     for visits, index in ((2, 6), (3, 9)):
         again = sparse_map.keyframes[index]
         again.T_camera_world = camera_at(0.01 * depth_m)
         if is_retired:
             sparse_map.retire(again, sparse_map.keyframes[0])
         new = view_novelty(sparse_map, ids, camera_at(0.0), depth_m)
-        assert new == pytest.approx(nearest / (LOOK_AGAIN * 2 ** (visits - 1)))
+        assert new == pytest.approx(nearest / (SECOND_VISIT * 2**visits))
 
 
 def sparse_map_without(sparse_map, views):
