@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
-from segfloor_ros.slam.results import FrameResult, in_map
+from segfloor_ros.slam.results import FrameResult, MovingPoints, in_map
 
 RNG = np.random.default_rng(11)
 T_BASE_LEFT = se3_exp(np.array([0.3, -0.1, 0.5, -1.4, 0.2, -1.5]))
@@ -22,6 +24,25 @@ def test_the_base_is_where_its_camera_is_mounted() -> None:
     # The first camera is T_BASE_LEFT in `map`, this one has moved from there.
     expected = T_BASE_LEFT @ invert(T_CAMERA_WORLD) @ invert(T_BASE_LEFT)
     np.testing.assert_allclose(found.T_odom_base, expected, atol=1e-12)
+
+
+def test_a_correction_of_the_odometry_brings_the_base_to_where_its_camera_is_in_the_map() -> None:
+    T_world_odom = se3_exp(np.array([0.2, -0.3, 0.1, 0.1, -0.2, 0.5]))
+    found = in_map(replace(result(np.eye(6)), T_map_odom=T_world_odom), T_BASE_LEFT)
+    expected = T_BASE_LEFT @ T_world_odom @ invert(T_CAMERA_WORLD) @ invert(T_BASE_LEFT)
+    np.testing.assert_allclose(found.T_map_odom @ found.T_odom_base, expected, atol=1e-12)
+
+
+def test_what_moves_goes_in_the_map_from_where_it_was_to_where_it_is() -> None:
+    before = RNG.normal(size=(5, 3)) + np.array([0.0, 0.0, 4.0])
+    velocity = RNG.normal(size=(5, 3))
+    was, will = (
+        in_map(replace(result(np.eye(6)), moving=MovingPoints(xyz, velocity)), T_BASE_LEFT).moving
+        for xyz in (before, before + 0.1 * velocity)
+    )
+    assert was is not None and will is not None
+    gone = was.xyz_map + 0.1 * was.velocity_m_s
+    np.testing.assert_allclose(gone, will.xyz_map, atol=1e-5)
 
 
 def test_the_covariance_is_that_of_the_place_and_the_turn_of_the_base_in_odom() -> None:

@@ -146,7 +146,7 @@ def test_one_frame_finds_a_camera_that_is_where_it_was_lost(mapped, monkeypatch)
     here, other = there(25)[-1], StereoRoom(seed=77)
     assert slam.process(ROOM.frame(30, here))[0].tracked
     monkeypatch.setattr(
-        'segfloor_ros.slam.tracking.front_end.RECOVERY_RATIO', 1.0
+        'segfloor_ros.slam.tracking.front_end.MIN_FOUND', 1.0
     )  # the whole map alone
     monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.MIN_AGREEMENT', 1.01)
     assert not slam.process(other.frame(31, here))[0].tracked

@@ -199,7 +199,7 @@ def test_a_jump_without_any_prediction_is_found_by_descriptors(frames):
 
 
 def test_who_was_lost_must_find_what_should_be_there(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.RECOVERY_RATIO', 1.0)
+    monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.MIN_FOUND', 1.0)
     monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.CHANCE_SHARE', 1.0)
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     black = np.zeros_like(frames[0].left)

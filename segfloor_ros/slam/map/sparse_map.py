@@ -199,10 +199,15 @@ class SparseMap:
         together[np.intersect1d(*keys) // len(self.keyframes)] = True
         return together
 
-    def merge(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
-        """Make one point of each pair (kept[i], gone[i]), (N,), that no keyframe observes both
-        of. The better known one gives the position and the patch, the one seen last the look.
+    def merge(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> int:
+        """Make one point of each pair (a[i], b[i]), (N,), that no keyframe observes both of, with
+        the id of the older one; returns how many. The better known one gives the position and the
+        patch, the one seen last the look.
         """
+        separate = ~self.seen_together(a, b)
+        a, b = a[separate], b[separate]
+        older = self.stable_id[a] < self.stable_id[b]
+        kept, gone = np.where(older, a, b), np.where(older, b, a)
         better = self.observer_count[gone] > self.observer_count[kept]
         later = self.points['seen_last'][gone] > self.points['seen_last'][kept]
         for names, chosen in ((OF_POSITION, better), (OF_LOOK, later)):
@@ -214,6 +219,7 @@ class SparseMap:
         born[kept] = np.minimum(born[kept], born[gone])
         self._rename(kept, gone)
         self.alive[gone] = False
+        return len(kept)
 
     def _rename(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
         """Give the observations of points `gone` to points `kept`."""

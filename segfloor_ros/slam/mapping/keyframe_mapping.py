@@ -264,12 +264,7 @@ def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Ar
 
 def fuse_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> int:
     """Merge points of a new keyframe with those of its neighbours; return how many merged."""
-    a, b = find_duplicates(sparse_map, keyframe)
-    separate = ~sparse_map.seen_together(a, b)
-    a, b = a[separate], b[separate]
-    older = sparse_map.stable_id[a] < sparse_map.stable_id[b]
-    sparse_map.merge(np.where(older, a, b), np.where(older, b, a))
-    return len(a)
+    return sparse_map.merge(*find_duplicates(sparse_map, keyframe))
 
 
 def find_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Pairs:

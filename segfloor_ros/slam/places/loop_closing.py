@@ -14,7 +14,7 @@ using Dynamic Covariance Scaling, ICRA 2013).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +28,7 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.known_views import views_near
-from segfloor_ros.slam.places.loops import (
-    MAX_MISSES,
-    LoopChecks,
-    are_certain,
-    drift,
-    median_depth_m,
-)
+from segfloor_ros.slam.places.loops import LoopChecks, Sightings, drift, match_of, median_depth_m
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, chi2_limit
@@ -142,10 +136,8 @@ def merge_pairs(sparse_map: SparseMap, own: NDArray[np.integer], old: NDArray[np
     own, old = own[pairs], old[pairs]
     _, first = np.unique(own, return_index=True)
     own, old = own[first], old[first]
-    separate = ~np.isin(own, old) & ~sparse_map.seen_together(own, old)
-    own, old = own[separate], old[separate]
-    older = sparse_map.stable_id[own] < sparse_map.stable_id[old]
-    sparse_map.merge(np.where(older, own, old), np.where(older, old, own))
+    once = ~np.isin(own, old)
+    sparse_map.merge(own[once], old[once])
 
 
 @dataclass(frozen=True)
@@ -234,17 +226,6 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     return step.reshape(-1, 6)
 
 
-@dataclass(frozen=True)
-class Sighting:
-    """A keyframe of the drive's own map that sees the known one. own_ids, known_ids: (N,) stable
-    ids of points that both have.
-    """
-
-    match: Match
-    own_ids: NDArray[np.int32]
-    known_ids: NDArray[np.int32]
-
-
 class KnownMap:
     """The known map, beside the drive's own. of_drive: whether this drive made it, and got lost."""
 
@@ -257,21 +238,13 @@ class KnownMap:
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
         self._checks = LoopChecks(own, self._map)
-        self._sightings: list[Sighting] = []
-        self._misses = 0
+        self._sightings = Sightings(own, TIMES_A_LOOP)
 
     def recognise(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
         match = self._look(keyframe, images)
-        if match is not None and self._is_possible(keyframe, match):
-            self._sightings.append(self._sighting(keyframe, match))
-            self._misses = 0
-        else:
-            self._misses += 1
-            if self._misses > MAX_MISSES:
-                self._sightings = []
-        matches = [sighting.match for sighting in self._sightings]
-        return are_certain(self._own, matches, TIMES_A_LOOP)
+        is_possible = match is not None and self._is_possible(keyframe, match)
+        return self._sightings.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
         if self._of_drive and not self._checks.is_within_reach(match):
@@ -286,43 +259,42 @@ class KnownMap:
     def _look(self, keyframe: KeyframeRecord, images: Images) -> Match | None:
         """Look for the view where the keyframes before saw it, else in the whole known map."""
         features = keyframe.features
-        if self._sightings:
-            pose = keyframe.T_camera_world @ drift(self._own, self._sightings[-1].match)
+        if self._sightings.matches:
+            pose = keyframe.T_camera_world @ drift(self._own, self._sightings.matches[-1])
             depth_m = median_depth_m(self._own, keyframe)
             around = self._map.points_of(views_near(self._map, pose, depth_m, NEIGHBOURS))
             track = self._places.confirm(images, features, around, pose)
         else:
             track = self._relocaliser.find(images, features)
-        if track is None or track.observed is None:
-            return None
-        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
-        ids = track.observed.point_id[rows]
-        order, _ = self._map.covisible(ids)
-        stable_ids = self._map.stable_id[ids]
-        return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable_ids)
+        anywhere = np.ones(len(self._map.keyframes), bool)
+        return None if track is None else match_of(self._map, keyframe, track, anywhere)
 
-    def _sighting(self, keyframe: KeyframeRecord, match: Match) -> Sighting:
-        own = keyframe.point_id[match.rows]
-        both = own != NO_POINT
-        return Sighting(match, self._own.stable_id[own[both]].copy(), match.stable_ids[both])
+    def _own_ids(self, match: Match) -> NDArray[np.int32]:
+        """Return the stable ids (N,) that the points of a match have in the drive's own map, -1
+        where it has none.
+        """
+        keyframe = self._own.keyframes[match.keyframe]
+        own = np.full(len(match.rows), NO_POINT, np.int32)
+        if keyframe.retired is None:
+            own = keyframe.point_id[match.rows]
+        return np.where(own != NO_POINT, self._own.stable_id[own], np.int32(NO_POINT))
 
     def merge(self, own_words: Arrays) -> Arrays:
         """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
         words of all keyframes.
         """
-        latest = self._sightings[-1].match
+        matches = self._sightings.matches
+        latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
         T_known_own = invert(drift(self._own, latest))
         before = len(self._map.keyframes)
         arrays = moved(map_to_arrays(self._own), T_known_own)
         known = self.to_arrays()
         self.restore(known)
         fill_map(self._own, arrays)
-        for sighting in self._sightings:
-            match, i = sighting.match, before + sighting.match.keyframe
-            place = self._own.keyframes[match.place]
-            T_i_j = match.T_camera_world @ place.T_world_camera
-            self._own.loops.append(LoopEdge(i, match.place, T_i_j))
-            merge_pairs(self._own, self._rows(sighting.own_ids), self._rows(sighting.known_ids))
+        for match, ids in zip(matches, own_ids, strict=True):
+            edge = _edge(self._own, match)
+            self._own.loops.append(replace(edge, i=before + match.keyframe))
+            merge_pairs(self._own, self._rows(ids), self._rows(match.stable_ids))
         fuse_latest(self._own, before + latest.keyframe)
         return {name: np.concatenate([known[name], own_words[name]]) for name in own_words}
 

@@ -88,8 +88,7 @@ class LoopDetector:
 
     def reset(self) -> None:
         """Believe in no loop."""
-        self._matches: list[Match] = []
-        self._misses = 0
+        self._sightings = Sightings(self._map)
 
     def detect(self, keyframe: KeyframeRecord, images: Images) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
@@ -99,20 +98,12 @@ class LoopDetector:
             self.reset()
             return []
         known = self._map.points_of(np.flatnonzero(near))
-        if self._matches:
-            match = self._follow(keyframe, images, far, known)
-        else:
-            match = self._find(keyframe, images, far, known)
-        if match is not None and self._is_sound(keyframe, match, lengths):
-            self._matches.append(match)
-            self._misses = 0
-        elif self._matches:
-            self._misses += 1
-            if self._misses > MAX_MISSES:
-                self.reset()
-        if not are_certain(self._map, self._matches):
+        look = self._follow if self._sightings.matches else self._find
+        match = look(keyframe, images, far, known)
+        is_sound = match is not None and self._is_sound(keyframe, match, lengths)
+        if not self._sightings.add(match if is_sound else None):
             return []
-        matches = self._matches
+        matches = self._sightings.matches
         self._note(matches[-1], 'closed')
         self.reset()
         return matches
@@ -167,7 +158,7 @@ class LoopDetector:
             ids = np.setdiff1d(self._map.points_of(group), known).astype(np.int32)
             track = self._places.locate(images, keyframe.features, ids)
             if track is not None:
-                return self._match(keyframe, track, far)
+                return match_of(self._map, keyframe, track, far)
         return None
 
     def _follow(
@@ -178,27 +169,14 @@ class LoopDetector:
         known: NDArray[np.int32],
     ) -> Match | None:
         """Look for the place where the keyframes before saw it."""
-        pose = keyframe.T_camera_world @ drift(self._map, self._matches[-1])
+        pose = keyframe.T_camera_world @ drift(self._map, self._sightings.matches[-1])
         around = views_near(
             self._map, pose, median_depth_m(self._map, keyframe), len(self._map.keyframes)
         )
         around = around[far[around]][:NEIGHBOURS]
         ids = np.setdiff1d(self._map.points_of(around), known).astype(np.int32)
         track = self._places.confirm(images, keyframe.features, ids, pose)
-        return None if track is None else self._match(keyframe, track, far)
-
-    def _match(
-        self, keyframe: KeyframeRecord, track: Track, far: NDArray[np.bool_]
-    ) -> Match | None:
-        assert track.observed is not None
-        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
-        ids = track.observed.point_id[rows]
-        order, _ = self._map.covisible(ids)
-        order = order[far[order]]
-        if len(order) == 0:
-            return None
-        stable = self._map.stable_id[ids].copy()
-        return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable)
+        return None if track is None else match_of(self._map, keyframe, track, far)
 
 
 def path_lengths(sparse_map: SparseMap, index: int) -> Array:
@@ -330,30 +308,64 @@ class LoopChecks:
         return uvr[:, :2], uvr[:, 0] - uvr[:, 2]
 
 
+def match_of(
+    known: SparseMap, keyframe: KeyframeRecord, track: Track, may_be: NDArray[np.bool_]
+) -> Match | None:
+    """Return what a keyframe that was found in a map sees of it. may_be: which keyframes of the map
+    (K,) may be the place; None where none of them sees the same.
+    """
+    assert track.observed is not None
+    rows = np.flatnonzero(track.observed.point_id != NO_POINT)
+    ids = track.observed.point_id[rows]
+    order, _ = known.covisible(ids)
+    order = order[may_be[order]]
+    if len(order) == 0:
+        return None
+    stable_ids = known.stable_id[ids]
+    return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable_ids)
+
+
+class Sightings:
+    """Keyframes in a row, all but `MAX_MISSES`, that see a place. times: as many of them, over as
+    long a motion, are asked for as for a loop.
+    """
+
+    def __init__(self, sparse_map: SparseMap, times: int = 1) -> None:
+        self.matches: list[Match] = []
+        self._map = sparse_map
+        self._times = times
+        self._misses = 0
+
+    def add(self, match: Match | None) -> bool:
+        """Take in what the next keyframe sees of the place; returns whether enough of them agree,
+        over enough of a motion.
+        """
+        self._misses = self._misses + 1 if match is None else 0
+        if match is not None:
+            self.matches.append(match)
+        elif self._misses > MAX_MISSES:
+            self.matches = []
+        return self._are_certain()
+
+    def _are_certain(self) -> bool:
+        if len(self.matches) < self._times * PROOF:
+            return False
+        latest = self.matches[-1]
+        motion = latest.T_camera_world @ invert(self.matches[0].T_camera_world)
+        if is_within(motion, (self._times * MIN_MOTION[0], self._times * MIN_MOTION[1])):
+            return False
+        keyframe = self._map.keyframes[latest.keyframe]
+        reach = AGREE[0] + AGREE[1] * median_depth_m(self._map, keyframe), AGREE[1]
+        # Both drifts, at the latest keyframe.
+        back = invert(latest.T_camera_world)
+        gaps = (keyframe.T_camera_world @ drift(self._map, m) @ back for m in self.matches[:-1])
+        return all(is_within(gap, reach) for gap in gaps)
+
+
 def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
-
-
-def are_certain(sparse_map: SparseMap, matches: list[Match], times: int = 1) -> bool:
-    """Whether enough keyframes agree, over enough of a motion. times: as many and as much as for a
-    loop.
-    """
-    if len(matches) < times * PROOF:
-        return False
-    latest = matches[-1]
-    motion = latest.T_camera_world @ invert(matches[0].T_camera_world)
-    if is_within(motion, (times * MIN_MOTION[0], times * MIN_MOTION[1])):
-        return False
-    keyframe = sparse_map.keyframes[latest.keyframe]
-    reach = AGREE[0] + AGREE[1] * median_depth_m(sparse_map, keyframe), AGREE[1]
-    for match in matches[:-1]:
-        # Both drifts, at the latest keyframe.
-        gap = keyframe.T_camera_world @ drift(sparse_map, match) @ invert(latest.T_camera_world)
-        if not is_within(gap, reach):
-            return False
-    return True
 
 
 def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:

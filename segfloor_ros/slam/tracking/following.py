@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.results import ENOUGH, MAJORITY, Track
+from segfloor_ros.slam.results import ENOUGH, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import (
@@ -33,8 +33,6 @@ from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
 from segfloor_ros.slam.tracking.pose import Agreement, Consensus
 
 MAX_FOLLOWED = 250
-MIN_FOUND = 0.15
-"""Share of the selected points that must be found and agree, else the frame is searched anew."""
 
 
 class Follower:
@@ -90,7 +88,7 @@ class Follower:
         ids = seen.ids[rows]
         measured = observations.take(rows)
         found = self._consensus.refine(pose, ids, measured.without_offset(offset_px))
-        if not self._believable(found, len(seen.ids)):
+        if not found.is_believable(len(seen.ids)):
             return None
         estimate = found.estimate
         return Track(estimate, ids[estimate.inliers], measured.take(estimate.inliers), seen.ids)
@@ -115,7 +113,7 @@ class Follower:
         uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
         observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
         agreement = self._consensus.refine(T_predicted, ids[found], observations)
-        return agreement if self._believable(agreement, len(ids)) else None
+        return agreement if agreement.is_believable(len(ids)) else None
 
     def _select(
         self, local_ids: NDArray[np.int32], T_camera_world: Array, excluded: Region | None
@@ -128,8 +126,3 @@ class Follower:
         cell_px = max(1, int(np.sqrt(area / TRACKED_POINTS)))
         reliability = self._map.points.reliability(seen.ids).astype(np.float32)
         return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, TRACKED_POINTS))
-
-    def _believable(self, found: Agreement, looked_for: int) -> bool:
-        """Whether enough points agree: a wrong pose has followers too, but not most."""
-        enough = max(ENOUGH, MIN_FOUND * looked_for)
-        return found.agreeing >= enough and found.share >= MAJORITY

@@ -30,7 +30,7 @@ from segfloor_ros.slam.results import (
 )
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
-from segfloor_ros.slam.tracking.following import MIN_FOUND, Follower
+from segfloor_ros.slam.tracking.following import Follower
 from segfloor_ros.slam.tracking.images import (
     ImageRotation,
     Images,
@@ -44,11 +44,7 @@ from segfloor_ros.slam.tracking.images import (
 from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
-from segfloor_ros.slam.tracking.pose import PoseInformation, differ
-
-RECOVERY_RATIO = MIN_FOUND
-"""Share of the points expected in view that a camera which was lost must find: far points alone
-fit many places."""
+from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
 
 CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
 """Points, and their share of those expected, that must be found where the sensors have the camera
@@ -221,7 +217,7 @@ class FrontEnd:
         track = self.tracker.track(images, features, self.local.point_ids, predictions)
         if self.motion.state is TrackingState.TRACKING:
             return self._carry_on(images, features, frame.stamp_ns, track)
-        if track is not None and _recognised(track, RECOVERY_RATIO):
+        if track is not None and _recognised(track, MIN_FOUND):
             return track
         return self._relocalise(images, features, frame.stamp_ns)
 
@@ -232,7 +228,7 @@ class FrontEnd:
         a record of standing still, or where a pose is poor, nearly as many: what comes close and
         fills the image has the most points, and takes the pose along.
         """
-        is_poor = track is None or not _recognised(track, RECOVERY_RATIO)
+        is_poor = track is None or not _recognised(track, MIN_FOUND)
         steady = self.motion.expected(stamp_ns)
         close = self.tracker.track_at(
             images, features, self.local.point_ids, steady.T_camera_world, steady, is_given=True

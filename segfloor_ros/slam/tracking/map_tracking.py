@@ -40,14 +40,7 @@ from segfloor_ros.slam.tracking.patch_alignment import (
     align_patches,
     measure_disparity,
 )
-from segfloor_ros.slam.tracking.pose import (
-    KNOWN_NOISE,
-    MAJORITY,
-    Agreement,
-    Consensus,
-    PoseEstimate,
-    solve_pnp,
-)
+from segfloor_ros.slam.tracking.pose import KNOWN_NOISE, Consensus, PoseEstimate, solve_pnp
 
 SIGMA_PIXEL = 0.6
 """Standard deviation of a corner's position at the finest pyramid level, px; grows with the
@@ -130,7 +123,7 @@ class Tracker:
         found = None
         if not is_given:
             found = self.consensus.refine(T_camera_world, ids, measured, known=known)
-        if found is None or not self._agree(found):
+        if found is None or not found.is_believable():
             if known is None:
                 return None
             found = self.consensus.at(known, ids, measured)
@@ -193,10 +186,7 @@ class Tracker:
         if len(rows) < ENOUGH:
             return None
         found = self.consensus.refine(T_start, ids, observations.take(rows), KNOWN_NOISE)
-        return found.estimate if self._agree(found) else None
-
-    def _agree(self, found: Agreement) -> bool:
-        return found.agreeing >= ENOUGH and found.share >= MAJORITY
+        return found.estimate if found.is_believable() else None
 
     def _search(
         self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float

@@ -56,6 +56,10 @@ FLOOR_M = 0.03
 USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
 """Where at least this share of what has a record fits, at no more than this noise, all is well."""
 
+MIN_FOUND = 0.15
+"""Share of the points that should be in view that must be found and agree: far points alone fit
+many places."""
+
 KNOWN_NOISE = 2.0
 """Corners of an image are worse by no more than this factor than patches of the same image."""
 
@@ -278,6 +282,13 @@ class Agreement:
     def share(self) -> float:
         """The share of the points that count which agree."""
         return self.agreeing / max(1, int(self.counted.sum()))
+
+    def is_believable(self, looked_for: int = 0) -> bool:
+        """Whether enough points agree, also of those that were looked for, and most of those that
+        count: a wrong pose has followers too.
+        """
+        enough = max(ENOUGH, MIN_FOUND * looked_for)
+        return self.agreeing >= enough and self.share >= MAJORITY
 
 
 class Consensus:

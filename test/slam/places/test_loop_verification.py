@@ -10,7 +10,7 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.map.sparse_map import SparseMap
-from segfloor_ros.slam.places.loops import LoopChecks, are_certain
+from segfloor_ros.slam.places.loops import LoopChecks, Sightings
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Observations, Rig
 
@@ -80,9 +80,9 @@ def test_free_space_does_not_run_through_what_stands_there():
 )
 def test_three_keyframes_on_the_move_must_show_the_same_drift(views, drifts_m, expected):
     sparse_map = row_of_views(26, list(range(10)), 0.1)
-    matches = []
+    sightings = Sightings(sparse_map)
     for index, drift_m in zip(views, drifts_m, strict=True):
         drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
         pose = sparse_map.keyframes[index].T_camera_world @ drift
-        matches.append(Match(index, 0, pose, NONE, NONE, NONE))
-    assert are_certain(sparse_map, matches) is expected
+        are_certain = sightings.add(Match(index, 0, pose, NONE, NONE, NONE))
+    assert are_certain is expected
