@@ -33,9 +33,11 @@ from segfloor_ros.slam.moving.scene_flow import (
     SmallCamera,
     static_scale,
 )
+from segfloor_ros.slam.places.known_views import MIN_FRAMES
 from segfloor_ros.slam.results import CHANCE_SHARE, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.tracking.images import Region
+from segfloor_ros.slam.tracking.pose import FLOOR_M
 
 DISPARITIES = 64
 BLOCK_PX = 5
@@ -46,9 +48,6 @@ SPECKLE_PX = 40
 MAX_PARALLAX_RAD = float(np.radians(30.0))
 COMPARED_VIEWS = 5
 KEPT_VIEWS = 30
-MIN_HEIGHT_M = 0.05
-"""What is lower may be floor, whose disparities repeat and mirror."""
-
 SHIN_M, FOOT_M = 0.3, 0.2
 """Below what moves at less than the first height is a foot, up to the second in each direction."""
 
@@ -67,9 +66,6 @@ MISFIT_OF_TEXTURE = 0.7
 
 MIN_AREA_PX = BLOCK_PX * BLOCK_PX
 """Less is a single wrong match."""
-
-SEARCH_EVERY = 3
-"""Frames between two searches where no keyframe asks for one, e.g. while the robot stands."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,7 @@ class MovingRegions:
     def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
         """Whether to search a frame."""
         self._frames_since += 1
-        return is_keyframe or (is_tracked and self._frames_since >= SEARCH_EVERY)
+        return is_keyframe or (is_tracked and self._frames_since >= MIN_FRAMES)
 
     def search(
         self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
@@ -199,7 +195,7 @@ class MovingRegions:
         height_m = np.full(len(rows), np.inf)
         if mount is not None:
             height_m = mount.heights_m(points.T)
-        high = height_m > MIN_HEIGHT_M
+        high = height_m > FLOOR_M
         seeds, doubtful = (np.zeros(disparity.size, np.uint8) for _ in range(2))
         seeds[rows] = (through >= solid) & (through > 1) & high
         background = disparity.copy()

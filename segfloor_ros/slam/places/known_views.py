@@ -28,7 +28,8 @@ NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 some tens of pixels, and their patches still look alike."""
 
 MIN_FRAMES = 3
-"""Frames between keyframes while the mapper is idle (condition A2)."""
+"""Frames between keyframes while the mapper is idle (condition A2), and between two searches for
+what moves where no keyframe asks for one, e.g. while the robot stands."""
 
 REACH = 0.5, 0.5
 """Up to which a keyframe sees much the same: distance, as a share of the depth of what is seen, and

@@ -28,7 +28,15 @@ from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.known_views import views_near
-from segfloor_ros.slam.places.loops import LoopChecks, Sightings, drift, match_of, median_depth_m
+from segfloor_ros.slam.places.loops import (
+    LINK_SIGMA,
+    LOOP_FACTOR,
+    LoopChecks,
+    Sightings,
+    drift,
+    match_of,
+    median_depth_m,
+)
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, chi2_limit
@@ -36,13 +44,6 @@ from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.pose import CONVERGED
-
-LINK_SIGMA = np.array([0.01] * 3 + [0.002] * 3)
-"""Error, m and rad, of the motion between two keyframes that share points; only the ratio to that
-of a loop matters, and how far from each other they stand does not."""
-
-LOOP_FACTOR = 2.0
-"""Error of a loop in that of the motion between two keyframes."""
 
 STEPS = 20
 
@@ -70,9 +71,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     new = [_edge(sparse_map, match) for match in matches]
     loops = [*sparse_map.loops, *new]
     T_loops = np.stack([loop.T_i_j for loop in loops])
-    sigma = np.concatenate(
-        [np.tile(LINK_SIGMA, (len(i), 1)), np.tile(LOOP_FACTOR * LINK_SIGMA, (len(loops), 1))]
-    )
+    factor = np.repeat([1.0, LOOP_FACTOR], [len(i), len(loops)])
+    sigma = factor[:, None] * np.repeat(LINK_SIGMA, 3)
     fixed = np.zeros(len(keyframes), bool)
     fixed[0] = True
     graph = PoseGraph(

@@ -7,7 +7,6 @@ must agree on drift and floor, and see the same space from both sides.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,22 +29,21 @@ from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX
 from segfloor_ros.slam.tracking.images import Images
 
 MAX_MISSES = 1
-REMEMBERED = 1000
 
 DRIFT_PER_M = 0.04, 0.01
 """Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
 
-LEAST_DRIFT = 0.02, 0.005
-"""Less, in m and rad, is no drift: the local adjustments take it away."""
+LINK_SIGMA, LOOP_FACTOR = (0.01, 0.002), 2.0
+"""Error, m and rad, of the motion between two keyframes that share points, and that of a loop in
+units of it; how far from each other they stand does not matter. What is no larger than that of a
+loop is no drift."""
 
 FREE_DRIFT = 0.3, 0.1
 """Drift, in m and rad, of the shortest of ways."""
 
-MAX_STEP_UP_M = 0.1
-MAX_SLOPE = 0.15
-MAX_TILT_RAD = 0.2
-"""Where a robot stands on the same floor again, its camera is about as high and as level as before:
-floors slope, and carts shake."""
+MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
+"""Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
+as before: floors slope, and carts shake."""
 
 IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by this share."""
@@ -80,7 +78,7 @@ class LoopDetector:
     """Looks for loops, keyframe by keyframe."""
 
     def __init__(self, sparse_map: SparseMap, places: PlaceRecognition) -> None:
-        self.candidates: deque[Candidate] = deque(maxlen=REMEMBERED)
+        self.candidates: list[Candidate] = []
         self._map = sparse_map
         self._places = places
         self._checks = LoopChecks(sparse_map)
@@ -206,7 +204,8 @@ class LoopChecks:
         so far, or has not drifted; '' for nothing.
         """
         moved = match.T_camera_world @ keyframe.T_world_camera
-        if is_within(moved, LEAST_DRIFT):
+        sigma_m, sigma_rad = LINK_SIGMA
+        if is_within(moved, (LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad)):
             return 'no drift'
         (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
         reach = free_m + per_m * length_m, free_rad + rad_per_m * length_m
@@ -243,7 +242,7 @@ class LoopChecks:
         T = T_base_left @ T_place_now @ invert(T_base_left)
         up_m = abs(T[2, 3]) - MAX_SLOPE * float(np.linalg.norm(T[:2, 3]))
         tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
-        return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_TILT_RAD)
+        return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_SLOPE)
 
     def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
         """Whether the keyframe's own points lie where the place's keyframe sees what they match."""

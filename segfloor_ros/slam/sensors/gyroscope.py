@@ -80,9 +80,10 @@ class TimedSeries(Generic[Sample]):
         if self._samples[0].stamp_ns < kept_ns - KEPT_NS:
             del self._samples[: bisect_left(self._samples, kept_ns, key=_stamp)]
 
-    def latest(self, count: int) -> list[Sample]:
-        """Return so many of the samples."""
-        return self._samples[-count:]
+    def latest(self) -> list[Sample]:
+        """Return the samples of the last moment."""
+        start_ns = self._samples[-1].stamp_ns - MOMENT_NS if self._samples else 0
+        return self._samples[bisect_left(self._samples, start_ns, key=_stamp) :]
 
     def window(self, before_ns: int, now_ns: int) -> list[Sample]:
         """Return the samples from the last one before a time to the first one after another; none

@@ -12,9 +12,6 @@ from segfloor_ros.geometry import Array, between, invert, make_transform
 from segfloor_ros.slam.rig import GATE, chi2_limit
 from segfloor_ros.slam.sensors.gyroscope import LATE_NS, TimedSeries, is_late, lag_in_words
 
-NEEDED = 20
-"""Poses that a drive needs to go on after it was broken off."""
-
 MAX_GAP_NS = 500_000_000
 """Time between two poses: drivers publish two a second at least."""
 
@@ -31,8 +28,8 @@ class WheelOdometry:
 
     @property
     def latest(self) -> list[WheelPose]:
-        """The poses of the last moments."""
-        return self._poses.latest(NEEDED)
+        """The poses of the last moment: a drive that was broken off goes on from them."""
+        return self._poses.latest()
 
     def motion(self, before_ns: int, now_ns: int) -> Array | None:
         """Return T_before_now (4, 4) of the base; None where too little was measured."""

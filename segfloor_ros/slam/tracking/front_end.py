@@ -12,6 +12,7 @@ from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.map.sparse_map import SparseMap
+from segfloor_ros.slam.places.known_views import ALIKE_SHARE
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
@@ -20,6 +21,7 @@ from segfloor_ros.slam.places.place_recognition import (
 )
 from segfloor_ros.slam.results import (
     ENOUGH,
+    MAJORITY,
     MOST,
     NO_POINT,
     SAME,
@@ -46,16 +48,14 @@ from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma
 from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
 from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
 
-CONTRARY, CONTRARY_WHEN_BLIND = (100, 0.3), (200, 0.5)
-"""Points, and their share of those expected, that must be found where the sensors have the camera
-somewhere else: wheels slip, but a view that begins anew may be of another place."""
-
 FEW_POINTS = 50
 """Wheels measure the pose better than fewer points, spread over the image, that do not slide along
 edges, and an IMU alone better than half as many."""
 
 PLENTY = 100
-"""With so many points in view the place is certain enough, whatever they are."""
+"""With so many points in view the place is certain enough, whatever they are, also where the
+sensors have the camera somewhere else: wheels slip. A view that begins anew needs twice as many: it
+may be of another place."""
 
 
 class FrontEnd:
@@ -169,8 +169,9 @@ class FrontEnd:
             return motion.state.is_resuming or motion.is_plausible(pose, stamp_ns)
         if motion.state.is_resuming:
             return False
-        least, ratio = CONTRARY_WHEN_BLIND if motion.state.is_blind else CONTRARY
-        return len(track.point_ids) >= least and _recognised(track, ratio)
+        if motion.state.is_blind:
+            return len(track.point_ids) >= 2 * PLENTY and _recognised(track, MAJORITY)
+        return len(track.point_ids) >= PLENTY and _recognised(track, ALIKE_SHARE)
 
     def _information(self, track: Track, images: Images) -> PoseInformation:
         return PoseInformation(

@@ -50,8 +50,9 @@ RANSAC_ITERATIONS = 1000
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 """Of a pose before any point is seen, in metres and radians: where no point determines it."""
 
-FLOOR_M = 0.03
-"""What is no higher belongs to the floor, which stands still whenever it was first seen."""
+FLOOR_M = 0.05
+"""What is no higher belongs to the floor, which stands still whenever it was first seen, and whose
+disparities repeat and mirror."""
 
 USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
 """Where at least this share of what has a record fits, at no more than this noise, all is well."""
