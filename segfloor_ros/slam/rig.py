@@ -174,6 +174,18 @@ def is_gated(error: Array, covariance: Array) -> bool:
     return float(error @ np.linalg.solve(covariance, error)) <= chi2_limit(len(error), GATE)
 
 
+def in_view(camera: StereoCamera, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return pixel and disparity (N, 3) of points (N, 3) of the left optical frame, NaN behind the
+    camera, and which of them (N,) lie in the image.
+    """
+    front = points[:, 2] > MIN_DEPTH_M
+    uvd = camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))
+    uvd[:, 2] = uvd[:, 0] - uvd[:, 2]
+    uvd[~front] = np.nan
+    uv = uvd[:, :2]
+    return uvd, ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
+
+
 def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:
     """Return predicted minus measured (u, v, d), (N, 3) px, for points (N, 3) of the left
     optical frame.

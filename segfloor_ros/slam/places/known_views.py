@@ -21,7 +21,7 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import MAJORITY
-from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS
+from segfloor_ros.slam.rig import NEIGHBOURS, in_view
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
@@ -132,9 +132,7 @@ def covered_share(
     covered = np.zeros(len(points), bool)
     for T_view_world in views:
         local = transform_points(T_view_world @ invert(T_camera_world), points)
-        front = local[:, 2] > MIN_DEPTH_M
-        uv = camera.project(np.where(front[:, None], local, (0.0, 0.0, 1.0)))[:, :2]
-        covered |= front & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
+        covered |= in_view(camera, local)[1]
     return float(covered.mean())
 
 

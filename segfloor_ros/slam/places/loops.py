@@ -25,7 +25,7 @@ from segfloor_ros.slam.places.place_recognition import (
     greatest_speed_mps,
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX
+from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX, in_view
 from segfloor_ros.slam.tracking.images import Images
 
 MAX_MISSES = 1
@@ -258,8 +258,8 @@ class LoopChecks:
         place = self._known.keyframes[match.place]
         T_place_world = place.T_camera_world @ invert(match.T_camera_world)
         local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
-        uv, _ = self._project(transform_points(T_place_world, local))
-        gap = np.linalg.norm(uv - place.observations.uvd_px[row, :2], axis=1)
+        uvd, _ = in_view(self._camera, transform_points(T_place_world, local))
+        gap = np.linalg.norm(uvd[:, :2] - place.observations.uvd_px[row, :2], axis=1)
         return float((gap < SAME_PX).mean()) >= MOST
 
     def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
@@ -283,28 +283,18 @@ class LoopChecks:
         """Return the share of points (N, 3) that lie in front of what a camera sees (M, 3) beside
         them, both in its optical frame; 0 where few can be compared.
         """
-        (uv, disparity), (uv_seen, disparity_seen) = self._project(points), self._project(seen)
-        valid = np.isfinite(uv).all(axis=1) & (uv >= 0).all(axis=1)
-        valid &= (uv < (self._camera.width, self._camera.height)).all(axis=1)
-        visible = np.isfinite(uv_seen).all(axis=1)
-        if not valid.any() or not visible.any():
+        uvd, valid = in_view(self._camera, points)
+        uvd_seen, _ = in_view(self._camera, seen)
+        uvd, uvd_seen = uvd[valid], uvd_seen[np.isfinite(uvd_seen[:, 0])]
+        if not len(uvd) or not len(uvd_seen):
             return 0.0
-        gap, near = cKDTree(uv_seen[visible]).query(uv[valid], distance_upper_bound=SAME_PX)
+        gap, near = cKDTree(uvd_seen[:, :2]).query(uvd[:, :2], distance_upper_bound=SAME_PX)
         beside = np.isfinite(gap)
         if beside.sum() < ENOUGH:
             return 0.0
-        behind = disparity_seen[visible][np.asarray(near)[beside]]
+        behind = uvd_seen[np.asarray(near)[beside], 2]
         margin = np.maximum(SAME_PX, IN_FRONT_SHARE * behind)
-        return float((disparity[valid][beside] - behind > margin).mean())
-
-    def _project(self, points: Array) -> tuple[Array, NDArray[np.float64]]:
-        """Return the pixels (N, 2) and disparities (N,) of points (N, 3) of an optical frame; NaN
-        behind the camera.
-        """
-        front = points[:, 2] > MIN_DEPTH_M
-        uvr = self._camera.project(np.where(front[:, None], points, (0.0, 0.0, 1.0)))
-        uvr[~front] = np.nan
-        return uvr[:, :2], uvr[:, 0] - uvr[:, 2]
+        return float((uvd[beside, 2] - behind > margin).mean())
 
 
 def match_of(

@@ -25,7 +25,7 @@ from segfloor_ros.slam.places.known_views import (
     views_near,
 )
 from segfloor_ros.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, in_view
 from segfloor_ros.slam.tracking.features import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
@@ -229,26 +229,16 @@ def predict_points(
     """
     camera = sparse_map.rig.camera
     points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
-    front = points[:, 2] > MIN_DEPTH_M
-    ids, points = ids[front], points[front]
-    uvr = camera.project(points)
+    uvd, visible = in_view(camera, points)
+    visible[visible] = ~is_inside(excluded, uvd[visible, :2])
+    ids, points, uvd = ids[visible], points[visible], uvd[visible]
     distance = np.sqrt((points**2).sum(axis=1))
     direction = points @ T_camera_world[:3, :3] / distance[:, None]
     cosine = (direction * sparse_map.viewing_direction[ids]).sum(axis=1)
     zoom = np.log(sparse_map.viewing_distance_m[ids] / distance)
     octave = sparse_map.viewing_octave[ids] + zoom / np.log(PYRAMID_SCALE)
-    visible = (
-        (uvr[:, 0] >= 0)
-        & (uvr[:, 0] < camera.width)
-        & (uvr[:, 1] >= 0)
-        & (uvr[:, 1] < camera.height)
-        & (cosine > MIN_VIEW_COSINE)
-        & (octave > -1.5)
-        & (octave < PYRAMID_LEVELS + 0.5)
-    )
-    uvd = np.stack([uvr[:, 0], uvr[:, 1], uvr[:, 0] - uvr[:, 2]], axis=1)
-    visible[visible] = ~is_inside(excluded, uvr[visible, :2])
-    return Prediction(ids[visible], uvd[visible], octave[visible])
+    alike = (cosine > MIN_VIEW_COSINE) & (octave > -1.5) & (octave < PYRAMID_LEVELS + 0.5)
+    return Prediction(ids[alike], uvd[alike], octave[alike])
 
 
 class LocalMap:
