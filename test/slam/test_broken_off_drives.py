@@ -140,6 +140,21 @@ def test_what_is_mapped_elsewhere_merges_when_the_map_is_recognised(frames):
     assert len(slam.to_arrays()['keyframe_stamp_ns']) > len(known) + 3
 
 
+def test_the_farther_from_where_a_submap_began_the_less_is_known_of_the_place(frames):
+    slam, _ = broken_off(frames[:FRAMES])
+    mapped = []
+    for k in range(36):
+        pose = planar_pose(0.04 * FRAMES, -0.05 * k, 0.01 * FRAMES + 2.2)
+        if not slam.process(ROOM.frame(FRAMES + GAP + k, pose)):
+            mapped.append(slam.provisional)
+    began, end = mapped[0], mapped[-1]
+    way_m = np.linalg.norm((invert(began.T_odom_base) @ end.T_odom_base)[:3, 3])
+    assert way_m > 0.7
+    # As many radians are unsure as metres; the base is 0.4 m below the camera.
+    expected = sigma_m(began) * np.sqrt(1 + way_m**2 / (1 + 0.4**2))
+    assert sigma_m(end) == pytest.approx(expected, rel=0.1)
+
+
 def test_a_map_that_had_hardly_begun_stays(frames):
     slam, _ = broken_off(frames[:3])
     known = slam.to_arrays()['keyframe_stamp_ns']

@@ -17,6 +17,8 @@ UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
 BIAS = np.array([0.06, -0.04, 0.08])
 RATE_HZ = 200
 BESIDE = (0.2, 0.05, -0.3)
+FIRST = np.eye(4)
+"""The world is the first camera, and so is odom."""
 
 
 def pose(t, turns):
@@ -37,13 +39,14 @@ def imu_sample(t, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
     return ImuSample(round(t * 1e9), turn, lifted, beside[:3, 3])
 
 
-def driven(seconds, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0)):
+def driven(seconds, turns, bias=BIAS, place_m=(0.0, 0.0, 0.0), T_odom_world=FIRST):
     gyroscope = Gyroscope()
     gravity = Gravity(gyroscope)
     for k in range(round(seconds * RATE_HZ) + 1):
         gyroscope.add(imu_sample(k / RATE_HZ, turns, bias, place_m))
         if k % 20 == 0:
-            gravity.see(round(k / RATE_HZ * 1e9), pose(k / RATE_HZ, turns), np.eye(3))
+            T_odom_camera = T_odom_world @ pose(k / RATE_HZ, turns)
+            gravity.see(round(k / RATE_HZ * 1e9), T_odom_camera, T_odom_world[:3, :3].T)
     return gravity
 
 
@@ -82,3 +85,12 @@ def test_a_measurement_is_given_to_one_keyframe():
     up = gravity.up_camera(pose(6.0, False))
     assert degrees_between(up.direction, UP) < 1.0
     assert gravity.up_camera(pose(6.0, False)) is None
+
+
+def test_up_is_the_same_in_a_world_that_is_turned_from_odom():
+    R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    T_odom_world = make_transform(R, np.array([1.0, 2.0, -0.5]))
+    gravity = driven(6.0, turns=False, bias=np.zeros(3), T_odom_world=T_odom_world)
+    assert degrees_between(gravity.up_world.direction, UP) < 0.1
+    up = gravity.up_camera(T_odom_world @ pose(6.0, False))
+    assert degrees_between(up.direction, UP) < 1.0
