@@ -183,7 +183,8 @@ def in_view(camera: StereoCamera, points: Array) -> tuple[Array, NDArray[np.bool
     uvd[:, 2] = uvd[:, 0] - uvd[:, 2]
     uvd[~front] = np.nan
     uv = uvd[:, :2]
-    return uvd, ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=1)
+    inside = (uv >= 0) & (uv < (camera.width, camera.height))
+    return uvd, np.asarray(inside.all(axis=1))
 
 
 def residuals(camera: StereoCamera, points: Array, observations: Observations) -> Array:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hand_made_maps import CAMERA, SCENES, add, seen
 
-from segfloor_ros.geometry import make_transform
+from segfloor_ros.geometry import make_transform, se3_exp, transform_points
 from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 
@@ -62,3 +62,16 @@ def test_an_adjustment_retires_views_of_what_others_have_seen_as_well(scene):
     # Neither the first nor the latest three; three others must go on seeing each point.
     assert retired == [1, 2, 3, 4, 5]
     assert sparse_map.alive.all()
+
+
+def test_new_points_are_where_their_disparities_without_the_offset_have_them(scene):
+    points, offset_px = scene, 0.4
+    sparse_map = SparseMap(Rig(CAMERA))
+    sparse_map.rig.offset.estimate = OffsetEstimate(offset_px, 1e4)
+    keyframe = seen(points, 0, [NO_POINT] * len(points))
+    keyframe.observations.uvd_px[:, 2] += offset_px
+    # A camera that is neither at the origin nor level.
+    keyframe.T_camera_world = se3_exp(np.array([0.5, -0.2, 1.0, 0.2, -0.4, 0.1]))
+    LocalMapper(sparse_map).insert(keyframe, patches(points))
+    expected = transform_points(keyframe.T_world_camera, points)
+    np.testing.assert_allclose(sparse_map.xyz_world, expected, atol=1e-9)
