@@ -84,105 +84,60 @@ class InputFault:
         return f'{images} {self.finding}; {self.remedy}'
 
 
-def _rows_apart(rows_px: float) -> InputFault:
-    return InputFault(
-        'rows_apart',
-        round(rows_px, 2),
+FAULTS = {
+    'rows_apart': (
         'px',
-        f'are not rectified: the same points stand {rows_px:.1f} rows apart, which is taken off '
-        'the right image as far as an offset, a roll and another size explain it',
+        'are not rectified: the same points stand {value:.1f} rows apart, which is taken off the '
+        'right image as far as an offset, a roll and another size explain it',
         'give the raw images (image_raw) with the calibration of this camera, or calibrate again '
         '(segfloor calibrate)',
-    )
-
-
-def _eyes_swapped(share: float) -> InputFault:
-    return InputFault(
-        'eyes_swapped',
-        round(100 * share, 1),
+    ),
+    'eyes_swapped': (
         '%',
-        f'are exchanged: {share:.0%} of the disparities are negative',
+        'are exchanged: {value:.0f}% of the disparities are negative',
         'exchange the two, and their calibrations if these are exchanged, too',
-    )
-
-
-def _depth_unaligned(shift_px: float, scale: float) -> InputFault:
-    return InputFault(
-        'depth_unaligned',
-        round(shift_px, 1),
+    ),
+    'depth_unaligned': (
         'px',
-        f'are not aligned: the edges of depth lie {shift_px:.0f} px beside those of the image, '
-        f'which is {scale:.2f} times as large',
+        'are not aligned: the edges of depth lie {value:.0f} px beside those of the image, which '
+        'is {scale:.2f} times as large',
         'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
-    )
-
-
-def _not_simultaneous(
-    lag_s: float, frame_s: float, names: tuple[str, str] = ('right', 'left')
-) -> InputFault:
-    late, early = names if lag_s > 0 else names[::-1]
-    return InputFault(
-        'not_simultaneous',
-        round(1e3 * lag_s, 1),
+    ),
+    'not_simultaneous': (
         'ms',
-        f'are not taken at the same time: the {late} one lags {1e3 * abs(lag_s):.0f} ms '
-        f'({abs(lag_s) / frame_s:.1f} frames) behind the {early} one',
+        'are not taken at the same time: the {late} one lags {lag_ms:.0f} ms ({frames:.1f} frames) '
+        'behind the {early} one',
         'take both at once, and pair them by the time of exposure',
-    )
-
-
-def _wrong_focal(factor: float, camera: StereoCamera) -> InputFault:
-    length = 'long' if factor < 1 else 'short'
-    return InputFault(
-        'focal_length',
-        round(100 * (1 / factor - 1), 1),
+    ),
+    'focal_length': (
         '%',
-        f'have another focal length than their calibration: turns show {camera.fx * factor:.0f} '
-        f'px, {camera.fx:.0f} px is {abs(100 * (1 / factor - 1)):.0f} % too {length}',
+        'have another focal length than their calibration: turns show {seen_px:.0f} px, '
+        '{given_px:.0f} px is {value:+.0f} %',
         'take the calibration of this lens at this resolution, or calibrate again '
         '(segfloor calibrate)',
-    )
-
-
-def _blurred(edge_px: float) -> InputFault:
-    return InputFault(
-        'blurred',
-        round(edge_px, 1),
+    ),
+    'blurred': (
         'px',
-        f'are blurred: their sharpest edges are {edge_px:.1f} px wide',
+        'are blurred: their sharpest edges are {value:.1f} px wide',
         'focus and clean the lenses, expose for a shorter time, or take smaller images',
-    )
-
-
-def _dark(bright_grey: float) -> InputFault:
-    return InputFault(
-        'dark',
-        round(bright_grey),
+    ),
+    'dark': (
         'grey levels',
-        f'are too dark: all but a hundredth of them is below {bright_grey:.0f} of 255',
+        'are too dark: all but a hundredth of them is below {value:.0f} of 255',
         'expose for longer, raise the gain, or switch on a lamp',
-    )
-
-
-def _saturated(share: float) -> InputFault:
-    return InputFault(
-        'saturated',
-        round(100 * share),
+    ),
+    'saturated': (
         '%',
-        f'are overexposed: {share:.0%} of them is white',
+        'are overexposed: {value:.0f} % of them is white',
         'expose for a shorter time, or lower the gain',
-    )
-
-
-def _eyes_differ(ratio: float) -> InputFault:
-    return InputFault(
-        'eyes_differ',
-        round(ratio, 2),
+    ),
+    'eyes_differ': (
         'times',
-        f'are exposed differently: the same points are {ratio:.2f} times as bright in one of them',
+        'are exposed differently: the same points are {value:.2f} times as bright in one of them',
         'set exposure and gain of both to the same values, or let one control both',
-    )
-
+    ),
+}
+"""Of each fault its unit, what was found, and what to do."""
 
 MISFITS = {'rows_apart', 'eyes_swapped', 'not_simultaneous', 'eyes_differ'}
 """Eyes that do not fit bend the world as a wrong focal length does."""
@@ -247,6 +202,19 @@ class RigCheck:
         """Return fault, value, unit and remedy of all that was found, for summary.json."""
         names = 'fault', 'value', 'unit', 'remedy'
         return [{name: getattr(fault, name) for name in names} for fault in self.faults.values()]
+
+    def _found(self, fault: str, value: float, **figures: Any) -> None:
+        unit, finding, remedy = FAULTS[fault]
+        words = finding.format(value=value, **figures)
+        self.faults[fault] = InputFault(fault, round(value, 2), unit, words, remedy)
+
+    def _found_lag(self, lag_s: float, frame_s: float, late: str, early: str) -> None:
+        """Note that one kind of image is late, or early where the lag is negative."""
+        late, early = (late, early) if lag_s > 0 else (early, late)
+        lag_ms, frames = 1e3 * abs(lag_s), abs(lag_s) / frame_s
+        self._found(
+            'not_simultaneous', 1e3 * lag_s, lag_ms=lag_ms, frames=frames, late=late, early=early
+        )
 
     def _look(self, frame: StereoFrame, matches: Matches) -> Array:
         """Return (N, 7): where points are in the left image, by how much in the right one (column,
@@ -313,28 +281,29 @@ class RigCheck:
         bent_px = abs(rows) - SURE * sigma[0]
         bent_px += (np.hypot(roll, size) - SURE * sigma[1:].max()) * centre.min()
         rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), float(bent_px))
-        found = []
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag
             self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
-            found.append(_not_simultaneous(lag_s, self._frame_s))
+            self._found_lag(lag_s, self._frame_s, 'right', 'left')
         if negative > 0.5:
-            found.append(_eyes_swapped(negative))
+            self._found('eyes_swapped', 100 * negative)
         if rows_px > ROWS_PX and (lag_s or 'not_simultaneous' not in self.faults):
-            found.append(_rows_apart(rows_px))
+            self._found('rows_apart', rows_px)
             # Roll and size move the columns as well.
             M = np.array([[size, -roll], [roll, size]])
             self._mend = np.column_stack([np.eye(2) + M, (0, rows) - M @ centre])
+        if len(self._looks) < RECENT:
+            return
         ratio = float(np.exp(np.median(seen[:, 6])))
-        if ratio > EYES_RATIO and len(self._looks) == RECENT:
-            found.append(_eyes_differ(ratio))
-        self.faults.update({fault.fault: fault for fault in found})
-        factor = self._focal.factor() if len(self._looks) == RECENT else None
+        if ratio > EYES_RATIO:
+            self._found('eyes_differ', ratio)
+        factor, fx = self._focal.factor(), self._camera.fx
         if self.faults.keys() & MISFITS:
             self.faults.pop('focal_length', None)
         elif factor is not None:
-            self.faults['focal_length'] = _wrong_focal(factor, self._camera)
+            too_long = 100 / factor - 100
+            self._found('focal_length', too_long, seen_px=factor * fx, given_px=fx)
 
     def _judge_pictures(self) -> None:
         if len(self._pictures) < RECENT:
@@ -342,14 +311,12 @@ class RigCheck:
         pictures = np.array(self._pictures)
         edge_px, white_share = float(pictures[:, 0].min()), float(pictures[:, 2].min())
         bright_grey = float(pictures[:, 1].max())
-        found = []
         if bright_grey < DARK_GREY:
-            found.append(_dark(bright_grey))
+            self._found('dark', bright_grey)
         elif edge_px > EDGE_PX:
-            found.append(_blurred(edge_px))
+            self._found('blurred', edge_px)
         if white_share > WHITE_SHARE:
-            found.append(_saturated(white_share))
-        self.faults.update({fault.fault: fault for fault in found})
+            self._found('saturated', 100 * white_share)
 
     def _judge_depth(self, frame: StereoFrame) -> None:
         if self._before is None:
@@ -361,10 +328,9 @@ class RigCheck:
             return
         frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
         if misfit.lag and misfit.scale == 1.0:
-            fault = _not_simultaneous(misfit.lag * frame_s, frame_s, ('depth', 'colour'))
+            self._found_lag(misfit.lag * frame_s, frame_s, 'depth', 'colour')
         else:
-            fault = _depth_unaligned(misfit.shift_px, misfit.scale)
-        self.faults[fault.fault] = fault
+            self._found('depth_unaligned', misfit.shift_px, scale=misfit.scale)
 
     def _lag_s(self, seen: Array) -> float:
         """Return by how much the right images are late, in seconds, by points (N, 7); 0 where that
