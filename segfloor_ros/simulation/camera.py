@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.calibration.parameters import EyeCalibration
+from segfloor_ros.camera.calibration.parameters import FISHEYE_RESOLUTION, EyeCalibration
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
@@ -64,9 +64,12 @@ def raw_cameras(rig: CameraRig, seed: int) -> tuple[EyeCalibration, EyeCalibrati
         axis = rng.normal(size=3)
         turn = axis / np.linalg.norm(axis) * np.radians(rig.misalignment_deg)
         K = camera.K + np.array([[0, 0, offset[0]], [0, 0, offset[1]], [0, 0, 0]])
-        D = np.array([*rig.distortion, *[0.0] * 5])[:5]
+        if rig.fisheye:
+            K[:2, :2] /= FISHEYE_RESOLUTION
+        D = np.array([*rig.distortion, *[0.0] * 5])[: 4 if rig.fisheye else 5]
         R = Rotation.from_rotvec(turn).as_matrix()
-        sides.append(EyeCalibration(rig.width, rig.height, K, D, R, P))
+        model = 'equidistant' if rig.fisheye else 'plumb_bob'
+        sides.append(EyeCalibration(rig.width, rig.height, K, D, R, P, model))
     return sides[0], sides[1]
 
 
@@ -100,7 +103,13 @@ def _rays(side: EyeCalibration, width: int, height: int) -> Array:
     """Return x/z and y/z (H, W, 2), in the rectified frame, of every pixel of a raw camera."""
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     x, y = (u - side.K[0, 2]) / side.K[0, 0], (v - side.K[1, 2]) / side.K[1, 1]
-    rays = np.stack([*undistort(x, y, side.D), np.ones_like(x)], axis=-1) @ side.R.T
+    if side.distortion_model == 'equidistant':
+        distorted = np.stack([x.ravel(), y.ravel()], axis=-1)[None]
+        ideal = cv2.fisheye.undistortPoints(distorted, np.eye(3), side.D)
+        x, y = ideal.reshape(height, width, 2).transpose(2, 0, 1)
+    else:
+        x, y = undistort(x, y, side.D)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ side.R.T
     return rays[..., :2] / rays[..., 2:]
 
 

@@ -148,8 +148,9 @@ class Vibration:
 class CameraRig:
     """The stereo camera. Position and angles are of the left camera on the base; pitch looks
     down, roll to the right. fov_x_deg: of the rectified image. distortion: k1 k2 p1 p2 k3 of the
-    raw images; with it, or with misalignment_deg (rotation of either raw camera against the
-    rectified pair), the images are written unrectified. covered: when something hides the lenses,
+    raw images, or k1 k2 k3 k4 of a fisheye (equidistant); with one of them, or with
+    misalignment_deg (rotation of either raw camera against the rectified pair), the images are
+    written unrectified. covered: when something hides the lenses,
     pairs of start and end in seconds.
 
     What follows in the list is what a real camera does to its images; `kind` in a scene file, or
@@ -176,6 +177,7 @@ class CameraRig:
     roll_deg: float = 0.0
     rate_hz: float = 10.0
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False
     misalignment_deg: float = 0.0
     covered: tuple[Point, ...] = ()
     vibration: Vibration = field(default_factory=Vibration)
@@ -198,7 +200,7 @@ class CameraRig:
     @property
     def rectified(self) -> bool:
         """Whether the images come out of the camera rectified."""
-        return not any(self.distortion) and self.misalignment_deg == 0.0
+        return not (self.fisheye or any(self.distortion) or self.misalignment_deg)
 
 
 @dataclass(frozen=True)

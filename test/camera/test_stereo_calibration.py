@@ -205,6 +205,12 @@ def test_the_view_of_a_fisheye_keeps_its_share_of_the_resolution_in_the_middle()
         assert size_px[0] / size_px[1] == pytest.approx(0.7, abs=0.02)
 
 
+def test_a_fisheye_is_rectified_whatever_its_coefficients() -> None:
+    eye = dataclasses.replace(raw_eye('equidistant'), D=np.zeros(4))
+    assert not eye.is_rectified
+    assert dataclasses.replace(eye, distortion_model='plumb_bob').is_rectified
+
+
 def test_coefficients_that_a_driver_fills_up_with_zeros_are_taken() -> None:
     eye = dataclasses.replace(raw_eye('equidistant'), D=[0.1, 0.02, 0.0, 0.0, 0.0])
     np.testing.assert_array_equal(eye.D, [0.1, 0.02, 0.0, 0.0])

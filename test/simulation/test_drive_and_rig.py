@@ -84,18 +84,20 @@ def test_raw_cameras_rectify_to_the_ideal_pair():
         assert np.degrees(np.arccos((np.trace(side.R) - 1) / 2)) == pytest.approx(0.8)
 
 
-def test_raw_picture_shows_what_the_ideal_one_shows():
+@pytest.mark.parametrize('fisheye', [False, True])
+def test_raw_picture_shows_what_the_ideal_one_shows(fisheye):
+    lens = {'distortion': (0.02, -0.005, 0.003, -0.001) if fisheye else DISTORTION}
     scene = Scene('', Route(((0, 0), (1, 0))), camera=CameraRig(
-        width=160, height=120, distortion=DISTORTION, misalignment_deg=0.8, noise_sigma=0.0
+        width=160, height=120, misalignment_deg=0.8, noise_sigma=0.0, fisheye=fisheye, **lens
     ))  # fmt: skip
     plan = plan_imaging(scene)
     # A picture whose brightness tells the position: bilinear in the ideal picture's column.
     ideal = np.tile(np.linspace(20, 220, plan.width, dtype=np.float32), (plan.height, 1))
     camera, side = rectified_camera(scene.camera), plan.raw[0]
     raw = develop(ideal, plan, scene, 0, 0, 0.0)
-    maps = cv2.initUndistortRectifyMap(
-        side.K, side.D, side.R, side.P[:, :3], (160, 120), cv2.CV_32FC1
-    )
+    assert side.distortion_model == ('equidistant' if fisheye else 'plumb_bob')
+    straight = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    maps = straight(side.K, side.D, side.R, side.P[:, :3], (160, 120), cv2.CV_32FC1)
     rectified = cv2.remap(raw, maps[0], maps[1], cv2.INTER_LINEAR, borderValue=0)
     column = (np.arange(160) - camera.cx) + (plan.width - 1) / 2
     expected = 20 + 200 * column / (plan.width - 1)

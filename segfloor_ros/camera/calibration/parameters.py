@@ -78,10 +78,15 @@ class EyeCalibration:
         return cls(width, height, matrix[:, :3], np.zeros(5), np.eye(3), matrix, origin=origin)
 
     @property
+    def is_straight(self) -> bool:
+        """Whether the lens is a pinhole: a fisheye is none, whatever its coefficients."""
+        return self.distortion_model != 'equidistant' and not self.D.any()
+
+    @property
     def is_rectified(self) -> bool:
         """Whether the raw image is the rectified one."""
         return (
-            not self.D.any()
+            self.is_straight
             and np.array_equal(self.R, np.eye(3))
             and bool(np.abs(self.K - self.P[:, :3]).max() < SAME_PX)
         )

@@ -87,7 +87,7 @@ def inspect_recording(
         duration_s=1e-9 * (stamps[-1] - stamps[0]) if stamps else 0.0,
         rate_hz=source.rate_hz,
         image=f'{camera.width}x{camera.height}',
-        distortion=eye.distortion_model if eye.D.any() else 'none',
+        distortion='none' if eye.is_straight else eye.distortion_model,
         is_rectified=source.calibration.is_rectified,
         baseline_m=None if source.takes_depth else camera.baseline_m,
         focal_px=camera.fx,
