@@ -118,6 +118,21 @@ def test_a_deactivated_node_keeps_its_map_and_a_cleaned_up_one_does_not(make_gra
         np.testing.assert_array_equal(confidence, expected)
 
 
+def test_a_node_that_was_cleaned_up_in_a_pause_does_not_begin_paused(make_graph) -> None:
+    graph = make_graph(*MANAGED)
+    labelled = graph.collect('labelled_points')
+    graph.add(CloudLabellingNode())
+    begin = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE
+    end = Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP
+    for transition in begin:
+        assert change(graph, 'cloud_labelling', transition)
+    assert graph.call(SetBool, 'cloud_labelling/pause', SetBool.Request(data=True)).success
+    for transition in (*end, *begin):
+        assert change(graph, 'cloud_labelling', transition)
+    publish(graph, cloud_messages(STAMP_NS))
+    graph.until(lambda: labelled, 'the first keyframe')
+
+
 def test_the_latched_map_is_there_until_cleanup(make_graph) -> None:
     graph = make_graph()
     graph.add(OccupancyGridNode())

@@ -292,6 +292,16 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_fo
     assert not file.exists()
 
 
+def test_what_a_killed_node_leaves_does_not_reach_the_next_graph(monkeypatch) -> None:
+    for _ in range(2):
+        with fresh_graph():
+            # A later graph may well have the domain of an earlier one.
+            monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
+            kept = KeptState('/occupancy_grid', 30.0)
+            assert kept_value(kept) is None
+            keep(kept)
+
+
 def test_what_was_noted_last_comes_with_the_map_and_tells_its_age(own_folder) -> None:
     kept = KeptState('/robot/noting', 30.0)
     keep(kept)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from node_messages import (
     pose_message_at,
     publish,
 )
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
@@ -344,6 +346,27 @@ class TestFreeScan:
         assert to_ns(scans[0].header.stamp) == frame.stamp_ns
         ahead = scans[0].ranges[np.argmin(np.abs(expected.bearings_rad))]
         assert ahead > 3.0, 'the room is open ahead'
+
+    def test_it_follows_the_parameters_as_they_are_now(self, make_graph) -> None:
+        (frame, *_), _ = room_drive(1)
+        graph = make_graph()
+        node, scans = graph.add(FloorSegmentationNode()), graph.collect('scan')
+        mount = transform_message(0, 'base_link', 'left', MOUNT.T_base_left)
+        publishers = publish(graph, {'camera_mount': mount})
+        graph.until(lambda: node.mount is not None, 'the mount')
+        expected = []
+        for count, step_height_m in enumerate((0.03, 0.2), 1):
+            parameter = Parameter('step_height_m', value=step_height_m)
+            assert node.set_parameters([parameter])[0].successful
+            later = replace(frame, stamp_ns=frame.stamp_ns + count)
+            publish(graph, self.frame_messages(later), publishers)
+            graph.until(lambda count=count: len(scans) == count, 'the scan')
+            settings = FloorSegmentationSettings(step_height_m=step_height_m)
+            floor = FloorSegmentation(CAMERA, settings).process(frame.left, frame.right, MOUNT)
+            expected.append(free_ranges(floor.scan))
+        assert (expected[0] != expected[1]).any()
+        for message, ranges in zip(scans, expected, strict=True):
+            np.testing.assert_array_equal(np.array(message.ranges), ranges)
 
     def test_slam_sends_every_tracked_frame_to_whoever_listens(self, make_graph) -> None:
         frames, _ = room_drive(4)

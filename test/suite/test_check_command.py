@@ -11,14 +11,18 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import psutil
 import pytest
+import yaml
 from command_line import segfloor
 from junitparser import JUnitXml
+from stereo_room import ROOM_MAX, ROOM_MIN
 
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, save_map
 from segfloor_ros.suite.description import RESULTS, Entry
 from segfloor_ros.suite.job import Job, do_job
-from segfloor_ros.suite.result_files import digest_of
+from segfloor_ros.suite.result_files import digest_of, unpack
 
 SAME = ('map.pgm', 'map.yaml', 'trajectory.txt', 'labelled_cloud.ply', 'floor_masks')
 SUITE = """
@@ -134,6 +138,33 @@ def test_what_decides_the_result_is_in_its_key(room, tmp_path):
     assert len(set(keys)) == 4
     assert elsewhere.content_digest([room]) == keys[0]
     assert elsewhere.digest() != job.digest()
+
+
+def truth_of_room(folder: Path) -> Path:
+    """The true map of the room, turned by a quarter: the drive starts at (14, 11)."""
+    (low_x, low_y, _), (high_x, high_y, _) = ROOM_MIN, ROOM_MAX
+    cells = np.full((round(20 * (high_x - low_x)), round(20 * (high_y - low_y))), FREE, np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = OCCUPIED
+    folder.mkdir()
+    save_map(OccupancyGrid(cells, 0.05, (14.0 - high_y, 11.0 + low_x)), folder / 'map.yaml')
+    start_pose = [14.0, 11.0, float(np.pi / 2)]
+    facts = {'start_pose_world': start_pose, 'fov_x_deg': 90.0}
+    (folder / 'scene.yaml').write_text(yaml.safe_dump(facts))
+    return folder
+
+
+def test_a_map_is_measured_where_its_drive_starts(room, tmp_path):
+    truth = truth_of_room(tmp_path / 'truth')
+    outcome = do_job(job_of(room, tmp_path, truth=str(truth)))
+    assert outcome.problem == ''
+    assert outcome.start_pose == pytest.approx((14.0, 11.0, np.pi / 2))
+    assert outcome.measured['free_precision_percent'] > 99
+    # What continues a map has its frame, wherever it starts itself.
+    unpack(outcome.archive, tmp_path / 'run')
+    entry = Entry('second', str(tmp_path / 'run'), RESULTS, truth=str(truth / 'map.yaml'))
+    job = Job(entry, '', str(tmp_path / 'cache'), reuse=False)
+    assert do_job(job, outcome).measured['free_precision_percent'] > 99
+    assert do_job(job).measured['free_precision_percent'] < 10
 
 
 def programs() -> list[psutil.Process]:
