@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from types import FrameType
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
@@ -38,6 +42,23 @@ def limit_blas_threads() -> None:
     """
     for variable in VARIABLES:
         os.environ.setdefault(variable, '1')
+
+
+def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
+    """Start `work(pipe, *arguments)` in a new process; returns the other end of the pipe, and the
+    process. Spawned: a fork would copy the locks of the threads of OpenCV and BLAS.
+    """
+    context = multiprocessing.get_context('spawn')
+    pipe, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=work, args=(theirs, *arguments))
+    process.start()
+    theirs.close()
+    return pipe, process
+
+
+def how_it_ended(status: int) -> str:
+    """Return the exit status of a process in words, e.g. `signal SIGKILL`."""
+    return f'status {status}' if status >= 0 else f'signal {signal.Signals(-status).name}'
 
 
 class Interrupt(threading.Event):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import HISTORY_NS, FrameTree, make_transform
+from segfloor_ros.geometry import HISTORY_NS, FrameTree, between, make_transform, rotation_angle
 
 S = 1_000_000_000
 
@@ -46,6 +46,18 @@ def test_between_two_times_position_and_turn_are_interpolated() -> None:
     np.testing.assert_allclose(tree.lookup('odom', 'base'), at(4.0, 2.0, 0.8))
     assert tree.lookup('odom', 'base', 9 * S) is None
     assert tree.lookup('odom', 'base', 13 * S) is None
+
+
+def test_a_frame_turns_about_an_axis_of_its_own_between_two_poses() -> None:
+    T_a, T_b = (
+        make_transform(Rotation.from_rotvec(turn).as_matrix(), np.array(at_m))
+        for turn, at_m in (((0.0, 0.5, 1.2), (1.0, 0.0, 0.0)), ((0.9, 0.0, -0.4), (3.0, 2.0, 1.0)))
+    )
+    np.testing.assert_allclose(between(T_a, T_b, 1.0), T_b, atol=1e-12)
+    half = between(T_a, T_b, 0.5)
+    np.testing.assert_allclose(half[:3, 3], [2.0, 1.0, 0.5])
+    angles = [rotation_angle(T[:3, :3].T @ half[:3, :3]) for T in (T_a, T_b)]
+    assert angles == pytest.approx([rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]) / 2] * 2)
 
 
 def test_only_ten_seconds_are_kept_and_a_jump_back_begins_anew() -> None:

@@ -9,7 +9,6 @@ figures were measured, and so no stage waits for another one.
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
 import platform
 from collections import deque
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.pipeline import KeyframeStages, MapInput, make_slam
+from segfloor_ros.processes import how_it_ended, start_apart
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.timing import MemoryLog, ReferenceWorkload, StageTimes, spread_of
 
@@ -135,11 +135,7 @@ def run_apart(work: Callable[..., Any], *arguments: Any, on_progress: Progress) 
     work: a function of a module; its arguments and result are pickled. Its known errors are raised
     here. Raises SegfloorError when the process ends early.
     """
-    context = multiprocessing.get_context('spawn')
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(sender, work, arguments), daemon=True)
-    process.start()
-    sender.close()
+    receiver, process = start_apart(_serve, work, arguments)
     try:
         while True:
             kind, value = receiver.recv()
@@ -151,7 +147,7 @@ def run_apart(work: Callable[..., Any], *arguments: Any, on_progress: Progress) 
     except EOFError:
         process.join()
         raise SegfloorError(
-            f'a process of the benchmark ended early (status {process.exitcode}); '
+            f'a process of the benchmark ended early ({how_it_ended(process.exitcode or 0)}); '
             'if memory is short, choose smaller --sizes'
         ) from None
     finally:

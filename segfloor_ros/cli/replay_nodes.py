@@ -29,7 +29,7 @@ from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.topics import DIAGNOSTICS, GRID, NODES, PACED_BY, PATIENCE_S, TOPICS
-from segfloor_ros.processes import end_with_parent, interrupts_deferred
+from segfloor_ros.processes import end_with_parent, how_it_ended, interrupts_deferred
 from segfloor_ros.timing import rss_mb
 
 # DDSI-RTPS 2.3, 9.6.1.1: discovery ports start at 7400, 250 per domain. Above domain 101 they run
@@ -101,7 +101,9 @@ class NodeProcesses:
         for node, process in self._processes.items():
             status = process.poll()
             if status is not None:
-                raise ReplayError(f'node {node} died ({_cause(status)}){self._last_words(node)}')
+                raise ReplayError(
+                    f'node {node} died ({how_it_ended(status)}){self._last_words(node)}'
+                )
 
     @property
     def process_ids(self) -> dict[str, int]:
@@ -140,12 +142,6 @@ class NodeProcesses:
     def _last_words(self, node: str) -> str:
         lines = self._lines(node)
         return f': {_without_clock(lines[-1])}' if lines else ''
-
-
-def _cause(status: int) -> str:
-    if status < 0:
-        return f'signal {signal.Signals(-status).name}'
-    return f'status {status}'
 
 
 def _without_clock(line: str) -> str:

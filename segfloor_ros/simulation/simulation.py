@@ -87,8 +87,9 @@ class Simulation:
         width, height = self.imaging.width * supersampling, self.imaging.height * supersampling
         world = build_world(scene, max(width, self.camera.width), max(height, self.camera.height))
         self._renderer = WorldRenderer(scene, world)
-        self._pictures = self._renderer.view(width, height, self.imaging.focal_px * supersampling)
-        self._truth = self._renderer.view(self.camera.width, self.camera.height, self.camera.fx)
+        focal_px = self.imaging.focal_px * supersampling
+        self._pictures = View(self._renderer, width, height, focal_px)
+        self._truth = View(self._renderer, self.camera.width, self.camera.height, self.camera.fx)
 
     def __enter__(self) -> Simulation:
         return self
@@ -123,7 +124,8 @@ class Simulation:
         self._renderer.move(self.motion.T_world_left(time_s), time_s)
         depth_m = self._truth.depth_m(CAMERAS[0])
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
-        return FrameTruth(self._truth.floor_mask(CAMERAS[0]), depth_m, disparity_px)
+        floor = self._truth.mask(CAMERAS[0], self._renderer.floor_ids)
+        return FrameTruth(floor, depth_m, disparity_px)
 
     def wheels(self) -> WheelReadings | None:
         """Return what the wheels tell of the whole drive, where the scene has such."""
@@ -194,10 +196,6 @@ class WorldRenderer:
         }
         self.floor_ids = [self.model.geom(name).id for name in world.floor_geoms]
 
-    def view(self, width: int, height: int, focal_px: float) -> View:
-        """Return a view through cameras of this size and focal length. Close it when done."""
-        return View(self, width, height, focal_px)
-
     def move(self, T_world_left: Array, time_s: float) -> None:
         """Put the rig at a pose of the left optical frame, and what moves where it is at a time."""
         self._place(RIG, T_world_left[:3, 3], quaternion_xyzw(T_world_left[:3, :3]))
@@ -225,12 +223,11 @@ class WorldRenderer:
 
 class View:
     """Pictures through the rectified pinhole cameras of the rig. The optical axis meets the middle
-    of the picture, (width - 1) / 2 and (height - 1) / 2 in pixels.
+    of the picture, (width - 1) / 2 and (height - 1) / 2 in pixels. Close it when done.
     """
 
     def __init__(self, renderer: WorldRenderer, width: int, height: int, focal_px: float):
         self._model, self._data = renderer.model, renderer.data
-        self._floor_ids = renderer.floor_ids
         self._geom_type = int(renderer.mujoco.mjtObj.mjOBJ_GEOM)
         self._fov_y_deg = float(np.degrees(2 * np.arctan(height / 2 / focal_px)))
         self._renderer = _open_renderer(renderer.mujoco, self._model, width, height)
@@ -249,10 +246,6 @@ class View:
         depth_m = self._render(camera)
         self._renderer.disable_depth_rendering()
         return depth_m
-
-    def floor_mask(self, camera: str) -> NDArray[np.uint8]:
-        """Return the mask (H, W) uint8: 255 where the camera sees floor, 0 elsewhere."""
-        return self.mask(camera, self._floor_ids)
 
     def mask(self, camera: str, geoms: list[int]) -> NDArray[np.uint8]:
         """Return the mask (H, W) uint8: 255 where the camera sees one of the geoms, 0 elsewhere."""

@@ -66,16 +66,6 @@ def sides(prism: Prism, side_m: float) -> Mesh:
     return Mesh(vertices, normals, uv, faces)
 
 
-def caps(prism: Prism, side_m: float, top: bool = True, bottom: bool = True) -> Mesh:
-    """Return the top and the bottom of a prism."""
-    parts = []
-    if top:
-        parts.append(_cap(prism, prism.top_m, 1.0, side_m))
-    if bottom:
-        parts.append(_cap(prism, prism.bottom_m, -1.0, side_m))
-    return merge(parts)
-
-
 def _side_normals(prism: Prism, direction: Array) -> Array:
     """Return the normals (K, 2, 3) at the start and the end of each side."""
     flat = np.stack([direction[:, 1], -direction[:, 0], np.zeros(len(direction))], axis=1)
@@ -102,7 +92,9 @@ def _side_uv(
     return np.stack([u, -vertices[:, 2] / side_m], axis=1)
 
 
-def _cap(prism: Prism, heights_m: Array, up: float, side_m: float) -> Mesh:
+def cap(prism: Prism, up: int, side_m: float) -> Mesh:
+    """Return the top (up 1) or the bottom (up -1) of a prism."""
+    heights_m = prism.top_m if up > 0 else prism.bottom_m
     vertices = np.column_stack([prism.footprint, heights_m])
     normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])
     normal *= np.sign(normal[2]) * up / np.linalg.norm(normal)
@@ -148,10 +140,8 @@ class World:
             side_m = self.texture(prism.texture).side_m
             upright = parts.setdefault((prism.texture, False), [])
             upright.append(sides(prism, side_m))
-            upright.append(caps(prism, side_m, top=not prism.is_floor))
-            if prism.is_floor:
-                top = caps(prism, side_m, bottom=False)
-                parts.setdefault((prism.texture, True), []).append(top)
+            parts.setdefault((prism.texture, prism.is_floor), []).append(cap(prism, 1, side_m))
+            upright.append(cap(prism, -1, side_m))
         return [
             self._geom(f'{prefix}_{index}', texture, merge(meshes), is_floor)
             for index, ((texture, is_floor), meshes) in enumerate(parts.items())

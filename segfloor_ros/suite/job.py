@@ -14,7 +14,6 @@ import fcntl
 import functools
 import hashlib
 import logging
-import multiprocessing
 import os
 import signal
 import socket
@@ -31,7 +30,7 @@ from typing import Any
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError, SettingsError, without_credentials
 from segfloor_ros.files.results import scratch_folder
-from segfloor_ros.processes import end_with_parent
+from segfloor_ros.processes import end_with_parent, how_it_ended, start_apart
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import Outcome, measure_run, start_pose_of
 from segfloor_ros.suite.result_files import Cache, digest_of, local_copy, pack, unpack
@@ -71,8 +70,7 @@ def run_segfloor(words: list[str], log: Path, timeout_s: float) -> None:
     if status:
         lines = log.read_text(errors='replace').strip().splitlines()
         last = lines[-1].removeprefix('segfloor: ') if lines else ''
-        cause = f'status {status}' if status > 0 else f'signal {signal.Signals(-status).name}'
-        raise ProgramError(f'{last or "ended without a word"} ({cause})')
+        raise ProgramError(f'{last or "ended without a word"} ({how_it_ended(status)})')
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -261,7 +259,8 @@ def _local(processes: int, jobs: list[Job], kept: Mapping[str, Outcome]) -> Gene
                 ready = [job for job in waiting if job.entry.continue_from not in todo]
                 for job in ready[: processes - len(running)]:
                     waiting.remove(job)
-                    pipe, process = _start(job, done.get(job.entry.continue_from), Path(folder))
+                    origin = done.get(job.entry.continue_from)
+                    pipe, process = start_apart(_work, job, origin, Path(folder), os.getpid())
                     running[pipe] = job, process
                 finished = wait(list(running))
                 for pipe in [pipe for pipe in running if pipe in finished]:
@@ -275,23 +274,12 @@ def _local(processes: int, jobs: list[Job], kept: Mapping[str, Outcome]) -> Gene
                 process.join()
 
 
-def _start(job: Job, origin: Outcome | None, folder: Path) -> tuple[Connection, SpawnProcess]:
-    # Spawned: a fork would copy the locks of the threads of OpenCV and BLAS.
-    context = multiprocessing.get_context('spawn')
-    pipe, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(theirs, job, origin, folder, os.getpid()))
-    process.start()
-    theirs.close()
-    return pipe, process
-
-
 def _receive(pipe: Connection, job: Job, process: SpawnProcess) -> Outcome:
     try:
         outcome: Outcome = pipe.recv()
     except EOFError:
         process.join()
-        status = process.exitcode or 0
-        cause = f'signal {signal.Signals(-status).name}' if status < 0 else f'status {status}'
+        cause = how_it_ended(process.exitcode or 0)
         outcome = Outcome(job.entry.name, {}, f'its worker ended ({cause})')
     pipe.close()
     process.join()

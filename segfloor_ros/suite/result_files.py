@@ -154,7 +154,8 @@ def local_copy(path_or_url: str, folder: Path) -> Path:
             with scratch_folder(folder) as scratch:
                 (made := scratch / target.name).mkdir()
                 system.get(path.rstrip('/'), str(made / copy.name), recursive=True)
-                _move(made, target)
+                with contextlib.suppress(OSError):  # another process has been faster
+                    made.rename(target)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f'{path_or_url}: cannot be read ({error})') from None
     return copy
@@ -187,15 +188,6 @@ def _open_system(url: str) -> tuple[Any, str]:
         return url_to_fs(url)
     except (ImportError, OSError, ValueError) as error:
         raise InputError(f'{url}: cannot be read ({error})') from None
-
-
-def _move(staging: Path, target: Path) -> None:
-    """Move a folder to its place, unless another process has been faster."""
-    try:
-        staging.rename(target)
-    except OSError:
-        if not target.is_dir():
-            raise
 
 
 def _name(path_or_url: str) -> str:

@@ -14,6 +14,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.evaluation.report import write_report
+from segfloor_ros.files.saved_map import read_map_file
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.slam.results import StereoSlamSettings
 
@@ -338,6 +339,15 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     summary = json.loads((second / 'summary.json').read_text())
     assert summary['map_updates'] == 0
     assert summary['relocalisations'] == []
+    # The keyframes of a file are before those of the drive, for SLAM and for the grid.
+    grown = tmp_path / 'grown.map'
+    words = '--load-map', saved, '--save-map', grown
+    done = segfloor('run', recording, '--out', tmp_path / 'on', *words)
+    assert done.returncode == 0, done.stderr
+    parts = read_map_file(grown).parts
+    of_grid = set(parts['grid']['stamp_ns'].tolist())
+    assert min(of_grid) < 0
+    assert of_grid <= set(parts['slam']['keyframe_stamp_ns'].tolist())
     elsewhere = StereoRoom(seed=77)
     frames = [elsewhere.frame(i, planar_pose(0.06 * i, 0.0, 0.01 * i)) for i in range(FRAMES)]
     other, third, kept = tmp_path / 'other', tmp_path / 'third', saved.read_bytes()

@@ -162,6 +162,10 @@ def test_the_covariance_of_the_velocity_is_that_of_both_poses_in_the_moving_fram
     found = poses.twist_covariance(before, left, now, 2.0)
     # x of the frame points along y of the moving frame, with its sign turned; 2 s: a quarter.
     np.testing.assert_allclose(found, np.diag([1.0, 4, 0, 0, 0, 1]), atol=1e-12)
+    # An eighth of a turn: what is unsure along x of the frame is so ahead and to the right.
+    slanted = make_transform(Rotation.from_euler('z', 45, degrees=True).as_matrix(), np.zeros(3))
+    ahead = poses.twist_covariance(np.zeros((6, 6)), slanted, np.diag([4.0, 0, 0, 0, 0, 0]), 1.0)
+    np.testing.assert_allclose(ahead[:2, :2], [[2.0, -2.0], [-2.0, 2.0]], atol=1e-12)
     message = poses.odometry_message(0, 'odom', 'base_link', left, now, np.ones(6), found)
     np.testing.assert_allclose(over_the_wire(message).twist.covariance.reshape(6, 6), found)
 

@@ -33,7 +33,7 @@ PLACES = 80
 """More than are driven past: a place that is seen again makes no keyframe."""
 STEP_M = 0.05
 FRAME_NS = 100_000_000
-RECEIVED = ('map', 'labelled_points', 'odometry', 'keyframe/path')
+RECEIVED = ('map', 'labelled_points', 'odometry', 'pose', 'keyframe/path')
 REJOIN_S = 60.0
 
 
@@ -231,6 +231,11 @@ def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(jou
         places.setdefault(stamp_of(message), place_of(message))
     steps_m = np.linalg.norm(np.diff(list(places.values()), axis=0), axis=1)
     assert steps_m.max() < 3 * STEP_M
+    # In the map the robot is where it is.
+    stamp_ns = stamp_of(journey.latest('odometry'))
+    place = place_of(journey.wait_for('pose', stamp_ns))
+    assert np.linalg.norm(place - journey.truth(stamp_ns)[:3, 3]) < 0.03
+    assert journey.odometry_error_m() > 0.1
     known, known_after = known_cells(grid), known_cells(grid_after)
     assert len(known & known_after.keys()) >= 0.98 * len(known)
 

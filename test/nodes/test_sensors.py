@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, depth_of_room
@@ -180,6 +181,21 @@ def test_an_imu_is_turned_by_tf_or_by_gravity_or_not_used(sensors) -> None:
     assert sensors.take(0) == []
     sensors.receive('imu', imu(4, '', (0.0, -9.81, 0.0)))
     assert [m.stamp_ns for m in sensors.take(0)] == [4]
+
+
+def test_an_imu_is_in_the_axes_of_the_rectified_camera(sensors) -> None:
+    R_rectified_left = Rotation.from_rotvec((0.1, -0.2, 0.3)).as_matrix()
+    for frame, accel_left, place_left in (
+        ('imu_link', [0, -9.81, 0], [0.0, 0.1, -0.3]),
+        ('elsewhere', [0, -9.81, 0], [0.0, 0.0, 0.0]),
+    ):
+        sensors.reset()
+        sensors.begin('left', R_rectified_left)
+        accel = (0.0, 0.0, 9.81) if frame == 'imu_link' else (0.0, -9.81, 0.0)
+        sensors.receive('imu', imu(1, frame, accel))
+        (sample,) = sensors.take(0)
+        np.testing.assert_allclose(sample.accel_m_s2, R_rectified_left @ accel_left)
+        np.testing.assert_allclose(sample.place_m, R_rectified_left @ place_left, atol=1e-12)
 
 
 def test_each_image_takes_what_was_measured_up_to_it_and_one_more(sensors) -> None:

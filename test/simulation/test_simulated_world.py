@@ -28,7 +28,7 @@ from segfloor_ros.simulation.solids import (
     true_map,
 )
 from segfloor_ros.simulation.textures import GENERATORS, make_texture
-from segfloor_ros.simulation.world import caps, merge, sides
+from segfloor_ros.simulation.world import cap, merge, sides
 
 PATH = {'waypoints': [[0.5, 0.5], [1.5, 0.5]]}
 ROOM = [[0, 0], [4, 0], [4, 3], [0, 3]]
@@ -133,14 +133,14 @@ def enclosed_volume(mesh):
 
 def test_meshes_are_closed_and_face_outwards():
     box = block((3.0, -2.0), (2.0, 1.0, 0.5), 'wood', yaw_deg=30, bottom_m=0.2)
-    mesh = merge([sides(box, 1.0), caps(box, 1.0)])
+    mesh = merge([sides(box, 1.0), cap(box, 1, 1.0), cap(box, -1, 1.0)])
     assert enclosed_volume(mesh) == pytest.approx(1.0)
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     geometric = np.cross(b - a, c - a)
     geometric /= np.linalg.norm(geometric, axis=1, keepdims=True)
     np.testing.assert_allclose(mesh.normals[mesh.faces[:, 0]], geometric, atol=1e-9)
     tube = cylinder((1.0, 1.0), 0.5, 2.0, 'metal')
-    mesh = merge([sides(tube, 1.0), caps(tube, 1.0)])
+    mesh = merge([sides(tube, 1.0), cap(tube, 1, 1.0), cap(tube, -1, 1.0)])
     polygon = 32 / 2 * 0.25 * np.sin(2 * np.pi / 32)
     assert enclosed_volume(mesh) == pytest.approx(2.0 * polygon)
     radial = mesh.vertices[: 4 * 32, :2] - 1.0
