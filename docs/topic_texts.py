@@ -23,6 +23,11 @@ ABOUT = {
         'About where base_link is in map, as RViz publishes it: the camera is looked for there.'
     ),
     'pose': 'Every tracked frame: base_link in map. Published while someone listens.',
+    'odometry/corrected': (
+        'What came on odometry before the mount of the camera was known, or the map was found '
+        'again: the same frames, corrected once. For who records.'
+    ),
+    'pose/corrected': 'So for pose.',
     'dynamic_mask': (
         'mono8, 255 where something moves, of the left image that stereo_slam receives, with its '
         'stamp; from a segmentation network. Used when there, never waited for.'

@@ -168,3 +168,17 @@ def ramp(start_m, slope_rad, length_m=3.0, half_width_m=4.0, **kwargs) -> Patch:
     return Patch(
         (start_m, -half_width_m, 0), along, (0, 2 * half_width_m, 0), True, **{'seed': 5, **kwargs}
     )
+
+
+def blank_floored(mount: Mount, *things: Patch) -> Scene:
+    """Return a scene whose floor has no texture, with three walls that have, and things."""
+    left = Patch((-1, 1.5, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=3)
+    right = Patch((-1, -1.3, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=4)
+    patches = [
+        floor_patch(grey=175.0, contrast=0.0),
+        left,
+        right,
+        wall(3.0, contrast=45.0),
+        *things,
+    ]
+    return Scene(patches, mount=mount, noise_grey=1.0)

@@ -45,9 +45,9 @@ class StereoRoom:
             to_face = (np.array(bound, np.float32) - origin[:, None]) / directions
         axis, distance = to_face.argmin(axis=0), to_face.min(axis=0)
         is_upper = np.take_along_axis(directions, axis[None], 0)[0] > 0
-        image = np.zeros(len(axis), np.float32)
+        image, seen = np.zeros(len(axis), np.float32), 2 * axis + is_upper
         for face in range(6):
-            at = np.flatnonzero(2 * axis + is_upper == face)
+            at = np.flatnonzero(seen == face)
             across = [k for k in range(3) if k != face // 2]
             s, t = (
                 (origin[k] - ROOM_MIN[k] + directions[k, at] * distance[at]) * TEXELS_PER_M

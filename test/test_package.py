@@ -288,3 +288,11 @@ def _environment() -> dict[str, str]:
     environment['PATH'] = os.pathsep.join([_scripts(), environment['PATH']])
     environment.pop('PYTHONPATH', None)
     return environment
+
+
+def test_the_command_starts_without_libraries_that_few_of_its_parts_need() -> None:
+    """Each takes a part of a second, in every process of a suite, too."""
+    heavy = {'matplotlib', 'evo', 'mujoco', 'distributed', 'rerun'}
+    words = f'import sys, segfloor_ros.cli.main; print(sorted({heavy} & sys.modules.keys()))'
+    found = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
+    assert found.stdout.strip() == '[]', found.stderr

@@ -32,6 +32,7 @@ from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.messages.topics import (
     CAMERA,
     CLOUD,
+    CORRECTED,
     DIAGNOSTICS,
     FLOOR,
     GRID,
@@ -55,7 +56,7 @@ SPIN_S = 0.1
 POSES = ('odometry', 'pose')
 MASK, POINTS, KEYFRAME = 'keyframe/floor_mask', 'map_points', 'keyframe/odometry'
 MOUNT, LABELLED = 'camera_mount', 'labelled_points'
-OF_PATH = (*POSES, MOUNT, 'keyframe/path')
+OF_PATH = (*POSES, *(name + CORRECTED for name in POSES), MOUNT, 'keyframe/path')
 OF_MAP = (*OF_PATH, MASK, LABELLED, 'map')
 """What a replay records: of a path alone, and of a map."""
 
@@ -255,7 +256,10 @@ class ReplayRecorder(Node):
         self.latest[name] = message
         self.arrived_s[name].setdefault(stamp_ns, time.monotonic())
         if name in POSES:
-            self._poses[name][stamp_ns] = pose_array(message.pose.pose)
+            self._poses[name].setdefault(stamp_ns, pose_array(message.pose.pose))
+        elif name.endswith(CORRECTED):
+            pose = pose_array(message.pose.pose)
+            self._poses[name.removesuffix(CORRECTED)][stamp_ns] = pose
         elif name == MASK and self._on_mask is not None:
             self._masks[stamp_ns] = grey8_image(message, MASK)
             self._hand_on_masks()

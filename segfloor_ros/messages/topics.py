@@ -55,6 +55,10 @@ MOVING_MASK = 'keyframe/moving_mask'
 MAP_START = 'keyframe/map_start'
 MAP_LOADED, MAP_WANTED, MAP_PART = 'map_file/loaded', 'map_file/wanted', 'map_file/part'
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
+CORRECTED = '/corrected'
+"""Ends the names of the topics on which poses come again that were provisional: the stamps of
+`odometry` and `pose` grow."""
+
 PACED_BY = (FRAME_DONE, 'keyframe/odometry', KEYFRAME_DONE)
 """Topics that a lossless camera listens to: how far frames and keyframes are."""
 
@@ -168,6 +172,8 @@ _ALL = [
     Topic('odometry', Odometry, KEYFRAMES, SLAM, is_optional=True, on_demand_by=(CLOUD,)),
     Topic('initialpose', PoseWithCovarianceStamped, KEYFRAMES, OTHERS, (SLAM,), is_optional=True),
     Topic('pose', PoseWithCovarianceStamped, KEYFRAMES, SLAM),
+    Topic('odometry' + CORRECTED, Odometry, KEYFRAMES, SLAM),
+    Topic('pose' + CORRECTED, PoseWithCovarianceStamped, KEYFRAMES, SLAM),
     Topic(
         'dynamic_mask',
         Image,

@@ -31,6 +31,7 @@ from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
 from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.maps import map_file_message, map_file_of, map_start_message
 from segfloor_ros.messages.topics import (
+    CORRECTED,
     FRAME_PARTS,
     KEYFRAME_PARTS,
     MAP_LOADED,
@@ -81,6 +82,8 @@ class SlamTopics:
         self.map_start_ns = map_start_ns + (map_start_ns == self.map_start_ns)
         self._is_loaded = is_loaded
         self._last: FrameResult | None = None
+        self.newest_ns = -1
+        """Stamp of the newest pose."""
         self._path_messages = poses.PathMessages(self._own.map_frame)
         self.frames = CameraFrames('', '')
 
@@ -97,7 +100,8 @@ class SlamTopics:
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
         if result.tracked:
-            self._publish_odometry(result)
+            self._publish_odometry(result, '' if result.stamp_ns > self.newest_ns else CORRECTED)
+            self.newest_ns = max(result.stamp_ns, self.newest_ns)
         if result.moving is not None:
             frame_id = self._own.map_frame
             message = clouds.moving_points_message(result.stamp_ns, frame_id, result.moving)
@@ -132,7 +136,7 @@ class SlamTopics:
             self._out.publish(info, camera_info_message(*at, getattr(calibration, side)))
             self._out.publish(name, image_message(*at, image))
 
-    def _publish_odometry(self, result: FrameResult) -> None:
+    def _publish_odometry(self, result: FrameResult, suffix: str) -> None:
         last, twist, of_twist = self._last, None, None
         covariance = poses.never_certain(result.covariance)
         if last is not None and last.tracked and result.stamp_ns > last.stamp_ns:
@@ -141,16 +145,16 @@ class SlamTopics:
             before = poses.never_certain(last.covariance)
             of_twist = poses.twist_covariance(before, result.T_odom_base, covariance, duration_s)
         own = self._own
-        if self._out.listeners('pose'):
+        if self._out.listeners('pose' + suffix):
             T_map_base = result.T_map_odom @ result.T_odom_base
             at = result.stamp_ns, own.map_frame
             message = poses.pose_with_covariance_message(*at, T_map_base, covariance)
-            self._out.publish('pose', message)
+            self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
         odometry = poses.odometry_message(
             *at, own.base_frame, T_odom_base, covariance, twist, of_twist
         )
-        self._out.publish('odometry', odometry)
+        self._out.publish('odometry' + suffix, odometry)
 
     def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
         own, out = self._own, self._out
@@ -185,7 +189,6 @@ class SlamResults:
         """Publish about another map from now on, of a camera whose mount is not known."""
         self.topics.reset(map_start_ns, is_loaded)
         self._unsent.clear()
-        self._provisional_ns = -1
         self._lost_since_ns: int | None = None
         self.mount: Mount | None = None
 
@@ -197,13 +200,11 @@ class SlamResults:
 
     def report_held(self, stamp_ns: int, slam: StereoSlam) -> None:
         """Report why no result is ready. While the mount is being measured, and by a drive that was
-        broken off, the newest pose is published: it is corrected once, when keyframes come.
+        broken off, the newest pose is published: it comes corrected once, when keyframes come.
         """
         result, reporter = slam.provisional, self._node.reporter
         if result is not None:
-            self._provisional_ns = stamp_ns
-            self._transforms.broadcast(result)
-            self.topics.publish(result)
+            self._send(result)
         if slam.back_end.submap is Submap.LOST:
             lost = self._lost_time(stamp_ns, tracked=False)
             reporter.report(stamp_ns, Level.ERROR, MAPPING_SUBMAP, tracked=0, submap=1, **lost)
@@ -220,10 +221,7 @@ class SlamResults:
     def _publish(self, result: FrameResult, slam: StereoSlam, milliseconds: float) -> None:
         if self.mount is None and result.tracked and slam.mount is not None:
             self._announce_mount(result.stamp_ns, slam.mount)
-        # What a robot steers by comes first, the images of a keyframe later.
-        if result.stamp_ns > self._provisional_ns:
-            self._transforms.broadcast(result)
-        self.topics.publish(result)
+        self._send(result)
         level = Level.WARN if result.blind else Level.OK if result.tracked else Level.ERROR
         self._node.reporter.report_processed(
             result.stamp_ns,
@@ -243,6 +241,12 @@ class SlamResults:
             input_faults=_faults_json(slam),
             remarks=REMARKS_APART.join(slam.sensors.remarks.values()),
         )
+
+    def _send(self, result: FrameResult) -> None:
+        # What a robot steers by comes first, the images of a keyframe later.
+        if result.stamp_ns > self.topics.newest_ns:
+            self._transforms.broadcast(result)
+        self.topics.publish(result)
 
     def _lost_time(self, stamp_ns: int, tracked: bool) -> dict[str, str]:
         """Return values for the status of a frame: for how long tracking has been lost, or, where

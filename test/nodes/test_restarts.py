@@ -224,12 +224,10 @@ def test_a_slam_that_sees_nothing_when_it_goes_on_holds_its_pose_and_the_map(jou
     truth = journey.truth(path.stamp_ns[-1])
     assert np.linalg.norm(path.T_map_base[-1][:3, 3] - truth[:3, 3]) < 0.03
     # `odom` is continuous: it goes on from where it was held, frame by frame, however far the robot
-    # is from there; what was not seen is now between it and the map. Poses that were provisional
-    # come a second time.
-    places = {stamp_of(held): place_of(held)}
-    for message in journey.received('odometry')[begun:]:
-        places.setdefault(stamp_of(message), place_of(message))
-    steps_m = np.linalg.norm(np.diff(list(places.values()), axis=0), axis=1)
+    # is from there; what was not seen is now between it and the map.
+    since = [held, *journey.received('odometry')[begun:]]
+    assert (np.diff([stamp_of(message) for message in since]) > 0).all()
+    steps_m = np.linalg.norm(np.diff([place_of(m) for m in since], axis=0), axis=1)
     assert steps_m.max() < 3 * STEP_M
     # In the map the robot is where it is.
     stamp_ns = stamp_of(journey.latest('odometry'))

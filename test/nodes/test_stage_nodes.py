@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from floor_scenes import SMALL_CAMERA, blank_floored, box
 from node_messages import (
     FEATURES,
     LABELLED,
@@ -176,6 +177,41 @@ class TestStereoSlam:
         assert (np.diff(cloud.point_id) > 0).all()
         # Among two thousand points of a young map a wrong match may be left.
         assert (cloud.xyz_map[:, 2] < -0.2).mean() < 0.002
+
+    def test_poses_that_were_provisional_come_corrected_on_topics_of_their_own(
+        self, make_graph
+    ) -> None:
+        """Where the floor has no texture the mount takes a while: `odometry` waits for nothing, and
+        its stamps grow.
+        """
+        scene = replace(
+            blank_floored(Mount(0.35, np.radians(8.0)), *box(1.6, 0.5, 0.4, 0.3)),
+            camera=SMALL_CAMERA,
+        )
+        calibration = rectified_calibration(SMALL_CAMERA)
+        graph = make_graph('-p', 'keyframe_max_frames:=1', '-p', 'tf_wait_s:=0.0')
+        names = ('odometry', 'odometry/corrected', 'pose/corrected')
+        odometry, corrected, poses = (graph.collect(name) for name in names)
+        graph.add(StereoSlamNode())
+        inputs = self.inputs(graph)
+        self._wait_for_outputs(graph)
+        stamps = [(i + 1) * 100_000_000 for i in range(8)]
+        for i, stamp_ns in enumerate(stamps):
+            here = replace(scene, mount=replace(scene.mount, forward_m=0.1 * i))
+            for side, image in zip(('left', 'right'), here.render()[:2], strict=True):
+                info = camera_info_message(stamp_ns, side, getattr(calibration, side))
+                inputs[f'{side}/camera_info'].publish(info)
+                inputs[f'{side}/image_raw'].publish(image_message(stamp_ns, side, image))
+            graph.until(lambda i=i: len(odometry) == i + 1, f'the pose of frame {i}')
+        assert [to_ns(message.header.stamp) for message in odometry] == stamps
+        graph.until(lambda: corrected and len(poses) == len(corrected), 'the corrected poses')
+        settled = len(corrected)
+        assert 1 < settled < len(stamps)
+        for found in (corrected, poses):
+            assert [to_ns(message.header.stamp) for message in found] == stamps[:settled]
+            for i, message in enumerate(found):
+                place = pose_array(message.pose.pose)[:3, 3]
+                np.testing.assert_allclose(place, [0.1 * i, 0.0, 0.0], atol=0.02)
 
     def test_the_mount_reaches_those_who_come_late(self, make_graph) -> None:
         frames, _ = room_drive(1)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from floor_scenes import SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
+from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
@@ -63,20 +63,6 @@ def test_a_wall_is_not_the_floor():
 
 def test_nothing_is_seen_of_a_blank_scene():
     assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
-
-
-def blank_floored(mount: Mount, *things: Patch) -> Scene:
-    """Return a scene whose floor has no texture, with three walls that have, and things."""
-    left = Patch((-1, 1.5, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=3)
-    right = Patch((-1, -1.3, 0), (6, 0, 0), (0, 0, 2.5), False, contrast=45.0, seed=4)
-    patches = [
-        floor_patch(grey=175.0, contrast=0.0),
-        left,
-        right,
-        wall(3.0, contrast=45.0),
-        *things,
-    ]
-    return Scene(patches, mount=mount, noise_grey=1.0)
 
 
 def mounts_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> list[Mount | None]:
