@@ -113,21 +113,23 @@ class Graph:
 
 @contextlib.contextmanager
 def fresh_graph(*arguments: str) -> Iterator[Graph]:
-    """A graph whose nodes get the given ROS arguments, in a domain that nobody else uses, with a
-    folder of their own for what outlives them.
-    """
+    """A graph whose nodes get the given ROS arguments, in surroundings of its own."""
+    with surroundings():
+        # The middleware of an earlier graph ends with the last reference to it, and is seen until
+        # then.
+        gc.collect()
+        rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
+        graph = Graph()
+        try:
+            yield graph
+        finally:
+            graph.close()
+
+
+@contextlib.contextmanager
+def surroundings() -> Iterator[None]:
+    """A domain that nobody else uses, and a folder for what outlives the nodes."""
     with tempfile.TemporaryDirectory(prefix='graph-') as folder:
         changed = {'ROS_DOMAIN_ID': str(free_domain()), 'XDG_RUNTIME_DIR': folder}
         with mock.patch.dict(os.environ, changed):
-            yield from _graph(*arguments)
-
-
-def _graph(*arguments: str) -> Iterator[Graph]:
-    # The middleware of an earlier graph ends with the last reference to it, and is seen until then.
-    gc.collect()
-    rclpy.init(args=['--ros-args', '--disable-external-lib-logs', *arguments])
-    graph = Graph()
-    try:
-        yield graph
-    finally:
-        graph.close()
+            yield

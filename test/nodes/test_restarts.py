@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from node_chain import CHAIN, NodeChain, seen_again
 from node_messages import grid_arrays
-from ros_graph import fresh_graph
+from ros_graph import fresh_graph, surroundings
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.model import StereoFrame
@@ -297,7 +297,7 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_fo
 
 def test_what_a_killed_node_leaves_does_not_reach_the_next_graph(monkeypatch) -> None:
     for _ in range(2):
-        with fresh_graph():
+        with surroundings():
             # A later graph may well have the domain of an earlier one.
             monkeypatch.setenv('ROS_DOMAIN_ID', 'test')
             kept = KeptState('/occupancy_grid', 30.0)
