@@ -1,5 +1,6 @@
 # make        everything needed, in .venv        make test   style, types and the fast tests
 # make demo   record a drive, map it, score it   make lint   style and types only
+# make explore      a simulated robot maps a room by itself
 # make test-slow    the tests left out of make test        make site   the documentation, in site/
 # make test-noble   the tests with the versions of Ubuntu 24.04, in .venv-noble
 # PYTHON=/path/to/python chooses the interpreter (3.10 or newer), PYTHON312=... that of test-noble.
@@ -25,7 +26,7 @@ CODE := segfloor_ros test launch_configs docs tools .ci setup.py
 # The tests start many processes, which need not compile the same modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: all test fast-tests test-slow test-noble noble-python demo lint format docs site clean
+.PHONY: all test fast-tests test-slow test-noble noble-python demo explore lint format docs site clean
 
 all: $(STAMP) $(TF)
 
@@ -84,6 +85,9 @@ $(NOBLE)/.installed: constraints-noble.txt constraints.txt setup.py setup.cfg py
 
 demo: $(STAMP) $(TF)
 	$(BIN)/segfloor demo
+
+explore: $(STAMP) $(TF)
+	$(BIN)/segfloor explore complex_room --out segfloor_explored
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(CODE)

@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'segfloor_ros'
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
+FURTHER_NODES = ('segfloor_pipeline', 'simulated_robot')
 HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"__version__ = '(.+)'", (HERE / PACKAGE / '__init__.py').read_text())[1]
 
@@ -46,9 +47,11 @@ setup(
         f'{PACKAGE}.simulation': [
             'scenes/*.yaml',
             'cameras/*.yaml',
+            'robots/*.yaml',
             'demo/*',
             'furniture.yaml',
             'world.xml',
+            'robot.xml',
         ],
         f'{PACKAGE}.evaluation': ['report.css'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
@@ -92,7 +95,7 @@ setup(
     entry_points={
         'console_scripts': [
             'segfloor = segfloor_ros.cli.start:main',
-            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, 'segfloor_pipeline')),
+            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, *FURTHER_NODES)),
         ]
     },
     zip_safe=True,

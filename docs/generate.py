@@ -16,6 +16,7 @@ from segfloor_ros.messages.topics import (
     GRID,
     NODES,
     PACED_BY,
+    ROBOT,
     SLAM,
     Topic,
     describe,
@@ -52,6 +53,10 @@ and by its height.""",
     GRID: """\
 Builds the occupancy grid from the labelled points, the rays to floor points and the floor scans. It
 follows every later correction of the keyframes.""",
+    ROBOT: """\
+A differential-drive robot in a rendered scene, in place of a camera's driver: it drives as it is
+told, slips and runs into things (MuJoCo), and publishes what its camera, wheels and IMU measure,
+and what is true. It needs the extra `sim`. [How to explore](../explore.md) with it.""",
 }
 
 PAUSE, RESET = ('`~/pause`', '`std_srvs/srv/SetBool`'), ('`~/reset`', '`std_srvs/srv/Trigger`')
@@ -82,6 +87,10 @@ SERVICES = {
             '`std_srvs/srv/Trigger`',
             'Write the whole map, with what the nodes behind know of it, to the file `save_map`.',
         ),
+    ],
+    ROBOT: [
+        (*PAUSE, 'Let the time stand still (true) or go on (false).'),
+        (*RESET, 'Put the robot back to where it started.'),
     ],
     FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
     CLOUD: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
@@ -120,12 +129,13 @@ STATUS = {
     'delivered. Values: `points`, `processing_ms`, `rss_mb`.',
     GRID: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',
+    ROBOT: 'One status per frame sent (`frame_index`).',
 }
 
 
 def page(node: str) -> str:
     """Return the page of a node in Markdown."""
-    stage = STAGE_SETTINGS[node].specs()
+    stage = (STAGE_SETTINGS.get(node) or NODE_SETTINGS[node]).specs()
     names = {spec.name for spec in stage}
     own = [spec for spec in NODE_SETTINGS[node].specs() if spec.name not in names]
     sections = [
@@ -190,7 +200,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 def main() -> None:
     """Write all pages."""
     PAGES.mkdir(exist_ok=True)
-    for node in NODES:
+    for node in (*NODES, ROBOT):
         (PAGES / f'{node}.md').write_text(page(node))
 
 

@@ -15,6 +15,12 @@ ABOUT = {
         'Angular velocity and acceleration, in a frame that tf ties to the camera. stereo_camera '
         'publishes those of a recording.'
     ),
+    'cmd_vel': (
+        'How to drive: linear.x in m/s, angular.z in rad/s; by parameter geometry_msgs/msg/Twist. '
+        'In step with who drives, its stamp is that of the image it answers.'
+    ),
+    'ground_truth': 'Where base_link truly is in world, at every image.',
+    'contact': 'When the robot runs into something, where, in base_link (m).',
     'odometry': (
         'Every tracked frame: base_link in odom (continuous), covariance, velocity. Silent while '
         'lost.'

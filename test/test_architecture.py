@@ -10,7 +10,9 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'segfloor_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
-ROS_FREE_ROOMS = ('camera', 'slam', 'floor', 'cloud', 'grid', 'evaluation', 'simulation')
+ROS_FREE_ROOMS = (
+    'camera', 'slam', 'floor', 'cloud', 'grid', 'evaluation', 'simulation', 'navigation',
+)  # fmt: skip
 ROS = {
     'rclpy', 'rcl_interfaces', 'tf2_ros', 'launch', 'launch_ros', 'ament_index_python', 'cv_bridge',
     'rosbag2_py', 'message_filters', 'builtin_interfaces',
@@ -84,9 +86,11 @@ def test_a_stage_knows_nothing_of_the_stages_behind_it(room) -> None:
             assert not rooms_imported(path) & behind, path.relative_to(PACKAGE)
 
 
-def test_ros_in_the_commands_is_for_the_replay_and_the_recorder_alone() -> None:
+def test_ros_in_the_commands_is_for_replay_recorder_and_exploration_alone() -> None:
     for path in MODULES:
-        if room_of(path) == 'cli' and not path.stem.startswith(('replay_', 'topic_recorder')):
+        if room_of(path) == 'cli' and not path.stem.startswith(
+            ('replay_', 'topic_recorder', 'explore_')
+        ):
             ros = {name for name in imports_of(path) if is_ros(name)}
             assert not ros, path.relative_to(PACKAGE)
 

@@ -19,6 +19,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / 'launch_configs'
 FILES = sorted(FOLDER.glob('*.launch.py'))
 SEGFLOOR, BAG = FOLDER / 'segfloor.launch.py', FOLDER / 'bag.launch.py'
+SIMULATION = FOLDER / 'simulation.launch.py'
 NODES = {
     'stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid',
 }  # fmt: skip
@@ -29,6 +30,17 @@ ARGUMENTS = {
     'right_image', 'left_camera_info', 'right_camera_info', 'depth', 'odometry', 'imu',
     'load_map', 'localize',
 }  # fmt: skip
+
+NAV2_STAND_IN = """
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.substitutions import LaunchConfiguration
+NAMES = ('params_file', 'use_sim_time', 'namespace')
+def generate_launch_description():
+    values = [LaunchConfiguration(name) for name in NAMES[:2]]
+    declared = [DeclareLaunchArgument(name, description='A.') for name in NAMES]
+    return LaunchDescription([*declared, ExecuteProcess(cmd=['nav2', *values])])
+"""
 
 
 def named_calls(tree: ast.AST) -> list[ast.Call]:
@@ -72,7 +84,7 @@ def test_a_saved_map_goes_to_slam_alone(launched) -> None:
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_a_parameter_file_that_is_not_there_is_an_error(launched, path) -> None:
-    bag = {} if path == SEGFLOOR else {'bag': '/a'}
+    bag = {'bag': '/a'} if path == BAG else {}
     with pytest.raises(ValueError, match=r'params_file:=/nope\.yaml: no such file'):
         launched(path, params_file='/nope.yaml', **bag)
 
@@ -290,6 +302,23 @@ def test_a_bag_is_played_with_its_own_time(launched, monkeypatch) -> None:
         launched(BAG)
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', '/mine.xml')
     assert set(launched(BAG, bag='/b')['ros2'].environment.values()) == {'/mine.xml'}
+
+
+def test_a_simulated_robot_comes_in_place_of_the_camera(launched, monkeypatch, tmp_path) -> None:
+    processes = launched(SIMULATION, scene='lane', robot='husky')
+    assert processes.keys() == {'simulated_robot', *STAGES}
+    files = after(processes['simulated_robot'].arguments, '--params-file')
+    own = [yaml.safe_load(Path(file).read_text()) for file in files]
+    assert {'scene': 'lane', 'robot': 'husky'} in [
+        values['ros__parameters'] for file in own for values in file.values()
+    ]
+    slam = processes['stereo_slam'].arguments
+    assert 'use_sim_time: true' in Path(after(slam, '--params-file')[-1]).read_text()
+    (tmp_path / 'launch').mkdir()
+    (tmp_path / 'launch' / 'navigation_launch.py').write_text(NAV2_STAND_IN)
+    monkeypatch.setitem(launch_stand_in.SHARE, 'nav2_bringup', tmp_path)
+    nav2 = launched(SIMULATION, nav2='true')['nav2']
+    assert nav2.arguments == [str(REPOSITORY / 'params' / 'nav2.yaml'), 'true']
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)

@@ -13,6 +13,7 @@ import segfloor_ros
 from segfloor_ros.cli.check import check_suite
 from segfloor_ros.cli.commands import benchmark, demo, params, replay, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
+from segfloor_ros.cli.explore import explore
 from segfloor_ros.cli.recordings import calibrate, convert, info, record, view
 from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.cli.view import SUFFIX
@@ -27,6 +28,7 @@ for command in (
     replay,
     info,
     view,
+    explore,
     simulate,
     calibrate,
     convert,

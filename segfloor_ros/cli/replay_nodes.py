@@ -67,31 +67,33 @@ class NodeProcesses:
         self._logs = {node: log_folder / f'{node}.log' for node in nodes}
         self._arguments = list(arguments)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.restarts_killed = False
+        """Whether a node that was killed is started again."""
 
     def __enter__(self) -> NodeProcesses:
         try:
             with interrupts_deferred():
-                self._start()
+                for node in self._logs:
+                    self._start(node)
         except BaseException:
             # `__exit__` is not called for what happens in here.
             self.stop()
             raise
         return self
 
-    def _start(self) -> None:
-        for node, log in self._logs.items():
-            command = [sys.executable, '-m', f'segfloor_ros.nodes.{node}', *self._arguments]
-            with log.open('wb') as output:
-                self._processes[node] = subprocess.Popen(
-                    command,
-                    env=self._environment,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    # An interrupt from the terminal ends the replay, which then stops its nodes.
-                    start_new_session=True,
-                    preexec_fn=partial(end_with_parent, os.getpid()),
-                )
+    def _start(self, node: str) -> None:
+        command = [sys.executable, '-m', f'segfloor_ros.nodes.{node}', *self._arguments]
+        with self._logs[node].open('ab') as output:
+            self._processes[node] = subprocess.Popen(
+                command,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                # An interrupt from the terminal ends the replay, which then stops its nodes.
+                start_new_session=True,
+                preexec_fn=partial(end_with_parent, os.getpid()),
+            )
 
     def __exit__(self, *error: object) -> None:
         self.stop()
@@ -100,7 +102,9 @@ class NodeProcesses:
         """Raise ReplayError naming the node whose process has ended."""
         for node, process in self._processes.items():
             status = process.poll()
-            if status is not None:
+            if status is not None and status < 0 and self.restarts_killed:
+                self._start(node)
+            elif status is not None:
                 raise ReplayError(
                     f'node {node} died ({how_it_ended(status)}){self._last_words(node)}'
                 )

@@ -288,7 +288,7 @@ def _grown(mask: Mask, side: int) -> Mask:
 
 def draw_overlay(maps: Comparison) -> NDArray[np.uint8]:
     """Return a colour picture (BGR), y up, enlarged to about a thousand pixels, with a legend."""
-    picture = _coloured(maps)[::-1]
+    picture = coloured(maps)[::-1]
     factor = max(1, WANTED_SIDE_PX // max(picture.shape[:2]))
     picture = np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)
     return np.vstack([picture, _legend(picture.shape[1])])
@@ -304,7 +304,8 @@ def save_overlay(maps: Comparison, path: Path) -> None:
     write_file(path, overlay_png(maps))
 
 
-def _coloured(maps: Comparison) -> NDArray[np.uint8]:
+def coloured(maps: Comparison) -> NDArray[np.uint8]:
+    """Return the picture (rows, columns, 3) BGR, a pixel a cell, the first row at the lowest y."""
     estimate, truth = maps.estimate, maps.truth
     free, occupied = estimate == FREE, estimate == OCCUPIED
     picture = np.full((*truth.shape, 3), COLOURS['no evidence'], np.uint8)

@@ -18,7 +18,12 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+    TwistStamped,
+)
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.constants import S_TO_NS
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -47,6 +52,9 @@ CAMERA, SLAM = 'stereo_camera', 'stereo_slam'
 FLOOR, CLOUD, GRID = 'floor_segmentation', 'cloud_labelling', 'occupancy_grid'
 NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
 """The nodes in the order of the data flow."""
+
+ROBOT = 'simulated_robot'
+"""In place of the camera, and of who else publishes what a robot measures."""
 
 OTHERS = ''
 """In place of a publisher: nodes outside of this package."""
@@ -150,11 +158,11 @@ def _images(side: str) -> list[Topic]:
     raw, rectified = f'{side}/image_raw', f'{side}/image_rect'
     packed = '/compressed'
     return [
-        Topic(raw, Image, IMAGES, CAMERA, (SLAM,)),
+        Topic(raw, Image, IMAGES, CAMERA, (SLAM,), also_by=(ROBOT,)),
         Topic(raw + packed, CompressedImage, IMAGES, CAMERA, (SLAM,), instead_of=raw),
         Topic(rectified, Image, IMAGES, OTHERS, (SLAM,), instead_of=raw),
         Topic(rectified + packed, CompressedImage, IMAGES, OTHERS, (SLAM,), instead_of=rectified),
-        Topic(f'{side}/camera_info', CameraInfo, IMAGES, CAMERA, (SLAM,)),
+        Topic(f'{side}/camera_info', CameraInfo, IMAGES, CAMERA, (SLAM,), also_by=(ROBOT,)),
     ]
 
 
@@ -166,9 +174,20 @@ def _rectified_pair(names: tuple[str, ...], profile: QoSProfile, **facts: Any) -
 
 _ALL = [
     *(topic for side in SIDES for topic in _images(side)),
-    Topic('wheel_odometry', Odometry, SENSORS, OTHERS, (SLAM,), is_optional=True),
-    Topic('depth/image_raw', Image, IMAGES, OTHERS, (SLAM,), instead_of='right/image_raw'),
-    Topic('imu', Imu, SENSORS, OTHERS, (SLAM,), is_optional=True),
+    Topic('wheel_odometry', Odometry, SENSORS, OTHERS, (SLAM,), is_optional=True, also_by=(ROBOT,)),
+    Topic(
+        'depth/image_raw',
+        Image,
+        IMAGES,
+        OTHERS,
+        (SLAM,),
+        instead_of='right/image_raw',
+        also_by=(ROBOT,),
+    ),
+    Topic('imu', Imu, SENSORS, OTHERS, (SLAM,), is_optional=True, also_by=(ROBOT,)),
+    Topic('cmd_vel', TwistStamped, KEYFRAMES, OTHERS, (ROBOT,)),
+    Topic('ground_truth', Odometry, KEYFRAMES, ROBOT),
+    Topic('contact', PointStamped, KEYFRAMES, ROBOT),
     Topic('odometry', Odometry, KEYFRAMES, SLAM, is_optional=True, on_demand_by=(CLOUD,)),
     Topic('initialpose', PoseWithCovarianceStamped, KEYFRAMES, OTHERS, (SLAM,), is_optional=True),
     Topic('pose', PoseWithCovarianceStamped, KEYFRAMES, SLAM),

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +67,20 @@ class FrameTruth:
     disparity_px: NDArray[np.float32]
 
 
+class Motion(Protocol):
+    """Tells where the rectified left optical frame is (4, 4) at a time."""
+
+    def T_world_left(self, time_s: float) -> Array:
+        """Return the pose."""
+
+
 class Simulation:
     """Drives through a scene. Use as a context manager; raises RenderingError where nothing can
     be rendered and InputError for an impossible scene. supersampling: the pictures are
-    rendered this many times finer than the camera's pixels.
+    rendered this many times finer than the camera's pixels. robot: moves in place of the drive.
     """
 
-    def __init__(self, scene: Scene, supersampling: int = 1):
+    def __init__(self, scene: Scene, supersampling: int = 1, robot: Motion | None = None):
         self.scene, self._finer = scene, supersampling
         self.drive: Drive = plan_drive(scene.path, scene.camera.rate_hz)
         self.camera = rectified_camera(scene.camera)
@@ -82,8 +89,10 @@ class Simulation:
             raise InputError('a depth sensor needs a camera without distortion and misalignment')
         solids, ground = obstacles(scene), floors(scene)
         self.motion = RigMotion(scene, self.drive, ground)
+        self._moved: Motion = robot or self.motion
         self.true_map: OccupancyGrid = true_map(scene, solids, ground, self.drive.xy_yaw[0, :2])
-        _check_clear(self.true_map, self.drive)
+        if robot is None:
+            _check_clear(self.true_map, self.drive)
         width, height = self.imaging.width * supersampling, self.imaging.height * supersampling
         world = build_world(scene, max(width, self.camera.width), max(height, self.camera.height))
         self._renderer = WorldRenderer(scene, world)
@@ -110,18 +119,21 @@ class Simulation:
 
     def frame(self, index: int) -> SimulatedFrame:
         """Render one pair."""
-        time_s = float(self.drive.times_s[index])
+        return self.frame_at(index, float(self.drive.times_s[index]))
+
+    def frame_at(self, index: int, time_s: float) -> SimulatedFrame:
+        """Render a pair of a time; its noise depends on the number."""
         left, right = (
             develop(self._exposed(side, time_s), self.imaging, self.scene, side, index, time_s)
             for side in range(len(CAMERAS))
         )
-        pose = self.motion.T_world_left(time_s)
-        return SimulatedFrame(index, time_s, left, right, pose, self._depth_mm(index))
+        pose = self._moved.T_world_left(time_s)
+        return SimulatedFrame(index, time_s, left, right, pose, self._depth_mm(index, time_s))
 
     def truth(self, index: int) -> FrameTruth:
         """Render what is true of one frame's rectified left image."""
         time_s = float(self.drive.times_s[index])
-        self._renderer.move(self.motion.T_world_left(time_s), time_s)
+        self._renderer.move(self._moved.T_world_left(time_s), time_s)
         depth_m = self._truth.depth_m(CAMERAS[0])
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
         floor = self._truth.mask(CAMERAS[0], self._renderer.floor_ids)
@@ -139,19 +151,18 @@ class Simulation:
             return None
         return imu_readings(self.scene, smooth_motion(self.motion))
 
-    def _depth_mm(self, index: int) -> NDArray[np.uint16] | None:
+    def _depth_mm(self, index: int, time_s: float) -> NDArray[np.uint16] | None:
         if not self.scene.sensors.depth.max_m:
             return None
-        time_s = float(self.drive.times_s[index])
         taken_s = time_s - self.scene.sensors.depth.lag_s
-        self._renderer.move(self.motion.T_world_left(taken_s), taken_s)
+        self._renderer.move(self._moved.T_world_left(taken_s), taken_s)
         true_m, grey = self._truth.depth_m(CAMERAS[0]), self._truth.grey(CAMERAS[0])
         return depth_reading_mm(self.scene, self.camera.fx, true_m, grey, index, time_s)
 
     def moving_mask(self, index: int) -> NDArray[np.uint8]:
         """Render what moves in one frame's left image: (H, W) uint8, 255 moving."""
         time_s = float(self.drive.times_s[index])
-        self._renderer.move(self.motion.T_world_left(time_s), time_s)
+        self._renderer.move(self._moved.T_world_left(time_s), time_s)
         mask = self._pictures.mask(CAMERAS[0], self._renderer.moving_geoms(time_s))
         share = ideal_image(mask.astype(np.float32), self.imaging, 0)
         return np.where(share > 127, np.uint8(255), np.uint8(0))
@@ -165,7 +176,7 @@ class Simulation:
         weights = weights[(rows - margin).clip(0, last)]
         exposed = np.zeros((len(rows), 1), np.float32)
         for moment, weight in zip(time_s + moments, weights.T, strict=True):
-            self._renderer.move(self.motion.T_world_left(moment), moment)
+            self._renderer.move(self._moved.T_world_left(moment), moment)
             exposed = exposed + weight[:, None] * self._pictures.grey(CAMERAS[side])
         return exposed
 
@@ -186,7 +197,7 @@ class WorldRenderer:
     """A world in MuJoCo in which the stereo rig and what moves can be placed."""
 
     def __init__(self, scene: Scene, world: World):
-        self.mujoco = _import_mujoco()
+        self.mujoco = import_mujoco()
         self._scene = scene
         self.model = self.mujoco.MjModel.from_xml_string(world.xml, world.files)
         self.data = self.mujoco.MjData(self.model)
@@ -261,7 +272,8 @@ class View:
         return self._renderer.render().copy()
 
 
-def _import_mujoco() -> Any:
+def import_mujoco() -> Any:
+    """Return the module. Raises RenderingError where it is not installed, or cannot render."""
     os.environ.setdefault('MUJOCO_GL', 'egl')
     try:
         import mujoco

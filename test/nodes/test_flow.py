@@ -8,7 +8,14 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.configuration import resolve
-from segfloor_ros.messages.topics import DIAGNOSTICS, NODES, TOPICS, published_by, subscribed_by
+from segfloor_ros.messages.topics import (
+    DIAGNOSTICS,
+    NODES,
+    ROBOT,
+    TOPICS,
+    published_by,
+    subscribed_by,
+)
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
@@ -73,8 +80,8 @@ def test_slam_takes_rectified_images_by_parameter(make_graph) -> None:
 
 def test_every_publisher_of_a_topic_is_a_node_and_every_listener_too() -> None:
     for topic in TOPICS.values():
-        assert topic.publisher in (*NODES, '')
-        assert set(topic.subscribers) <= set(NODES)
+        assert topic.publisher in (*NODES, ROBOT, '')
+        assert set(topic.subscribers) <= {*NODES, ROBOT}
         assert not topic.name.startswith('/')
 
 

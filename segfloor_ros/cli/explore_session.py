@@ -1,0 +1,199 @@
+"""An exploration: the simulated robot and the nodes behind its camera, each a process of its own,
+and the planner that drives it by what they publish, in step with the robot's time.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped, Vector3
+from std_srvs.srv import SetBool, Trigger
+
+from segfloor_ros.cli.replay_nodes import STALL_S, NodeGraph, ReplayError, running_nodes
+from segfloor_ros.cli.replay_session import cpu_s
+from segfloor_ros.configuration import Configuration
+from segfloor_ros.evaluation.exploration import Exploration
+from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import OccupancyGrid
+from segfloor_ros.messages.images import scan_arrays
+from segfloor_ros.messages.maps import MAP_POINT_DTYPE, cloud_array, grid_of
+from segfloor_ros.messages.poses import pose_array
+from segfloor_ros.messages.topics import (
+    CAMERA,
+    GRID,
+    NODES,
+    ROBOT,
+    SLAM,
+    TOPICS,
+    make_header,
+    stamp_of,
+    to_ns,
+)
+from segfloor_ros.navigation.explorer import Explorer
+from segfloor_ros.processes import Interrupt
+
+ANSWER_S = 2.0
+"""What a node has not answered for so long, in real time, is not waited for: it may be gone."""
+
+OnMap = Callable[[float, OccupancyGrid, str], None]
+"""Told the time of the robot, the map and the phase."""
+
+
+@dataclass(frozen=True)
+class ExploreSession:
+    """One exploration. robot: values of the node `simulated_robot`. slam: values of `stereo_slam`,
+    e.g. where the camera sits. found: what it comes to. most_s: of the robot's time. save: where
+    the whole map goes at the end.
+    """
+
+    configuration: Configuration
+    params_file: Path | None
+    robot: dict[str, Any]
+    slam: dict[str, Any]
+    explorer: Explorer
+    found: Exploration
+    most_s: float
+    save: Path
+    on_map: OnMap
+    interrupt: Interrupt
+
+    def execute(self) -> None:
+        """Explore until all is done, the time is over or an interrupt comes. A node that is killed
+        starts again. Raises ReplayError when one ends otherwise, or nothing moves.
+        """
+        nodes = (ROBOT, *(node for node in NODES if node != CAMERA))
+        with running_nodes(self._parameters, self.params_file, None, nodes) as graph:
+            pilot = Pilot(graph, self.explorer, self.found, self.on_map)
+            graph.connect(is_paced=False, interrupted=self.interrupt)
+            graph.call(SetBool, f'{ROBOT}/pause', SetBool.Request(data=False))
+            graph.processes.restarts_killed = True
+            start_s, pilot.last_sign_s = time.monotonic(), time.monotonic()
+            while not (self.explorer.is_done or self.interrupt.is_set()):
+                graph.spin()
+                pilot.answer()
+                if pilot.time_s > self.most_s:
+                    break
+                if time.monotonic() > pilot.last_sign_s + STALL_S:
+                    raise ReplayError(f'the robot has not moved on for {STALL_S:g} s')
+            self.found.wall_s = time.monotonic() - start_s
+            self.found.cpu_s = {**cpu_s(graph.processes), 'planner': sum(os.times()[:2])}
+            if self.found.maps:
+                graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), STALL_S)
+
+    def _parameters(self, folder: Path) -> dict[str, Any]:
+        """Return the parameters as resolved, of nodes in step with the robot."""
+        parameters = self.configuration.as_ros_parameters()
+        del parameters[CAMERA]
+        parameters[ROBOT] = {'ros__parameters': {**self.robot, 'rate': 0.0, 'start_paused': True}}
+        parameters[SLAM]['ros__parameters'].update(
+            self.slam, background=False, tf_wait_s=0.0, save_map=str(self.save.absolute())
+        )
+        parameters[GRID]['ros__parameters'].update(publish_period_s=0.0)
+        return parameters
+
+
+class Pilot:
+    """Drives the robot: answers every frame with a command once the nodes are done with it."""
+
+    def __init__(
+        self, graph: NodeGraph, explorer: Explorer, found: Exploration, on_map: OnMap
+    ) -> None:
+        self._recorder, self._explorer, self._on_map = graph.recorder, explorer, on_map
+        self.found = found
+        self.last_sign_s = time.monotonic()
+        """When the last frame came, in real time."""
+        self._waiting: dict[int, float] = {}
+        self._scans: dict[int, FloorScan] = {}
+        self._poses: dict[int, Array] = {}
+        self._obstacles = np.zeros((0, 3))
+        self._map_ns = 0
+        topic = TOPICS['cmd_vel']
+        self._commands = graph.recorder.create_publisher(topic.type, topic.name, topic.profile)
+        for name, take in (
+            ('pose', self._take_pose),
+            ('scan', self._take_scan),
+            ('obstacle_points', self._take_obstacles),
+            ('map', self._take_map),
+            ('contact', self._take_contact),
+            ('ground_truth', self._take_truth),
+            ('frame_done', lambda message: self.answer()),
+            ('keyframe/done', lambda message: self.answer()),
+        ):
+            topic = TOPICS[name]
+            graph.recorder.create_subscription(topic.type, name, take, topic.profile)
+
+    @property
+    def time_s(self) -> float:
+        """The time of the robot."""
+        return 1e-9 * max(self.found.true_poses, default=0)
+
+    def answer(self) -> None:
+        """Command the robot at the frames that the nodes are done with, or do not answer."""
+        now_s = time.monotonic()
+        while self._waiting:
+            stamp_ns, since_s = next(iter(self._waiting.items()))
+            if not self._is_done(stamp_ns) and now_s < since_s + ANSWER_S:
+                return
+            del self._waiting[stamp_ns]
+            self._command(stamp_ns)
+
+    def _is_done(self, stamp_ns: int) -> bool:
+        """Whether all that the nodes make of a frame has come."""
+        notes = self._recorder.notes
+        status = notes.answers.get(stamp_ns)
+        if status is None:
+            return False
+        values = status.values
+        is_mapped = values.get('keyframe') != '1' or stamp_ns in notes.failed
+        has_pose = stamp_ns in self._poses and stamp_ns in self._scans
+        return (is_mapped or self._map_ns >= stamp_ns) and (
+            values.get('tracked') != '1' or has_pose
+        )
+
+    def _command(self, stamp_ns: int) -> None:
+        T_map_base = self._poses.pop(stamp_ns, None)
+        scan = self._scans.pop(stamp_ns, None)
+        if T_map_base is not None:
+            self.found.poses[stamp_ns] = T_map_base
+            self._explorer.take_obstacles(self._obstacles, scan, T_map_base)
+        ended = len(self._explorer.ended)
+        forward, turn = self._explorer.step(1e-9 * stamp_ns, T_map_base)
+        for goal in self._explorer.ended[ended:]:
+            self.found.goals.append((goal, self.found.true_poses[stamp_ns]))
+        twist = Twist(linear=Vector3(x=float(forward)), angular=Vector3(z=float(turn)))
+        self._commands.publish(TwistStamped(header=make_header(stamp_ns, 'base_link'), twist=twist))
+
+    def _take_truth(self, message: Any) -> None:
+        stamp_ns = stamp_of(message)
+        self.found.true_poses[stamp_ns] = pose_array(message.pose.pose)
+        self.last_sign_s = time.monotonic()
+        self._waiting[stamp_ns] = self.last_sign_s
+
+    def _take_pose(self, message: Any) -> None:
+        self._poses[stamp_of(message)] = pose_array(message.pose.pose)
+        self.answer()
+
+    def _take_scan(self, message: Any) -> None:
+        self._scans[stamp_of(message)] = scan_arrays(message, 'scan')
+        self.answer()
+
+    def _take_obstacles(self, message: Any) -> None:
+        points = cloud_array(message, MAP_POINT_DTYPE, 'obstacle_points')
+        self._obstacles = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float64)
+
+    def _take_map(self, message: Any) -> None:
+        grid = self._explorer.grid = grid_of(message)
+        self._map_ns = to_ns(message.header.stamp)
+        self.found.maps.append((self._map_ns, grid))
+        self._on_map(self.time_s, grid, self._explorer.phase)
+        self.answer()
+
+    def _take_contact(self, message: Any) -> None:
+        self.found.bumps_ns.append(stamp_of(message))

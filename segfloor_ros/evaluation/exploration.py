@@ -1,0 +1,160 @@
+"""What an exploration came to: figures, a picture of map and path on the truth, and a film of the
+map as it grew.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_cells
+from segfloor_ros.evaluation.maps import MapTruth, Mask, Pose2d, from_frame, resample
+from segfloor_ros.geometry import Array
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
+from segfloor_ros.navigation.costmap import room_around
+from segfloor_ros.navigation.explorer import Goal
+
+AT_GOAL_M = 0.3
+"""A goal is reached where the robot truly is within this of it: the planner's own 0.15 m, and as
+much again for the map."""
+
+FILM_FRAMES = 60
+"""At most, ten of them in a second."""
+
+
+@dataclass
+class Exploration:
+    """An exploration as it went. start: where the frame of the map truly lies. Poses by stamp in
+    ns: where SLAM had the base in the map at the time, and where it truly was in the scene. maps:
+    with their stamps. goals: with the true pose at the end of each.
+    """
+
+    start: Pose2d
+    poses: dict[int, Array] = field(default_factory=dict)
+    true_poses: dict[int, Array] = field(default_factory=dict)
+    maps: list[tuple[int, OccupancyGrid]] = field(default_factory=list)
+    bumps_ns: list[int] = field(default_factory=list)
+    goals: list[tuple[Goal, Array]] = field(default_factory=list)
+    wall_s: float = 0.0
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+
+def reachable_floor(truth: OccupancyGrid, radius_m: float, start: Pose2d) -> Mask:
+    """Return the floor (rows, columns) that a robot of some radius can stand on."""
+    room_m = room_around(truth.cells != OCCUPIED, truth.resolution_m)
+    _, labels = cv2.connectedComponents((room_m > radius_m).astype(np.uint8), connectivity=4)
+    column, row = ((np.array(start[:2]) - truth.origin_xy_m) / truth.resolution_m).astype(int)
+    away_m = room_around(labels != labels[row, column], truth.resolution_m)
+    return np.asarray((away_m <= radius_m) & (truth.cells == FREE))
+
+
+def mapped_share(grid: OccupancyGrid, truth: OccupancyGrid, floor: Mask, start: Pose2d) -> float:
+    """Return how much of the floor is free on a map whose frame lies at `start`."""
+    return float((resample(grid, truth, start) == FREE)[floor].mean())
+
+
+def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[str, Any]:
+    """Return the figures of an exploration by name."""
+    _, grid = found.maps[-1]
+    floor = reachable_floor(truth, radius_m, found.start)
+    maps = compare(grid, MapTruth(truth, found.start))
+    cells = score_cells(maps)
+    stamps = sorted(found.poses)
+    estimated = from_frame(np.array([found.poses[t][:2, 3] for t in stamps]), found.start)
+    true = np.array([found.true_poses[t][:2, 3] for t in stamps])
+    sim_s = (max(found.true_poses) - min(found.true_poses)) * 1e-9
+    way = np.array([pose[:2, 3] for _, pose in sorted(found.true_poses.items())])
+    return {
+        'mapped_share': round(mapped_share(grid, truth, floor, found.start), 4),
+        'bumps': len(found.bumps_ns),
+        'goals_reached': sum(_is_at(goal, pose, found.start) for goal, pose in found.goals),
+        'goals_total': len(found.goals),
+        'path_rmse_m': round(float(np.sqrt(np.mean(np.sum((estimated - true) ** 2, 1)))), 4),
+        'free_precision': round(cells.free_precision, 4),
+        'free_recall': round(cells.free_recall, 4),
+        'tracked_share': round(len(stamps) / len(found.true_poses), 4),
+        'path_m': round(float(np.hypot(*np.diff(way, axis=0).T).sum()), 2),
+        'sim_s': round(sim_s, 1),
+        'wall_s': round(found.wall_s, 1),
+        'real_time_factor': round(sim_s / found.wall_s, 3),
+        'cpu_s': {name: round(seconds, 1) for name, seconds in found.cpu_s.items()},
+    }
+
+
+def _is_at(goal: Goal, T_world_base: Array, start: Pose2d) -> bool:
+    (true,) = from_frame(goal.point[None], start)
+    return bool(goal.is_reached) and bool(np.hypot(*(true - T_world_base[:2, 3])) <= AT_GOAL_M)
+
+
+def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
+    """Draw the map on the truth with the way, bumps and goals, as PNG."""
+    figure, show = _canvas(found, truth)
+    show(len(found.maps) - 1)
+    axes = figure.axes[0]
+    bumps = np.array([_true_at(found, t) for t in found.bumps_ns]).reshape(-1, 2)
+    axes.plot(*bumps.T, 'x', color='red', markersize=9, mew=2.5, label=f'{len(bumps)} bumps')
+    for reached, colour in ((True, 'tab:green'), (False, 'tab:red')):
+        goals = [g.point for g, pose in found.goals if _is_at(g, pose, found.start) == reached]
+        if goals:
+            points = from_frame(np.array(goals), found.start)
+            label = 'goals reached' if reached else 'goals missed'
+            axes.plot(*points.T, 'o', mfc='none', color=colour, label=f'{len(goals)} {label}')
+    for name, bgr in COLOURS.items():
+        axes.plot([], [], 's', color=_rgb(bgr), markeredgecolor='grey', label=name)
+    axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0), fontsize=8)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png', dpi=110, bbox_inches='tight')
+    return buffer.getvalue()
+
+
+def write_film(path: Path, found: Exploration, truth: OccupancyGrid) -> None:
+    """Write the map as it grew as an animated GIF."""
+    figure, show = _canvas(found, truth)
+    steps = np.linspace(0, len(found.maps) - 1, min(FILM_FRAMES, len(found.maps))).astype(int)
+    FuncAnimation(figure, show, frames=steps.tolist()).save(
+        path, writer=PillowWriter(fps=10), dpi=60
+    )
+
+
+def _canvas(found: Exploration, truth: OccupancyGrid) -> tuple[Figure, Any]:
+    """Return a figure, and what shows the map of a number with the way so far on it."""
+    height, width = truth.cells.shape
+    figure = Figure(figsize=(6 * max(width / height, 0.6), 6), layout='tight')
+    axes = figure.add_subplot()
+    x, y = truth.origin_xy_m
+    size = truth.resolution_m
+    extent = (x, x + width * size, y, y + height * size)
+    shown = axes.imshow(np.zeros((height, width, 3)), origin='lower', extent=extent)
+    (way,) = axes.plot([], [], color='tab:blue', linewidth=1.2, label='true way')
+    (robot,) = axes.plot([], [], 'o', color='tab:blue', markersize=6)
+    stamps = np.array(sorted(found.true_poses))
+    path = np.array([found.true_poses[t][:2, 3] for t in stamps.tolist()])
+
+    def show(number: int) -> None:
+        stamp_ns, grid = found.maps[number]
+        picture = coloured(compare(grid, MapTruth(truth, found.start)))
+        shown.set_data(picture[..., ::-1])
+        count = int(np.searchsorted(stamps, stamp_ns, side='right'))
+        count = len(path) if number == len(found.maps) - 1 else count
+        way.set_data(*path[:count].T)
+        robot.set_data(*path[max(count - 1, 0) : count].T)
+        axes.set_title(f'{stamp_ns * 1e-9:.0f} s', fontsize=10)
+
+    return figure, show
+
+
+def _true_at(found: Exploration, stamp_ns: int) -> NDArray[np.float64]:
+    nearest = min(found.true_poses, key=lambda t: abs(t - stamp_ns))
+    return np.asarray(found.true_poses[nearest][:2, 3])
+
+
+def _rgb(bgr: tuple[int, int, int]) -> tuple[float, ...]:
+    return tuple(value / 255 for value in bgr[::-1])

@@ -1,0 +1,90 @@
+"""`segfloor explore`: a closed loop over DDS, from an empty map to goals on the whole one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import segfloor
+
+from segfloor_ros.trajectory import read_trajectory
+
+pytestmark = pytest.mark.skipif(find_spec('mujoco') is None, reason='the extra sim')
+
+RATE_HZ = 5
+
+SMALL_ROOM = """
+description: A room with a box in it.
+seed: 5
+floor: {texture: marble}
+walls:
+  - {points: [[-0.7, -0.9], [2.1, -0.9], [2.1, 0.9], [-0.7, 0.9]], closed: true,
+     texture: rough_plaster, posters: 6}
+boxes:
+  - {at: [1.3, 0.55], size: [0.3, 0.3, 0.5], texture: goods}
+camera: {width: 480, height: 360, rate_hz: 5}
+path: {waypoints: [[0, 0], [0.5, 0]]}
+"""
+
+
+def kill_slam_after(seconds: float) -> threading.Timer:
+    """Start a timer that kills the node of SLAM that this process has started."""
+
+    def kill() -> None:
+        for folder in Path('/proc').glob('[0-9]*'):
+            with contextlib.suppress(OSError):
+                parent = (folder / 'stat').read_text().rpartition(')')[2].split()[1]
+                is_slam = b'segfloor_ros.nodes.stereo_slam' in (folder / 'cmdline').read_bytes()
+                if int(parent) == os.getpid() and is_slam:
+                    os.kill(int(folder.name), signal.SIGKILL)
+
+    timer = threading.Timer(seconds, kill)
+    timer.start()
+    return timer
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_robot_maps_a_room_by_itself_and_drives_to_goals_though_slam_is_killed(tmp_path) -> None:
+    scene, out = tmp_path / 'room.yaml', tmp_path / 'out'
+    scene.write_text(SMALL_ROOM)
+    timer = kill_slam_after(30.0)
+    done = segfloor('explore', scene, '--out', out, '--goals', '1', '--minutes', '4')
+    timer.cancel()
+    assert done.returncode == 0, done.stderr
+    found = json.loads((out / 'summary.json').read_text())
+    assert found['mapped_share'] > 0.95
+    assert found['bumps'] == 0
+    assert (found['goals_reached'], found['goals_total']) == (1, 1)
+    assert found['path_rmse_m'] < 0.05
+    assert (out / 'explored.gif').read_bytes().startswith(b'GIF89a')
+    times_s, poses = read_trajectory(out / 'ground_truth.txt')
+    tracked_s, _ = read_trajectory(out / 'trajectory.txt')
+    lost = np.flatnonzero(np.diff(tracked_s) > 1.5 / RATE_HZ)
+    assert len(lost), 'SLAM was killed'
+    for last_s, next_s in zip(tracked_s[lost], tracked_s[lost + 1], strict=True):
+        stands = (times_s > last_s + 0.5) & (times_s < next_s)
+        places = poses[stands, :2, 3]
+        assert not len(places) or np.hypot(*(places - places[0]).T).max() < 0.005
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (('hall', '--robot', 'huski'), 'huski: no such robot'),
+        (('hal',), 'hal: no such scene or file'),
+        (('hall', '--goals', '-1'), '--goals'),
+    ],
+)
+def test_what_cannot_be_explored_is_said_in_one_line(tmp_path, arguments, words) -> None:
+    done = segfloor('explore', *arguments, '--out', str(tmp_path / 'out'))
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not (tmp_path / 'out').exists()

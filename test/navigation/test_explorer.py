@@ -1,0 +1,179 @@
+"""The planner on small maps: what may be driven over, ways, frontiers, and a robot that explores a
+floor plan which it sees bit by bit.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.geometry import make_transform
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.navigation.costmap import Costmap
+from segfloor_ros.navigation.explorer import STOP, Body, Explorer, Goal
+
+CELL_M = 0.1
+BODY = Body(radius_m=0.15, blind_m=0.3, speed_m_s=0.4, turn_rad_s=0.8)
+NOTHING = np.zeros((0, 2))
+
+TWO_ROOMS = """
+##########################
+#............#...........#
+#............#...........#
+#........................#
+#........................#
+#........................#
+#........................#
+#........................#
+#............#...........#
+#............#...........#
+##########################
+"""
+
+
+def grid_of(drawing: str, origin_xy_m=(0.0, 0.0)) -> OccupancyGrid:
+    """Return a map of `#` occupied, `.` free, `?` unknown; the lowest row is that of least y."""
+    rows = drawing.split()[::-1]
+    codes = {'#': OCCUPIED, '.': FREE, '?': UNKNOWN}
+    return OccupancyGrid(
+        np.array([[codes[c] for c in row] for row in rows], np.int8), CELL_M, origin_xy_m
+    )
+
+
+def costmap_of(grid: OccupancyGrid, obstacles=NOTHING, driven=((0.65, 0.55),)) -> Costmap:
+    return Costmap(grid, 0.15, 0.3, np.array(obstacles), np.array(driven), 0.0)
+
+
+def pose_of(x: float, y: float, yaw: float) -> np.ndarray:
+    return make_transform(Rotation.from_euler('Z', yaw).as_matrix(), np.array([x, y, 0.0]))
+
+
+def test_cells_and_points_are_of_the_map_whatever_its_origin() -> None:
+    costmap = costmap_of(grid_of(TWO_ROOMS, (-3.0, 2.0)), driven=[(-2.35, 2.55)])
+    assert costmap.cells_of(np.array([-2.95, 2.25])).tolist() == [[2, 0]]
+    assert costmap.points_of(np.array([[2, 0]])) == pytest.approx(np.array([[-2.95, 2.25]]))
+
+
+def test_a_way_leads_through_the_door_and_keeps_off_the_walls() -> None:
+    costmap = costmap_of(grid_of(TWO_ROOMS))
+    ways = costmap.ways_from(np.array([0.35, 0.85]), 0.3)
+    goal, away_m = costmap.nearest_place(np.array([2.2, 0.85]))
+    assert away_m < CELL_M
+    way = costmap.points_of(ways.cells[ways.to(goal)])
+    crossing = way[np.abs(way[:, 0] - 1.35) < 0.06]
+    assert len(crossing)
+    assert ((crossing[:, 1] > 0.4) & (crossing[:, 1] < 0.7)).all()
+    rows, columns = costmap.cells_of(way).T
+    assert (costmap.room_m[rows, columns] > 0.15).all()
+    assert np.hypot(*np.diff(way, axis=0).T).max() < 1.5 * CELL_M
+
+
+def test_a_crate_in_the_door_closes_the_way() -> None:
+    ways = costmap_of(grid_of(TWO_ROOMS), [(1.35, 0.45), (1.35, 0.65)]).ways_from(
+        np.array([0.35, 0.85]), 0.3
+    )
+    assert not np.isfinite(ways.cost[ways.cells[:, 1] > 13]).any()
+
+
+def test_where_the_robot_stands_is_free_and_what_it_cannot_see_before_it() -> None:
+    grid = grid_of('???????????\n' * 11)
+    costmap = Costmap(grid, 0.15, 0.3, NOTHING, np.array([(0.55, 0.55)]), 0.4)
+    assert costmap.places[5, 5]
+    assert costmap.places[5, 7]
+    assert not costmap.places[5, 8]
+
+
+def test_frontiers_are_places_a_radius_away_from_unknown_floor_but_not_from_slits() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[1:4, 1] = UNKNOWN
+    assert costmap_of(grid).frontiers() == []
+    grid.cells[1:-1, 18:-1] = UNKNOWN
+    (frontier,) = costmap_of(grid).frontiers()
+    assert frontier[:, 1].max() == 16
+    assert frontier[:, 1].min() >= 14
+
+
+def test_a_scan_clears_what_it_passes_and_nothing_else() -> None:
+    explorer = Explorer(BODY, 0)
+    ahead, aside, far = (1.0, 0.0, 0.1), (0.0, 1.0, 0.1), (5.0, 0.0, 0.1)
+    scan = FloorScan(-0.5, 0.1, np.full(11, 2.0, np.float32), None, 4.0)
+    cases = [(None, [ahead, aside]), (scan, [aside])]
+    for seen, kept in cases:
+        explorer.take_obstacles(np.array([ahead, aside, far]), seen, np.eye(4))
+        explorer.grid = grid_of(TWO_ROOMS)
+        assert explorer.obstacles.tolist() == [list(point[:2]) for point in kept]
+
+
+class Drive:
+    """A robot on a true map, of which it sees what lies before it within some metres."""
+
+    def __init__(self, truth: OccupancyGrid, explorer: Explorer, pose: np.ndarray) -> None:
+        self.truth, self.explorer, self.pose = truth, explorer, pose
+        self.time_s, self.nearest_m = 0.0, np.inf
+        self._known = np.full_like(truth.cells, UNKNOWN)
+        room = cv2.distanceTransform((truth.cells == FREE).astype(np.uint8), cv2.DIST_L2, 5)
+        self._room_m = room * CELL_M
+
+    def see(self) -> None:
+        x, y, yaw = self.pose
+        for angle in yaw + np.linspace(-0.8, 0.8, 60):
+            for way in np.arange(0.25, 2.0, CELL_M / 3):
+                cell = (int((y + way * np.sin(angle)) / CELL_M),
+                        int((x + way * np.cos(angle)) / CELL_M))  # fmt: skip
+                self._known[cell] = self.truth.cells[cell]
+                if self._known[cell] == OCCUPIED:
+                    break
+        self.explorer.grid = OccupancyGrid(self._known.copy(), CELL_M, (0.0, 0.0))
+
+    def go_on(self, until_s: float) -> None:
+        while self.time_s < until_s and not self.explorer.is_done:
+            self.see()
+            x, y, yaw = self.pose
+            forward, turn = self.explorer.step(self.time_s, pose_of(x, y, yaw))
+            step = np.array([forward * np.cos(yaw), forward * np.sin(yaw), turn])
+            self.pose = self.pose + 0.2 * step
+            self.time_s += 0.2
+            self.nearest_m = min(self.nearest_m, self._room_m[int(y / CELL_M), int(x / CELL_M)])
+
+    @property
+    def share(self) -> float:
+        floor = self.truth.cells == FREE
+        return float((self._known == FREE)[floor].mean())
+
+
+def test_it_explores_both_rooms_then_drives_to_its_goals_and_touches_nothing() -> None:
+    drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, 3, seed=1), np.array([0.6, 0.55, 3.0]))
+    drive.go_on(300.0)
+    assert drive.explorer.is_done
+    assert drive.share > 0.97
+    assert [goal.is_reached for goal in drive.explorer.ended] == [True] * 3
+    assert drive.nearest_m > BODY.radius_m - CELL_M / 2
+
+
+def test_goals_that_are_given_are_driven_to_in_their_order_and_one_in_a_wall_is_given_up() -> None:
+    goals = [Goal(np.array([2.0, 0.8]), 'desk'), Goal(np.array([1.35, 0.95]), 'wall')]
+    drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, goals), np.array([0.6, 0.55, 0.0]))
+    drive.go_on(300.0)
+    assert [(g.name, g.is_reached) for g in drive.explorer.ended] == [
+        ('desk', True),
+        ('wall', False),
+    ]
+
+
+def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:
+    drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, 0), np.array([0.6, 0.55, 0.0]))
+    drive.go_on(2.0)
+    commands = [drive.explorer.step(2.0 + 0.1 * i, None) for i in range(60)]
+    assert commands[0] == STOP
+    assert all(forward == 0 for forward, _ in commands)
+    assert abs(commands[-1][1]) > 0
+    after = [drive.explorer.step(9.0 + 0.1 * i, pose_of(*drive.pose)) for i in range(100)]
+    assert set(after) != {STOP}
+
+
+def test_before_the_first_map_it_stands_still() -> None:
+    explorer = Explorer(BODY, 0)
+    assert {explorer.step(float(t), np.eye(4)) for t in range(10)} == {STOP}

@@ -1,0 +1,98 @@
+"""The robot in MuJoCo: it drives as told and as its wheels let it, and feels what it runs into."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.simulation.robot import DrivenRobot, open_robot
+from segfloor_ros.simulation.scene_file import open_scene
+
+pytestmark = pytest.mark.skipif(find_spec('mujoco') is None, reason='the extra sim')
+
+
+def robot_in(scene: str, name: str = 'turtlebot3_burger', *values: str) -> DrivenRobot:
+    robot, camera = open_robot(name)
+    return DrivenRobot(open_scene(scene, [*camera, *values]), robot)
+
+
+def yaw_of(pose: np.ndarray) -> float:
+    return float(Rotation.from_matrix(pose[:3, :3]).as_euler('ZYX')[0])
+
+
+def test_it_starts_where_the_drive_of_the_scene_does() -> None:
+    pose = robot_in('lane').T_world_base(0.0)
+    assert pose[:3, 3] == pytest.approx(np.zeros(3), abs=0.001)
+    assert yaw_of(pose) == pytest.approx(0.0, abs=0.001)
+
+
+@pytest.mark.parametrize('name', ['turtlebot3_burger', 'husky'])
+def test_it_drives_straight_at_the_speed_it_is_told_and_no_faster_than_it_can(name) -> None:
+    driven, (published, _) = robot_in('lane', name), open_robot(name)
+    driven.drive(0.2, 0.0)
+    driven.advance(3.0)
+    way = driven.T_world_base(3.0)[:3, 3] - driven.T_world_base(2.2)[:3, 3]
+    assert way == pytest.approx([0.16, 0.0, 0.0], abs=0.003)
+    assert driven.wheels[-1].T_wheels_base[0, 3] == pytest.approx(0.2 * 3.0 - 0.02, abs=0.01)
+    driven.drive(9.0, 0.0)
+    driven.advance(5.5)
+    way = driven.T_world_base(5.5)[0, 3] - driven.T_world_base(5.0)[0, 3]
+    assert way == pytest.approx(0.5 * published.speed_m_s, rel=0.02)
+
+
+def test_it_turns_on_the_spot_as_its_wheels_and_its_gyroscope_measure() -> None:
+    driven = robot_in('lane')
+    driven.drive(0.0, 0.6)
+    driven.advance(3.0)
+    turned = yaw_of(driven.T_world_base(3.0))
+    assert turned == pytest.approx(0.6 * 3.0, rel=0.05)
+    assert np.hypot(*driven.T_world_base(3.0)[:2, 3]) < 0.03
+    assert yaw_of(driven.wheels[-1].T_wheels_base) == pytest.approx(turned, rel=0.05)
+    # The base turns about what is up in the camera.
+    rate = [sample.gyro_rad_s @ driven.mount.up_in_camera for sample in driven.imu]
+    assert np.sum(rate) / 100 == pytest.approx(turned, rel=0.05)
+
+
+def test_standing_its_accelerometer_measures_gravity() -> None:
+    driven = robot_in('lane')
+    driven.advance(1.0)
+    mean = np.mean([sample.accel_m_s2 for sample in driven.imu], axis=0)
+    assert mean == pytest.approx(9.81 * driven.mount.up_in_camera, abs=0.1)
+    stamps = [sample.stamp_ns for sample in driven.imu]
+    assert set(np.diff(stamps)) == {10_000_000}
+
+
+def test_four_wheels_slip_in_a_turn() -> None:
+    driven = robot_in('lane', 'husky')
+    driven.drive(0.0, 0.6)
+    driven.advance(4.0)
+    by_wheels = yaw_of(driven.wheels[-1].T_wheels_base)
+    assert 0.3 < yaw_of(driven.T_world_base(4.0)) / by_wheels < 0.9
+
+
+def test_a_wall_stops_it_and_is_one_bump_while_its_wheels_go_on() -> None:
+    driven = robot_in('low_box', 'turtlebot3_burger', 'boxes=[{at: [0.6, 0], size: [0.1, 1, 0.5]}]')
+    driven.drive(0.22, 0.0)
+    driven.advance(6.0)
+    ((time_s, place),) = driven.bumps
+    front_m = 0.55 - (-0.032 + 0.138 / 2)
+    assert time_s == pytest.approx(front_m / 0.22, abs=0.3)
+    assert place[0] == pytest.approx(-0.032 + 0.138 / 2, abs=0.01)
+    assert driven.T_world_base(6.0)[0, 3] == pytest.approx(front_m, abs=0.02)
+    assert driven.wheels[-1].T_wheels_base[0, 3] > front_m + 0.3
+
+
+def test_someone_who_walks_into_it_bumps() -> None:
+    person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 1.0, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', person)
+    driven.advance(3.0)
+    assert [time_s for time_s, _ in driven.bumps] == [pytest.approx(1.7, abs=0.1)]
+
+
+def test_a_robot_that_there_is_not_is_refused_with_one_like_it() -> None:
+    with pytest.raises(InputError, match=r'huski: no such robot.*husky'):
+        open_robot('huski')
