@@ -47,6 +47,9 @@ recordings differ."""
 FOCAL_SHARE = 0.03
 """Depths that are wrong by less do not matter to a map; real calibrations are not better known."""
 
+MOTION_STEPS, STEPS = 5, 15
+"""Of the fit: the first ones find the motion alone."""
+
 PRIOR_SIGMA = 0.5
 """Of the logarithm of the factor: images may be half or twice as large as those calibrated."""
 
@@ -130,7 +133,9 @@ def _log_factor(camera: StereoCamera, then: Array, now: Array) -> tuple[float, f
     then, now = then.astype(np.float64), now.astype(np.float64)
     x, T = 0.0, np.eye(4)
     information = 0.0
-    for step in range(15):
+    for step in range(STEPS):
+        if step == MOTION_STEPS and _turn_rad(T) < MIN_TURN_RAD:
+            return None
         error, J = _residuals(camera, then, now, x, T)
         noise_px = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
         weight = (1.0 + np.square(error).sum(axis=1) / (2 * noise_px) ** 2) ** -2 / noise_px**2
@@ -138,14 +143,17 @@ def _log_factor(camera: StereoCamera, then: Array, now: Array) -> tuple[float, f
         g = np.einsum('nij,ni,n->j', J, error, weight)
         H[6, 6] += PRIOR_SIGMA**-2
         g[6] -= x * PRIOR_SIGMA**-2
-        size = 6 if step < 5 else 7  # first the motion alone
+        size = 6 if step < MOTION_STEPS else 7
         change = np.zeros(7)
         change[:size] = np.linalg.lstsq(H[:size, :size], g[:size], rcond=None)[0]
         T, x = se3_exp(change[:6]) @ T, x + float(np.clip(change[6], -PRIOR_SIGMA, PRIOR_SIGMA))
         information = float(H[6, 6] - H[6, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6])
-    turn_rad = np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
-    is_rigid = noise_px < RETURN_PX
-    return (x, information) if is_rigid and turn_rad > MIN_TURN_RAD else None
+    is_known = noise_px < RETURN_PX and _turn_rad(T) > MIN_TURN_RAD
+    return (x, information) if is_known else None
+
+
+def _turn_rad(T_now_then: Array) -> float:
+    return float(np.arccos(np.clip((np.trace(T_now_then[:3, :3]) - 1) / 2, -1, 1)))
 
 
 def _residuals(

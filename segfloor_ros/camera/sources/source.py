@@ -174,7 +174,7 @@ class StereoSource:
         return None if pair is None else self._rectified_pair(pair)
 
     def _rectified(self) -> Iterator[StereoFrame]:
-        return map(self._rectified_pair, self._decoded())
+        return (self._rectified_pair(pair) for pair in self._decoded())
 
     def _rectified_pair(self, pair: RawPair) -> StereoFrame:
         left, right = self._rectifier.rectify(pair.left, pair.right)
