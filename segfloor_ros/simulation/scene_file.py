@@ -18,13 +18,13 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse import csr_array
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
+from segfloor_ros.navigation.costmap import Ways, graph_of
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene, Wall
@@ -329,24 +329,11 @@ def _reachable(room_m: Array) -> Mask:
 
 
 def _graph(places: Mask, room_m: Array, cell_m: float) -> csr_array:
-    """Return the symmetric graph of steps between neighbouring places, weighted by their length and
-    by how tight it is there.
+    """Return the graph of steps between neighbouring places, weighted by their length and by how
+    tight it is there.
     """
-    index = np.full(np.array(places.shape) + 2, -1, np.int32)
-    index[1:-1, 1:-1][places] = np.arange(places.sum())
     tightness = np.clip((PLAN.comfort_m - room_m) / (PLAN.comfort_m - PLAN.clearance_m), 0, 1)
-    here = index[1:-1, 1:-1][places]
-    rows, columns, weights = [], [], []
-    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        shifted = index[1 + dy : index.shape[0] - 1 + dy, 1 + dx : index.shape[1] - 1 + dx][places]
-        linked = shifted >= 0
-        cost = np.hypot(dy, dx) * cell_m * (1 + 2 * tightness[linked])
-        rows += [here[linked], shifted[linked]]
-        columns += [shifted[linked], here[linked]]
-        weights += [cost, cost]
-    size = int(places.sum())
-    entries = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
-    return coo_array(entries, shape=(size, size)).tocsr()
+    return graph_of(places, cell_m, 1 + 2 * tightness)
 
 
 def _tour(graph: csr_array, cells: Cells, room_m: Array, cell_m: float) -> Cells:
@@ -355,33 +342,17 @@ def _tour(graph: csr_array, cells: Cells, room_m: Array, cell_m: float) -> Cells
     seen = _within(cells, cells[start], cell_m)
     visits, length_m = [start], 0.0
     while length_m < PLAN.longest_m and not seen.all():
-        costs, previous = _ways_from(graph, here)
-        costs = np.where(seen | ~np.isfinite(costs), np.inf, costs)
+        ways = Ways.from_place(graph, cells, here)
+        costs = np.where(seen | ~np.isfinite(ways.cost), np.inf, ways.cost)
         if not np.isfinite(costs).any():
             break
-        way = _way(previous, int(np.argmin(costs)))
+        way = ways.to(int(np.argmin(costs)))
         for place in way:
             seen |= _within(cells, cells[place], cell_m)
         visits += way
         length_m += float(np.hypot(*np.diff(cells[[here, *way]], axis=0).T).sum()) * cell_m
         here = visits[-1]
-    _, previous = _ways_from(graph, here)
-    return np.array(visits + _way(previous, start))
-
-
-def _ways_from(graph: csr_array, start: int) -> tuple[Array, NDArray[np.int32]]:
-    """Return the cost of the best way to every place, and the place before it on that way."""
-    costs, previous = dijkstra(graph, indices=[start], return_predecessors=True)
-    return costs[0], previous[0]
-
-
-def _way(previous: NDArray[np.int32], goal: int) -> list[int]:
-    """Return the places after the start up to the goal."""
-    way: list[int] = []
-    while previous[goal] >= 0:
-        way.append(goal)
-        goal = int(previous[goal])
-    return way[::-1]
+    return np.array(visits + Ways.from_place(graph, cells, here).to(start))
 
 
 def _within(cells: Cells, place: Cells, cell_m: float) -> Mask:
