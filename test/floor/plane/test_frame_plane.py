@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
-from floor_scenes import MOUNT, SMALL_CAMERA
+from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA
 
+from segfloor_ros.camera.model import Mount
+from segfloor_ros.floor.disparity.profile import FloorLine
 from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame
 
 
@@ -48,3 +50,18 @@ def test_where_nothing_is_matched_the_camera_is_as_it_is_mounted():
     expected = expectations(MOUNT, pitched(4.0))
     found = plane_of_frame(SMALL_CAMERA, 0, nothing, nothing, 1.0, expected).angles_height
     np.testing.assert_allclose(found, expected[0], atol=1e-6)
+
+
+@pytest.mark.parametrize('camera', [SMALL_CAMERA, CAMERA])
+def test_rows_of_a_view_that_begins_below_the_top_are_those_of_the_image(camera):
+    """The robot brakes: the floor is higher in the image than as the camera is mounted."""
+    true = Mount(0.29, MOUNT.pitch_rad + np.radians(2.0), np.radians(1.5))
+    first_row, line = camera.height // 2, FloorLine.of(camera, true)
+    rows = np.arange(first_row, camera.height)[:, None]
+    columns = np.arange(0, camera.width, 2 if camera is CAMERA else 1)
+    derolled = rows + line.shear * (columns - camera.cx)
+    disparity = (line.slope * (derolled - line.horizon)).astype(np.float32)
+    texture = np.full_like(disparity, 50.0)
+    fit = plane_of_frame(camera, first_row, disparity, texture, 1.0, expectations(MOUNT, np.eye(4)))
+    found = [true.pitch_rad, true.roll_rad, true.height_m]
+    np.testing.assert_allclose(fit.angles_height, found, atol=0.004)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from segfloor_ros.camera.model import Up
 from segfloor_ros.floor.plane.mount import PlaneSearch, level_prior
-from segfloor_ros.floor.plane.plane import Samples, plane_of
+from segfloor_ros.floor.plane.plane import Samples, plane_of, refine
 
 UNKNOWN = np.full(3, np.nan)
 DISPARITY_M = 40.0
@@ -72,3 +73,49 @@ def test_what_stands_far_away_does_not_tilt_the_floor(rises_are_known: bool) -> 
     frame = Samples(rays, np.zeros(3), disparity, weight, DISPARITY_M, rise, down)
     height_m = found([frame] * 4, None)[2]
     assert (abs(height_m - 0.5) < 0.01) == rises_are_known
+
+
+def test_a_floor_runs_along_the_path_on_it() -> None:
+    """The camera is pitched by 0.3: a level path leads up to the floor's plane that is steeper."""
+    path = np.array([[0.0, -np.sin(0.3), np.cos(0.3)], [0.2, -np.sin(0.3), np.cos(0.3)]])
+    start, unsure = TRUE + np.array([0.2, 0.1, 0.0]), np.array([0.5, 0.5, 0.1])
+    fit = refine([], start, UNKNOWN, path, start, unsure)
+    climb = np.abs(plane_of(fit.angles_height) * TRUE[2] @ path.T)
+    assert climb.max() < 0.1 * np.abs(plane_of(start) * TRUE[2] @ path.T).max()
+    assert fit.angles_height[0] == pytest.approx(TRUE[0], abs=0.03)
+
+
+def test_a_plane_is_that_of_the_first_camera_also_where_others_are_elsewhere() -> None:
+    """Each frame is seen from another place, and turned; no two of them agree by chance."""
+    rng = np.random.default_rng(4)
+    frames = []
+    for position_m, turn in (((0.4, -0.05, 0.8), 0.15), ((-0.3, 0.1, 1.5), -0.2)):
+        u, v = rng.uniform(-0.6, 0.6, 500), rng.uniform(0.1, 0.8, 500)
+        axes = np.array(
+            [[1, 0, 0], [0, np.cos(turn), np.sin(turn)], [0, -np.sin(turn), np.cos(turn)]]
+        )
+        rays = np.stack([u, v, np.ones(500)], axis=1) @ axes
+        above = 1 + plane_of(TRUE) @ np.array(position_m)
+        disparity = -DISPARITY_M * rays @ plane_of(TRUE) / above
+        seen = disparity > 2
+        down = axes[1] / 300
+        rise = np.full(seen.sum(), -DISPARITY_M * float(plane_of(TRUE) @ down) / above)
+        frames.append(
+            Samples(
+                rays[seen],
+                np.array(position_m),
+                disparity[seen],
+                np.ones(seen.sum()),
+                DISPARITY_M,
+                rise,
+                down,
+            )
+        )
+    unsure = np.array([0.5, 0.5, 1.0])
+    fit = refine(frames, TRUE + 0.02, UNKNOWN, np.zeros((0, 3)), TRUE + 0.02, unsure)
+    np.testing.assert_allclose(fit.angles_height, TRUE, atol=0.003)
+    assert fit.support == pytest.approx(1.0)
+    # As much as they weigh says how well it is known: a tenth says as much if it rises otherwise.
+    flat = [replace(frame, rise=np.zeros_like(frame.rise)) for frame in frames]
+    other = refine(flat, TRUE, UNKNOWN, np.zeros((0, 3)), TRUE, unsure)
+    assert (other.sigma > 2 * fit.sigma).all()
