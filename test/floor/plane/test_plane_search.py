@@ -119,3 +119,22 @@ def test_a_plane_is_that_of_the_first_camera_also_where_others_are_elsewhere() -
     flat = [replace(frame, rise=np.zeros_like(frame.rise)) for frame in frames]
     other = refine(flat, TRUE, UNKNOWN, np.zeros((0, 3)), TRUE, unsure)
     assert (other.sigma > 2 * fit.sigma).all()
+
+
+@pytest.mark.parametrize(('share_below', 'is_known'), [(0.0, True), (0.02, True), (0.1, False)])
+def test_a_plane_below_which_much_is_seen_is_no_floor(share_below: float, is_known: bool) -> None:
+    """A floor hides what is below it: a mirror, or a table, lets one see through."""
+    rng = np.random.default_rng(1)
+    u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.1, 0.8, 3000)
+    rays = np.stack([u, v, np.ones(3000)], axis=1)
+    disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
+    disparity[: int(share_below * 3000)] *= 0.5
+    search = PlaneSearch(UNKNOWN)
+    for _ in range(4):
+        fit = search.add(
+            Samples(rays, np.zeros(3), disparity, np.ones(3000), DISPARITY_M), level_prior(None), []
+        )
+    assert fit is not None
+    assert fit.angles_height == pytest.approx(TRUE, abs=0.01)
+    assert fit.violations == pytest.approx(share_below, abs=0.01)
+    assert search.is_known() is is_known
