@@ -25,6 +25,8 @@ MEAN_NOISE = 0.35
 """Error of the mean, or median, of neighbours as a share of that of one: they err together."""
 SIGMAS = 2.0
 """What differs by more sigmas is something else: one in twenty does by chance."""
+SAME_PX = SIGMAS * NOISE_PX
+"""Disparities that differ by no more may be of the same surface."""
 BLOCK_PX = 5
 """Side of the block that is matched."""
 SPECKLE_PX = 60
@@ -33,8 +35,6 @@ _SMALL_STEP, _LARGE_STEP = 8, 32
 """Penalties P1 of a disparity step of one and P2 of a larger one, per pixel of the block."""
 _UNIQUENESS_PERCENT = 5
 """How much better than the second the best match must be."""
-_LEFT_RIGHT_PX = 1
-"""Largest left-right difference of a disparity."""
 
 STEP = 16
 """Numbers of disparities are multiples of this."""
@@ -106,7 +106,7 @@ class DisparityMatcher:
         self.num_disparities = num_disparities
         area = block_px**2
         # OpenCV takes what is not positive for 1.
-        tolerance = _LEFT_RIGHT_PX if left_right_check else num_disparities
+        tolerance = round(SAME_PX) if left_right_check else num_disparities
         self._matcher = cv2.StereoSGBM_create(
             minDisparity=0,
             numDisparities=num_disparities,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.matching import SUBPIXEL
+from segfloor_ros.floor.disparity.matching import SAME_PX, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.observation import VDisparity
 
@@ -29,8 +29,6 @@ _FAR_M = 1000.0
 
 _OBSTACLE_M = 0.2
 """An upright surface of this height is taken out before the profile is fitted."""
-_RISE_PX = 1.0
-"""Disparities are compared over as many rows as it takes a floor to rise by this."""
 _RISE_TOLERANCE = 0.75
 
 
@@ -191,10 +189,12 @@ def v_disparity(
 def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
     """Tell where disparities (R, W) rise down the image as those of a floor do, (R, W).
 
+    They are compared over as many rows as it takes a floor to rise by more than noise.
+
     slope: of a level floor, in pixels per row. Upright surfaces do not rise; nor does floor of
     little texture, where semi-global matching prefers level steps.
     """
-    half = math.ceil(_RISE_PX / slope / 2)
+    half = math.ceil(SAME_PX / slope / 2)
     rise = np.zeros_like(disparity)
     rise[half:-half] = disparity[2 * half :] - disparity[: -2 * half]
     return is_rise(rise / np.float32(2 * half), slope)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.floor.disparity.matching import SAME_PX
 from segfloor_ros.floor.disparity.photometric import EDGE_SLOPE
 from segfloor_ros.floor.disparity.profile import FloorProfile, pixels_where
 from segfloor_ros.floor.disparity.view import STEP_PX, FloorView, surface_above
@@ -44,7 +45,6 @@ _ROWS, _COLUMNS = 5, 7
 _GAP_ROWS = 2
 _MIN_SHARE = 0.25
 _MAX_SPREAD_PX = 1.2
-_TOLERANCE_PX = 1.0
 _BEHIND = 0.6
 """The wall behind may show this share of the disparity: the ground may dip, the pitch err."""
 _EDGE_ROWS = 4
@@ -267,8 +267,8 @@ def fill_to_contact(
     contrary = ~compared.consistent[part] | compared.denied[part]
     upright_px = _upright_above(disparity[part], contrary & textured[part])
     floor_px = compared.floor_px
-    nearest, farthest = floor_px + np.float32(_TOLERANCE_PX), np.float32(_BEHIND) * floor_px
-    contact = (upright_px < nearest) & (upright_px > farthest - np.float32(_TOLERANCE_PX))
+    nearest, farthest = floor_px + np.float32(SAME_PX), np.float32(_BEHIND) * floor_px
+    contact = (upright_px < nearest) & (upright_px > farthest - np.float32(SAME_PX))
     rows = np.arange(small.shape[0], dtype=np.int32)[:, None]
     above = np.maximum.accumulate(np.where(open_, 0, rows), axis=0)
     last = small.shape[0] - 1

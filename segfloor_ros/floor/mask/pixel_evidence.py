@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import measured_sigma_px
-from segfloor_ros.floor.disparity.matching import MEAN_NOISE, NOISE_PX, SIGMAS, SUBPIXEL
+from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SIGMAS, SUBPIXEL
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.disparity.view import FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
@@ -37,7 +37,6 @@ _WINDOW_SHARE = 0.25
 """Of the image's width: floor so near looks alike. A sun, a lamp and dust change it slowly."""
 _FEW = 0.1
 """Where floor covers less than this share of the window, all floor of the image counts."""
-_SMOOTH_PX = 5
 _SHRINK = 4
 _STEP_GREY = 1.0
 """Grey levels are whole: no surface is known better."""
@@ -194,7 +193,7 @@ def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[
     What is measured as floor may be a thing that is hardly higher: the mean is taken twice, the
     second time without what stood out.
     """
-    grey = cv2.blur(image, (_SMOOTH_PX, _SMOOTH_PX)).astype(np.float32)
+    grey = cv2.blur(image, (BLOCK_PX, BLOCK_PX)).astype(np.float32)
     odd: NDArray[np.bool_] = np.zeros(image.shape, np.bool_)
     for _ in range(2):
         counted = (floor & ~odd).astype(np.float32)

@@ -32,7 +32,7 @@ from segfloor_ros.floor.disparity.photometric import (
     texture_grey,
 )
 from segfloor_ros.floor.disparity.profile import pixels_where
-from segfloor_ros.floor.disparity.view import column_step, surface_above
+from segfloor_ros.floor.disparity.view import STEP_PX, column_step, surface_above
 from segfloor_ros.floor.plane.plane import (
     LEVEL_SIGMA,
     SAMPLES,
@@ -77,8 +77,6 @@ _TILT_TOLERANCE_DEG = 1.0
 MAX_KEYFRAMES = 20
 """Where so many do not show the floor well enough, nothing is said."""
 
-_COLUMN_STEP_PX = 2
-"""Every other column is searched for the base of things."""
 _BASE_WEIGHT = 8.0
 """All of the surface above places a base: it counts as so many samples."""
 _AROUND_ROWS = 15
@@ -379,8 +377,8 @@ def find_bases(
     """Return rows, columns (N,) and disparities (N,) of where upright things stand on blank floor
     in an image (H, W) of known disparities (H, W), 0 for none. enough: texture that is no noise.
     """
-    image, disparity = left[:, ::_COLUMN_STEP_PX], disparity_px[:, ::_COLUMN_STEP_PX]
-    texture = texture_grey(left, TEXTURE_WINDOW_PX)[:, ::_COLUMN_STEP_PX]
+    image, disparity = left[:, ::STEP_PX], disparity_px[:, ::STEP_PX]
+    texture = texture_grey(left, TEXTURE_WINDOW_PX)[:, ::STEP_PX]
     slope = row_slope(image)
     strongest = cv2.dilate(slope, np.ones((_AROUND_ROWS, 1), np.uint8))
     base = (slope == strongest) & (slope >= EDGE_SLOPE)
@@ -391,7 +389,7 @@ def find_bases(
     base &= (share > _UPRIGHT_SHARE) & (variance < _UPRIGHT_SPREAD_PX**2)
     base[-_BLANK_GAP - _BLANK_ROWS :] = False
     rows, columns = np.nonzero(base)
-    return rows, _COLUMN_STEP_PX * columns, mean[rows, columns]
+    return rows, STEP_PX * columns, mean[rows, columns]
 
 
 def _below(blank: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.matching import NOISE_PX
+from segfloor_ros.floor.disparity.matching import NOISE_PX, SAME_PX
 from segfloor_ros.floor.disparity.profile import (
     HEIGHT_SIGMA,
     PITCH_SIGMA_RAD,
@@ -32,9 +32,6 @@ LEVEL_SIGMA = np.array([math.radians(7.0), math.radians(2.0), math.inf])
 """Cameras look roughly ahead and hardly roll, one sigma of pitch and roll; height is not known."""
 SAMPLES = 4000
 """So many pixels of an image are looked at: their neighbours say the same."""
-_INLIER_PX = 1.0
-"""Disparities this near to a plane's support it; where its own is smaller nothing is known of it.
-"""
 _BEND = 0.05
 """A floor bends, and its disparity differs from the plane's, by this share."""
 _VIOLATION_WEIGHT = 1.5
@@ -176,10 +173,10 @@ def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.boo
     expected = samples.rays @ planes.T
     # In place: thousands of samples times hundreds of planes take most of a process's memory.
     expected *= -samples.disparity_m / np.where(np.abs(along) < 1e-6, 1e-6, along)
-    visible = expected > _INLIER_PX
+    visible = expected > SAME_PX
     error = samples.disparity_px[:, None] - expected
     expected *= -_BEND
-    expected -= 2 * _INLIER_PX
+    expected -= 2 * SAME_PX
     return error, expected, visible
 
 
@@ -192,7 +189,7 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     planes = plane_of(angles_height)
     error, limit, visible = _seen(samples, planes)
     below = visible & (error < limit)
-    on = np.divide(error, _INLIER_PX, out=error)
+    on = np.divide(error, SAME_PX, out=error)
     np.multiply(on, on, out=on)
     np.subtract(1, on, out=on)
     np.maximum(on, 0, out=on)
@@ -211,7 +208,7 @@ def shares(frames: list[Samples], angles_height: Array) -> tuple[float, float]:
         error, limit, visible = _seen(samples, plane_of(angles_height)[None])
         weight = np.where(visible[:, 0], samples.weight, 0)
         total += float(weight.sum())
-        on += float(weight[np.abs(error[:, 0]) < _INLIER_PX].sum())
+        on += float(weight[np.abs(error[:, 0]) < SAME_PX].sum())
         below += float(weight[error[:, 0] < limit[:, 0]].sum())
     return (on / total, below / total) if total > 0 else (0.0, 1.0)
 
@@ -295,7 +292,7 @@ def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tupl
         expected = -samples.disparity_m * toward / along
         error = samples.disparity_px - expected
         weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
-        weight = np.where(expected > _INLIER_PX, weight, 0)
+        weight = np.where(expected > SAME_PX, weight, 0)
         weight /= _CORRELATED_SAMPLES * NOISE_PX**2
         jacobian = samples.rays @ by_state
         jacobian -= (toward / along)[:, None] * (samples.position_m @ by_state)
