@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -36,7 +37,10 @@ from segfloor_ros.trajectory import read_trajectory
 
 SUFFIX = '.rrd'
 
-SHARE = 0.02
+WEB_PORT = 9090
+"""Where the page for the browser is served, on this machine."""
+
+SHARE = 0.015
 """Of the time of a drive that showing its frames may take, and as much its keyframes."""
 
 WIDTH_PX, QUALITY = 480, 80
@@ -82,7 +86,10 @@ def open_view(target: str | None) -> Iterator[View | None]:
     elif os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'):
         stream.spawn()
     else:
-        rerun.serve_web_viewer(connect_to=stream.serve_grpc())
+        address = stream.serve_grpc()
+        rerun.serve_web_viewer(web_port=WEB_PORT, connect_to=address)
+        page = f'http://localhost:{WEB_PORT}?url={quote(address, safe="")}'
+        console.print(f'view: {page}', highlight=False, soft_wrap=True)
         is_served = True
     try:
         yield View(stream, rerun)
@@ -237,6 +244,7 @@ class View:
         drawn = self._rr.GridMap(
             data=pixels_of(grid.cells).tobytes(),
             format=form,
+            colormap=self._rr.components.Colormap.Grayscale,
             cell_size=grid.resolution_m,
             translation=[*grid.origin_xy_m, 0.0],
         )
@@ -289,6 +297,7 @@ class View:
         stages = summary['stages'].items()
         rows += [(stage, f'{times["p50_ms"]:.1f} ms, median') for stage, times in stages]
         self.about(folder.name, rows)
+        self.state(first_ns, f'{summary["tracked_frames"]} of {summary["frames"]} frames tracked')
         self._loops_ns = [round(1e9 * at_s) for at_s in summary.get('loop_times_s', [])]
         self.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
         self.cloud(first_ns, read_ply(folder / 'labelled_cloud.ply'))

@@ -78,6 +78,7 @@ def test_a_run_shows_images_floor_cloud_path_map_times_and_state(run):
     grid = load_map(out / 'map.yaml')
     (data,) = values(shown, '/world/map', 'data')
     np.testing.assert_array_equal(np.ravel(data), pixels_of(grid.cells).ravel())
+    assert values(shown, '/world/map', 'colormap') == [1]  # grey levels
     assert values(shown, '/world/map', 'cell_size') == pytest.approx([grid.resolution_m])
 
 
