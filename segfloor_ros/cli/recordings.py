@@ -13,8 +13,16 @@ from rich.table import Table
 
 from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, NewBag
 from segfloor_ros.camera.bag_writer import convert as write_bag
-from segfloor_ros.camera.calibration.chessboard import CalibrationResult, calibrate_folder
+from segfloor_ros.camera.calibration.chessboard import (
+    DICTIONARY,
+    FILES,
+    Board,
+    CalibrationResult,
+    calibrate_folder,
+    check_recording,
+)
 from segfloor_ros.camera.model import DEPTH
+from segfloor_ros.camera.rig.check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.inspection import Inspection, Stream, inspect_recording
 from segfloor_ros.camera.sources.source import StereoSource
@@ -251,41 +259,110 @@ def convert(
 
 def calibrate(
     folder: Annotated[
-        Path, typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.')
-    ],
-    square_m: Annotated[
-        float,
-        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
-    ],
-    board: Annotated[
-        str, typer.Option(help='Inner corners along the long and the short side.')
-    ] = '9x6',
-    out: Annotated[
         Path | None,
-        typer.Option('--out', help="Folder for left.yaml and right.yaml; else the pictures'."),
+        typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.'),
     ] = None,
+    square_m: Annotated[
+        float | None,
+        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
+    ] = None,
+    board: Annotated[
+        str,
+        typer.Option(help='Inner corners along both sides: the long one first, ChArUco as drawn.'),
+    ] = '9x6',
+    marker_m: Annotated[
+        float,
+        typer.Option('--marker', callback=within(0), help='ChArUco: side of a marker in metres.'),
+    ] = 0.0,
+    dictionary: Annotated[
+        str, typer.Option(help='ChArUco: of its markers, e.g. 4X4_50.')
+    ] = DICTIONARY,
+    out: Annotated[
+        Path | None, typer.Option('--out', help="Folder for what is written; else the pictures'.")
+    ] = None,
+    recording: Annotated[
+        str | None,
+        typer.Option(
+            '--check',
+            metavar='RECORDING',
+            help='In place of pictures: measure how the calibration of a recording fits it, with '
+            '--square also by the length of a board in view. Status 1: it does not.',
+        ),
+    ] = None,
+    params: terminal.Params = None,
+    assignments: terminal.Set = None,
 ) -> None:
-    """Calibrate a stereo pair from chessboard pictures; writes ROS camera calibration files.
+    """Calibrate a stereo pair from pictures of a board: ROS calibration files and a report.
 
     \b
     segfloor calibrate pictures --square 0.03 --board 9x6
+    segfloor calibrate pictures --square 0.03 --board 10x7 --marker 0.022 --dictionary 5X5_100
+    segfloor calibrate --check drive.mcap --square 0.03 --board 9x6
     """
     sides = re.fullmatch('([0-9]{1,2})x([0-9]{1,2})', board)
     if sides is None:
         raise SettingsError(f'--board {board}: expected e.g. 9x6')
+    pattern = None
+    if square_m is not None:
+        pattern = Board(int(sides[1]), int(sides[2]), square_m, marker_m, dictionary)
+    if recording is not None and folder is None:
+        settings = terminal.configuration(params, assignments, recording).stereo_camera
+        _check_calibration(open_source(settings), pattern)
+        return
+    if folder is None or pattern is None or recording is not None:
+        raise SettingsError('give a folder of pictures and --square, or --check RECORDING alone')
     with terminal.progress_bar('searching boards', None) as progress:
-        result = calibrate_folder(folder, square_m, (int(sides[1]), int(sides[2])), out, progress)
-    _print_result(result, out or folder)
+        result = calibrate_folder(folder, pattern, out, progress)
+    if result.left_out:
+        terminal.print_error(f'{folder}: left out: {result.left_out}')
+    _print_calibration(result, out or folder)
 
 
-def _print_result(result: CalibrationResult, folder: Path) -> None:
+def _print_calibration(result: CalibrationResult, folder: Path) -> None:
+    """Print figures of a calibration and the errors of each pair, and write its report."""
+    # Imported here: Matplotlib takes a second that other commands should not wait for.
+    from segfloor_ros.evaluation.report import write_calibration_page
+
+    table = figure_table('pair', 'left px', 'right px', 'rows px')
+    for view, errors_px in zip(result.views, result.view_errors_px, strict=True):
+        table.add_row(view.paths[0].name, *(f'{error:.3f}' for error in errors_px))
+    console.print(table)
     camera = result.calibration.camera
     rows = [
-        ('pairs used', f'{result.pairs_used} of {result.pairs_total}'),
+        ('pairs used', f'{len(result.views)} of {result.pairs_total}'),
         ('reprojection error', f'{result.rms_px:.3f} px RMS'),
         ('row difference after rectification', f'{result.epipolar_rms_px:.3f} px RMS'),
+        ('worst pair', result.views[0].paths[0].name),
+        ('board seen in the left image', f'{result.seen_share(0):.0%} of it'),
+        ('board seen in the right image', f'{result.seen_share(1):.0%} of it'),
         ('focal length, rectified', f'{camera.fx:.1f} px'),
         ('baseline', f'{camera.baseline_m:.4f} m'),
     ]
-    console.print(terminal.value_table('calibration', rows, str(folder)))
-    console.print(f'{folder / "left.yaml"}\n{folder / "right.yaml"}', highlight=False)
+    console.print(value_table('calibration', rows, str(folder)))
+    page = write_calibration_page(result, rows, folder)
+    for path in (*(folder / name for name in FILES), page):
+        console.print(str(path), highlight=False, soft_wrap=True)
+
+
+def _check_calibration(source: StereoSource, board: Board | None) -> None:
+    """Print how the calibration of a recording fits it. Raises typer.Exit where it does not."""
+    with terminal.progress_bar('checking', source.frame_count) as progress:
+        found = check_recording(source, board, progress)
+    lags = [fault.value for fault in found.faults if fault.fault == 'not_simultaneous']
+    lag, rows, length = 'none seen', 'not measured: too little is seen', 'no board is seen'
+    if lags:
+        lag = f'{lags[0]:.0f} ms'
+    elif found.pairs < SETTLED_FRAMES:
+        lag = f'not measured: takes {SETTLED_FRAMES} pairs of a moving camera'
+    if found.rows_px is not None:
+        rows = '{:.2f} px, at most {:.2f} px'.format(*found.rows_px)
+    if found.scale is not None and board is not None:
+        true_m = board.diagonal_m
+        length = f'{found.scale * true_m:.4f} m for {true_m:.4f} m, in {found.boards} pairs'
+    figures = [('pairs', str(found.pairs)), ('row error', rows), ('lag between the eyes', lag)]
+    figures += [] if board is None else [('first to last corner of the board', length)]
+    console.print(value_table('calibration', figures, source.name))
+    for fault in found.faults:
+        terminal.print_error(fault.line())
+    if found.faults:
+        raise typer.Exit(1)

@@ -11,14 +11,17 @@ from typing import Any
 import cv2
 import numpy as np
 
+from segfloor_ros.camera.calibration.chessboard import PAGE, CalibrationResult
 from segfloor_ros.errors import os_errors
 from segfloor_ros.evaluation.map_score import MapScore, compare, draw_overlay, score_map
 from segfloor_ros.evaluation.report_pictures import (
     ReportData,
     cloud_picture,
+    coverage_picture,
     keyframe_pictures,
     map_picture,
     memory_picture,
+    pair_picture,
     read_run,
     v_disparity_picture,
 )
@@ -41,6 +44,36 @@ def write_report(run: Path, truth: Path | None = None) -> Path:
     path = run / REPORT
     with os_errors(f'{path}: cannot be written'):
         add_files(run, {REPORT: page.encode()})
+    return path
+
+
+def write_calibration_page(
+    result: CalibrationResult, figures: list[tuple[str, str]], folder: Path
+) -> Path:
+    """Write calibration.html beside the files of a calibration and return its path.
+
+    figures: names and values that the page begins with. Raises InputError.
+    """
+    names = [', '.join(path.name for path in view.paths) for view in result.views]
+    rows = [
+        [name, *(f'{error:.3f}' for error in errors_px)]
+        for name, errors_px in zip(names, result.view_errors_px, strict=True)
+    ]
+    sizes_px = np.linalg.norm(result.view_errors_px[:, :2], axis=1)
+    shares = (sizes_px / sizes_px.max()).tolist()
+    seen = 'Corners in the left and the right image; orange: those of the worst pair'
+    content = [
+        _fact_row([(value, name) for name, value in figures]),
+        _section('Left out', html.escape(result.left_out)),
+        _section('Where the board was seen', _figure(coverage_picture(result), seen)),
+        _section('Errors', _table(('pair', 'left px', 'right px', 'rows px', ''), rows, shares)),
+        _section('The worst pair, rectified', _figure(pair_picture(result), names[0], 'jpeg')),
+    ]
+    about = 'Errors are RMS: of the corners in each image, of their rows after rectification.'
+    path = folder / PAGE
+    with os_errors(f'{path}: cannot be written'):
+        page = html_page(f'Segfloor: calibration of {folder.name}', about, ''.join(content))
+        add_files(folder, {PAGE: page.encode()})
     return path
 
 
@@ -200,16 +233,26 @@ def _v_disparity(data: ReportData) -> str:
 
 
 def _stages(summary: dict[str, Any]) -> str:
-    longest = max([stage['p95_ms'] for stage in summary['stages'].values()] or [1.0])
-    rows = ''.join(
-        f'<tr><td>{html.escape(name)}</td><td>{stage["count"]}</td><td>{stage["p50_ms"]:.1f}</td>'
-        f'<td>{stage["p95_ms"]:.1f}</td><td>{stage["max_ms"]:.1f}</td><td class="bar">'
-        f'<div style="width:{100 * stage["p50_ms"] / longest:.1f}%"></div></td></tr>'
-        for name, stage in summary['stages'].items()
+    stages = summary['stages']
+    times = ('p50_ms', 'p95_ms', 'max_ms')
+    rows = [
+        [name, str(stage['count']), *(f'{stage[key]:.1f}' for key in times)]
+        for name, stage in stages.items()
+    ]
+    longest = max([stage['p95_ms'] for stage in stages.values()] or [1.0])
+    shares = [stage['p50_ms'] / longest for stage in stages.values()]
+    return _table(('stage', 'calls', 'median ms', 'p95 ms', 'max ms', ''), rows, shares)
+
+
+def _table(names: tuple[str, ...], rows: list[list[str]], shares: list[float]) -> str:
+    """Return rows with a bar at the end of each, empty without rows. shares: of its full length."""
+    head = ''.join(f'<th>{name}</th>' for name in names)
+    lines = ''.join(
+        f'<tr>{"".join(f"<td>{html.escape(cell)}</td>" for cell in row)}'
+        f'<td class="bar"><div style="width:{100 * share:.1f}%"></div></td></tr>'
+        for row, share in zip(rows, shares, strict=True)
     )
-    names = ('stage', 'calls', 'median ms', 'p95 ms', 'max ms', '')
-    head = '<tr>' + ''.join(f'<th>{name}</th>' for name in names) + '</tr>'
-    return f'<div class="scroll"><table>{head}{rows}</table></div>' if rows else ''
+    return f'<div class="scroll"><table><tr>{head}</tr>{lines}</table></div>' if rows else ''
 
 
 def _memory(summary: dict[str, Any]) -> str:

@@ -19,6 +19,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.calibration.chessboard import (
+    CalibrationResult,
+    eight_bit,
+    rectified_pixels,
+)
+from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud.labelled_cloud import FLOOR as FLOOR_POINT
@@ -26,7 +32,7 @@ from segfloor_ros.cloud.labelled_cloud import OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.cloud.labelled_cloud import UNKNOWN as UNKNOWN_POINT
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.maps import MapTruth, load_truth
-from segfloor_ros.files.images import check_same_size, read_mask
+from segfloor_ros.files.images import check_same_size, read_grey, read_mask
 from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
@@ -47,6 +53,8 @@ FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
 
 STEPS = 1, 2, 5
 """Lengths of a scale bar, times a power of ten."""
+
+CORNER_TINT, CORNER_PX = (40, 140, 250), 4
 
 STRIP_WIDTH_PX = 480
 MAX_DRAWN_POINTS = 60000
@@ -168,6 +176,39 @@ def _legend(axes: Axes, colours: dict[str, str]) -> None:
         fontsize=9,
         frameon=False,
     )
+
+
+def coverage_picture(result: CalibrationResult) -> bytes:
+    """Draw where both eyes saw corners of the board, their hull, and those of the worst pair."""
+    eye, worst = result.calibration.left, result.views[0]
+    figure = Figure(figsize=(10, 0.4 + 4.6 * eye.height / eye.width), layout='constrained')
+    for side, axes in enumerate(figure.subplots(1, 2)):
+        corners = np.concatenate([view.corners[side] for view in result.views])
+        axes.fill(*cv2.convexHull(corners)[:, 0].T, color='tab:blue', alpha=0.12, linewidth=0)
+        axes.plot(*corners[:, 0].T, '.', color='tab:blue', markersize=2.5)
+        axes.plot(*worst.corners[side][:, 0].T, '.', color='tab:orange', markersize=4)
+        title = f'{("left", "right")[side]}: {result.seen_share(side):.0%} of the image'
+        axes.set(title=title, xlim=(0, eye.width), ylim=(eye.height, 0), aspect='equal')
+    return _png(figure)
+
+
+def pair_picture(result: CalibrationResult) -> bytes:
+    """Draw the worst pair as it is rectified, with its corners, and lines on which both eyes should
+    have them.
+    """
+    calibration, view = result.calibration, result.views[0]
+    left, right = (eight_bit(read_grey(path)) for path in view.paths)
+    pair = np.hstack(StereoRectifier(calibration).rectify(left, right))
+    drawn = cv2.cvtColor(pair, cv2.COLOR_GRAY2BGR)
+    left_px = rectified_pixels(calibration.left, view.corners[0])
+    right_px = rectified_pixels(calibration.right, view.corners[1])
+    right_px[:, 0] += left.shape[1]
+    for u, v in np.rint(np.concatenate([left_px, right_px])).astype(int).tolist():
+        cv2.circle(drawn, (u, v), CORNER_PX, CORNER_TINT, 1, cv2.LINE_AA)
+    by_row = left_px[np.argsort(left_px[:, 1])]
+    for _, v in np.rint(by_row[:: result.board.columns]).astype(int).tolist():
+        cv2.line(drawn, (0, v), (pair.shape[1] - 1, v), CORNER_TINT, 1)
+    return bytes(cv2.imencode('.jpg', drawn)[1])
 
 
 def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:

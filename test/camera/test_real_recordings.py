@@ -11,7 +11,7 @@ from camera_recordings import opened
 from test_bag_writer import assert_same_recording
 
 from segfloor_ros.camera.bag_writer import ImageCoding, convert
-from segfloor_ros.camera.calibration.chessboard import calibrate_folder
+from segfloor_ros.camera.calibration.chessboard import Board, calibrate_folder
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.camera.sources import StereoSource
 
@@ -128,8 +128,8 @@ def test_real_recordings_survive_the_round_trip(
 
 
 def test_the_chessboard_camera_is_that_of_opencv(shared_data: Path, tmp_path: Path) -> None:
-    result = calibrate_folder(shared_data / 'chessboard', 0.025, out=tmp_path)
-    assert result.pairs_used == 13
+    result = calibrate_folder(shared_data / 'chessboard', Board(9, 6, 0.025), out=tmp_path)
+    assert len(result.views) == 13
     storage = cv2.FileStorage(str(shared_data / 'chessboard' / 'intrinsics.yml'), 0)
     published_fx = storage.getNode('M1').mat()[0, 0]
     for eye in (result.calibration.left, result.calibration.right):

@@ -1,7 +1,17 @@
 """`segfloor convert` and `segfloor calibrate` for real."""
 
+import cv2
 import numpy as np
-from chessboards import BOARD, K_TRUE, SQUARE_M, write_boards
+import pytest
+from chessboards import (
+    BOARD,
+    DICTIONARY,
+    K_TRUE,
+    MARKER_M,
+    SQUARE_M,
+    write_boards,
+    write_marked_boards,
+)
 from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 
@@ -57,6 +67,11 @@ def test_calibrate_writes_what_the_reader_reads(tmp_path):
     done = segfloor('calibrate', boards, *form, '--out', tmp_path)
     assert done.returncode == 0, done.stderr
     assert '8 of 8' in done.stdout
+    assert done.stdout.splitlines()[-1] == str(tmp_path / 'calibration.html')
+    page = (tmp_path / 'calibration.html').read_text()
+    # Every pair has its row, and both pictures are there: coverage and the worst pair.
+    assert [f'left{i:02d}.png, right{i:02d}.png</td>' in page for i in range(1, 9)] == [True] * 8
+    assert page.count('<img') == 2
     calibration = read_calibration(tmp_path / 'left.yaml', tmp_path / 'right.yaml')
     np.testing.assert_allclose(calibration.left.K, K_TRUE, atol=3.0)
 
@@ -70,7 +85,47 @@ def test_calibrate_solves_the_pictures_of_opencv(shared_data, tmp_path):
     assert abs(calibration.left.K[0, 0] - 534) < 10
 
 
+def test_pictures_of_another_board_end_in_one_line(tmp_path):
+    boards = write_boards(tmp_path / 'boards', 8)
+    done = segfloor('calibrate', boards, '--square', 0.03, '--board', '8x6', '--out', tmp_path)
+    assert done.returncode == 2
+    said = [line for line in done.stderr.splitlines() if line.startswith('segfloor')]
+    assert len(said) == 1
+    assert '0 of 8 pairs' in said[0]
+    assert '8 do not show enough of it in both eyes (first: left01.png' in said[0]
+    assert not list(tmp_path.glob('*.*'))
+
+
+@pytest.mark.skipif(not hasattr(cv2, 'aruco'), reason='OpenCV without aruco')
+def test_calibrate_takes_boards_with_markers(tmp_path):
+    boards = write_marked_boards(tmp_path / 'boards', 6)
+    (boards / 'left03.png').write_bytes(b'no image')
+    form = ('--square', SQUARE_M, '--board', 'x'.join(map(str, BOARD)))
+    markers = ('--marker', MARKER_M, '--dictionary', DICTIONARY)
+    done = segfloor('calibrate', boards, *form, *markers, '--out', tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert '5 of 6' in done.stdout
+    assert 'left out: 1 cannot be read (first: ' in done.stderr
+
+
 def test_calibrate_refuses_a_board_in_no_form(tmp_path):
     done = segfloor('calibrate', tmp_path, '--square', 0.03, '--board', 'nine')
     assert done.returncode == 2
     assert '--board nine' in done.stderr
+
+
+def test_calibrate_checks_a_recording(tmp_path):
+    boards = write_boards(tmp_path / 'boards', 11)
+    form = ('--square', SQUARE_M, '--board', 'x'.join(map(str, BOARD)))
+    assert segfloor('calibrate', boards, *form).returncode == 0
+    done = segfloor('calibrate', '--check', boards, *form)
+    assert done.returncode == 0, done.stderr
+    assert 'm for 0.2163 m, in 2 pairs' in done.stdout
+    # The same pictures of larger squares: the calibration makes them too small.
+    larger = ('--square', 1.2 * SQUARE_M, *form[2:])
+    done = segfloor('calibrate', '--check', boards, *larger)
+    assert done.returncode == 1
+    assert 'show the board 0.83' in done.stderr
+    done = segfloor('calibrate')
+    assert done.returncode == 2
+    assert 'give a folder of pictures and --square, or --check RECORDING' in done.stderr
