@@ -29,6 +29,7 @@ from segfloor_ros.messages.topics import (
     CAMERA,
     GRID,
     NODES,
+    PATIENCE_S,
     ROBOT,
     SLAM,
     TOPICS,
@@ -38,9 +39,6 @@ from segfloor_ros.messages.topics import (
 )
 from segfloor_ros.navigation.explorer import Explorer
 from segfloor_ros.processes import Interrupt
-
-ANSWER_S = 2.0
-"""What a node has not answered for so long, in real time, is not waited for: it may be gone."""
 
 OnMap = Callable[[float, OccupancyGrid, str], None]
 """Told the time of the robot, the map and the phase."""
@@ -135,11 +133,11 @@ class Pilot:
         return 1e-9 * max(self.found.true_poses, default=0)
 
     def answer(self) -> None:
-        """Command the robot at the frames that the nodes are done with, or do not answer."""
+        """Command the robot at the frames that the nodes are done with, or have lost."""
         now_s = time.monotonic()
         while self._waiting:
             stamp_ns, since_s = next(iter(self._waiting.items()))
-            if not self._is_done(stamp_ns) and now_s < since_s + ANSWER_S:
+            if not self._is_done(stamp_ns) and now_s < since_s + PATIENCE_S:
                 return
             del self._waiting[stamp_ns]
             self._command(stamp_ns)
