@@ -335,7 +335,7 @@ class MountViewer:
         if enough is not None:
             slope, block = texture_grey(left, 1), (BLOCK_PX, BLOCK_PX)
             texture = cv2.blur(slope, block)[rows, columns]
-            weight = texture_weight(texture, enough)
+            weight = texture_weight(texture, 1.25 * enough)
             # A disparity is that of the texture in its block, and belongs where that is.
             slope *= np.arange(len(left), dtype=np.float32)[:, None]
             shown_at = cv2.blur(slope, block)[rows, columns] / np.maximum(texture, 1e-6)
