@@ -192,7 +192,7 @@ def test_a_camera_that_hangs_on_its_body_is_put_on_the_base_with_it(start, drive
         others.append(Broadcaster(graph))
         others[0].send_fixed(('camera_link', CAMERA_FRAME, T_body_camera))
 
-    chain = start(broadcast, tf_wait_s=2.0)
+    chain = start(broadcast, tf_wait_s=4.0)
     tf = Listener(chain.graph)
     chain.graph.connected([others[0].fixed])
     chain.drive(frames[:1])
