@@ -77,6 +77,11 @@ _TILT_TOLERANCE_DEG = 1.0
 MAX_KEYFRAMES = 20
 """Where so many do not show the floor well enough, nothing is said."""
 
+MORE_TEXTURE = 1.25
+"""A mount is kept, so it asks for more texture than the plane of one frame. As measured: with 1 the
+mount of KITTI 06 rolls by 1.6° in place of 0.8°, with 1.5 a rug alone shows none.
+"""
+
 _BASE_WEIGHT = 8.0
 """All of the surface above places a base: it counts as so many samples."""
 _AROUND_ROWS = 15
