@@ -150,7 +150,8 @@ class Pilot:
             return False
         values = status.values
         is_mapped = values.get('keyframe') != '1' or stamp_ns in notes.failed
-        has_pose = stamp_ns in self._poses and stamp_ns in self._scans
+        # Of frames that come close together only the newest has a scan.
+        has_pose = stamp_ns in self._poses and max(self._scans, default=0) >= stamp_ns
         return (is_mapped or self._map_ns >= stamp_ns) and (
             values.get('tracked') != '1' or has_pose
         )
