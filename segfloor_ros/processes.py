@@ -89,8 +89,13 @@ def terminated_like_interrupted() -> Iterator[None]:
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
     """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
-    process and the note that it runs. A started program gets the default handlers again.
+    process and the note that it runs, or into a fork, where exceptions are ignored. A started
+    program gets the default handlers again. Beside the main thread, which alone gets signals,
+    nothing is done.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     received: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:

@@ -30,7 +30,7 @@ from typing import Any
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError, SettingsError, without_credentials
 from segfloor_ros.files.results import scratch_folder
-from segfloor_ros.processes import end_with_parent, how_it_ended, start_apart
+from segfloor_ros.processes import end_with_parent, how_it_ended, interrupts_deferred, start_apart
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import Outcome, measure_run, start_pose_of
 from segfloor_ros.suite.result_files import Cache, digest_of, local_copy, pack, unpack
@@ -52,21 +52,23 @@ class ProgramError(SegfloorError):
 
 def run_segfloor(words: list[str], log: Path, timeout_s: float) -> None:
     """Run the command `segfloor` and end it where it takes too long. Raises ProgramError."""
-    with log.open('wb') as output:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'segfloor_ros.cli.main', *words],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=functools.partial(end_with_parent, os.getpid()),
-        )
+    process = None
     try:
+        with log.open('wb') as output, interrupts_deferred():
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'segfloor_ros.cli.main', *words],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=functools.partial(end_with_parent, os.getpid()),
+            )
         status = process.wait(timeout_s)
     except subprocess.TimeoutExpired:
         raise ProgramError(f'no map within {timeout_s:g} s') from None
     finally:
-        _end(process)
+        if process is not None:
+            _end(process)
     if status:
         lines = log.read_text(errors='replace').strip().splitlines()
         last = lines[-1].removeprefix('segfloor: ') if lines else ''
