@@ -12,7 +12,6 @@ itself, a plain face not at all. Patches that overlap hold the same pixels and e
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,9 +44,8 @@ ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
 MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 """No patch is measured better: lenses, rectification and the shape of things are not perfect."""
 
-MIN_CORRELATION = math.sqrt(MAJORITY)
-"""Of the patches of one point in both images: its square is the share of the one's variance that
-the other explains."""
+MIN_CORRELATION = 0.7
+"""Of the patches of one point in both images."""
 
 Patches = NDArray[np.float32]
 
