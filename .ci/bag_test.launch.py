@@ -19,7 +19,7 @@ from tf2_ros import Buffer, TransformListener
 
 import segfloor_ros.simulation
 from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.messages.maps import grid_of
+from segfloor_ros.messages.arrays import grid_of
 from segfloor_ros.messages.topics import TOPICS
 
 DRIVE = Path(segfloor_ros.simulation.__file__).parent / 'demo' / 'drive.mcap'

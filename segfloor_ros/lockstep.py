@@ -22,8 +22,13 @@ from segfloor_ros.camera.rig.check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
-from segfloor_ros.files.results import check_writable
-from segfloor_ros.files.saved_map import MapFile, is_map_file, read_map_file, write_map_file
+from segfloor_ros.files.results import (
+    MapFile,
+    check_writable,
+    is_map_file,
+    read_map_file,
+    write_map_file,
+)
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline

@@ -17,7 +17,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.saved_map import Arrays, MapFile
+from segfloor_ros.files.results import Arrays, MapFile
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation

@@ -6,10 +6,9 @@ import numpy as np
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Observations, Rig
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 

@@ -16,8 +16,8 @@ from ros_graph import Graph
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import CONNECTIONS, Status
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.topics import CLOUD, FLOOR, GRID, SLAM, published_by
 
 CHAIN = (SLAM, FLOOR, CLOUD, GRID)

@@ -9,8 +9,13 @@ import numpy as np
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages.images import image_message, scan_message
-from segfloor_ros.messages.maps import features_message, labelled_message, sparse_cloud_message
+from segfloor_ros.messages.arrays import (
+    features_message,
+    image_message,
+    labelled_message,
+    scan_message,
+    sparse_cloud_message,
+)
 from segfloor_ros.messages.poses import PathMessages, odometry_message
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 

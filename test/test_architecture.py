@@ -51,8 +51,7 @@ def imports_of(path: Path) -> Iterator[str]:
 
 
 def room_of(path: Path) -> str:
-    parts = path.relative_to(PACKAGE).parts
-    return parts[0] if len(parts) > 1 else ''
+    return path.relative_to(PACKAGE).parts[0].removesuffix('.py')
 
 
 def rooms_imported(path: Path) -> set[str]:

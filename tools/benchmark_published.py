@@ -40,9 +40,9 @@ from segfloor_ros.evaluation.map_score import (
 )
 from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings, save_map
-from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import render_once
 from tools.driving import drive, open_recording
 from tools.published_figures import (
     PUBLISHED,

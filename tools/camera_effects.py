@@ -16,8 +16,8 @@ import typer
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import announcing, console, figure_table
 from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.simulation.drive_files import RecordingOptions, render_once
 from segfloor_ros.simulation.scene_file import open_scene, shipped
+from segfloor_ros.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.suite.job import ProgramError, run_segfloor
 from segfloor_ros.suite.measures import measure_run, number, start_pose_of
 

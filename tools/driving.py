@@ -15,8 +15,8 @@ from segfloor_ros.camera.model import MeasurementLog, RecordedSensor, StereoFram
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import render_once
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.slam.stereo_slam import StereoSlam
 

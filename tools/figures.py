@@ -26,8 +26,8 @@ from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.drive_files import RecordingOptions, render_once
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.suite.job import run_segfloor
 from segfloor_ros.suite.measures import measure_run, start_pose_of
 from segfloor_ros.trajectory import read_trajectory

@@ -16,10 +16,14 @@ from segfloor_ros.configuration import Configuration
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.simulation.drive_files import DISPARITY_SCALE, RecordingOptions, render_once
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import FrameTruth
+from segfloor_ros.simulation.simulation import (
+    DISPARITY_SCALE,
+    FrameTruth,
+    RecordingOptions,
+    render_once,
+)
 from segfloor_ros.trajectory import read_trajectory
 from tools.driving import open_recording
 

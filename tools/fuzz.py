@@ -51,7 +51,7 @@ OUTCOMES = (*GOOD, TRACEBACK, HANG, MEMORY_OUT, CRASH, FOREIGN, UNNAMED)
 EARLY = (
     'segfloor_ros.evaluation.report', 'segfloor_ros.evaluation.trajectory',
     'segfloor_ros.suite.result_files', 'segfloor_ros.simulation.simulation',
-    'segfloor_ros.simulation.drive_files', 'segfloor_ros.simulation.scene_file',
+    'segfloor_ros.simulation.simulation', 'segfloor_ros.simulation.scene_file',
     'rosbags.rosbag1', 'rosbags.rosbag2', 'rosbags.typesys', 'scipy.spatial.transform',
 )  # fmt: skip
 """What commands import late."""

@@ -19,10 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.files.saved_map import Arrays
+from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, invert, se3_exp
-from segfloor_ros.slam.map.records import Match
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -34,6 +32,7 @@ from segfloor_ros.slam.places.loops import path_lengths
 from segfloor_ros.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
 from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.saved_slam import fill_map
+from segfloor_ros.slam.sparse_map import Match, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 

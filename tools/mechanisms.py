@@ -93,7 +93,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
-    'points seen through': Mechanism({'slam.map.sparse_map.PROOF': 1 << 30}),
+    'points seen through': Mechanism({'slam.sparse_map.PROOF': 1 << 30}),
     'search for what moves': Mechanism(settings={'detect_moving': False}),
 }
 """What makes the path."""
@@ -150,12 +150,12 @@ GRID: dict[str, Mechanism] = {
     'partly free edges': Mechanism(
         {'grid.keyframe_evidence.Fan.edges': lambda self: _nowhere(self.lengths)}
     ),
-    'evidence ends where it is sure': Mechanism({'grid.fold.MOST': 2.8}),
-    'dilation of hits': Mechanism({'grid.fold._AROUND': np.ones((1, 1), np.uint8)}),
+    'evidence ends where it is sure': Mechanism({'grid.mapper.MOST': 2.8}),
+    'dilation of hits': Mechanism({'grid.mapper._AROUND': np.ones((1, 1), np.uint8)}),
     'slant': Mechanism({'grid.keyframe_evidence.slant': lambda range_m, _: np.ones(len(range_m))}),
     'nothing free right behind faces': Mechanism(
         {
-            'grid.fold.EvidenceFolder._draw_behind': lambda self, shape, placed: np.zeros(
+            'grid.mapper.EvidenceFolder._draw_behind': lambda self, shape, placed: np.zeros(
                 shape, np.uint8
             )
         }

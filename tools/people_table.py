@@ -45,9 +45,9 @@ from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.lockstep import LockstepRun
 from segfloor_ros.results_folder import OutputFolder
-from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene import Scene
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import render_once
 from segfloor_ros.simulation.solids import place
 
 SEEN_AGAIN_S = 10.0

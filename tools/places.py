@@ -29,7 +29,7 @@ import typer
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
-from segfloor_ros.files.saved_map import from_bytes, to_bytes
+from segfloor_ros.files.results import from_bytes, to_bytes
 from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import FrameResult, KeyframePath

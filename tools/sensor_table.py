@@ -23,8 +23,8 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.pipeline import Pipeline, make_slam
-from segfloor_ros.simulation.drive_files import render_once
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import render_once
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
 from tools.driving import after_sensors, open_recording

@@ -19,8 +19,8 @@ from segfloor_ros.evaluation.map_score import compare, draw_overlay
 from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.files.results import write_file
 from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.simulation.drive_files import RecordingOptions, render_once
 from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.suite.job import ProgramError, run_segfloor
 
 SMALL = ('camera.width=480', 'camera.height=360')

@@ -26,10 +26,9 @@ from segfloor_ros.evaluation.map_score import compare, score_cells
 from segfloor_ros.evaluation.maps import MapTruth, cell_centres, from_frame, load_truth, states
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.map_file import FREE, OccupancyGrid, render
-from segfloor_ros.grid.mapper import EvidenceHistory
+from segfloor_ros.grid.mapper import EvidenceFolder, EvidenceHistory
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import KeyframeFeatures

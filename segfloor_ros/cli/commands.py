@@ -317,9 +317,8 @@ def simulate(
     segfloor simulate floor_plan.yaml --out office
     """
     # Imported here: the simulator takes time that other commands should not wait for.
-    from segfloor_ros.simulation.drive_files import RecordingOptions, record
     from segfloor_ros.simulation.scene_file import open_scene
-    from segfloor_ros.simulation.simulation import Simulation
+    from segfloor_ros.simulation.simulation import RecordingOptions, Simulation, record
 
     kind = [f'camera.kind={camera}'] if camera is not None else []
     described = open_scene(scene, [*kind, *(set_values or ())])

@@ -76,7 +76,7 @@ def explore(
     """
     # Imported here: simulator and pictures take time that other commands should not wait for.
     from segfloor_ros.evaluation import exploration
-    from segfloor_ros.navigation.explorer import Body, Explorer, Goal
+    from segfloor_ros.navigation import Body, Explorer, Goal
     from segfloor_ros.simulation.robot import DrivenRobot, open_robot
     from segfloor_ros.simulation.scene_file import open_scene
     from segfloor_ros.simulation.solids import floors, obstacles, true_map

@@ -22,8 +22,7 @@ from segfloor_ros.evaluation.exploration import Exploration
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages.images import scan_arrays
-from segfloor_ros.messages.maps import MAP_POINT_DTYPE, cloud_array, grid_of
+from segfloor_ros.messages.arrays import MAP_POINT_DTYPE, cloud_array, grid_of, scan_arrays
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import (
     CAMERA,
@@ -37,7 +36,7 @@ from segfloor_ros.messages.topics import (
     stamp_of,
     to_ns,
 )
-from segfloor_ros.navigation.explorer import Explorer
+from segfloor_ros.navigation import Explorer
 from segfloor_ros.processes import Interrupt
 
 OnMap = Callable[[float, OccupancyGrid, str], None]

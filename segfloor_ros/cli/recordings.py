@@ -30,7 +30,7 @@ from segfloor_ros.cli import terminal
 from segfloor_ros.cli.terminal import console, figure_table, value_table, within
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.errors import InputError, SettingsError, os_errors
-from segfloor_ros.files.saved_map import is_map_file
+from segfloor_ros.files.results import is_map_file
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.results_folder import read_summary
 

@@ -25,9 +25,14 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.cli.view import View
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import diagnostics
+from segfloor_ros.messages.arrays import (
+    bgr_image,
+    grey8_image,
+    grid_of,
+    labelled_arrays,
+    moving_points_arrays,
+)
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.images import bgr_image, grey8_image
-from segfloor_ros.messages.maps import grid_of, labelled_arrays, moving_points_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array
 from segfloor_ros.messages.topics import (
     CAMERA,

@@ -33,11 +33,11 @@ from segfloor_ros.cli.view import View
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError, SegfloorError
-from segfloor_ros.files.saved_map import MapFile
+from segfloor_ros.files.results import MapFile
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
+from segfloor_ros.messages.arrays import grid_of, labelled_arrays, sparse_cloud_arrays
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level, Status
-from segfloor_ros.messages.maps import grid_of, labelled_arrays, sparse_cloud_arrays
 from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
 from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import RunResult, summarise

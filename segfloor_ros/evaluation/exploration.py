@@ -19,8 +19,7 @@ from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_
 from segfloor_ros.evaluation.maps import MapTruth, Mask, Pose2d, from_frame, resample
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
-from segfloor_ros.navigation.costmap import room_around
-from segfloor_ros.navigation.explorer import Goal
+from segfloor_ros.navigation import Goal, room_around
 
 AT_GOAL_M = 0.3
 """A goal is reached where the robot truly is within this of it: the planner's own 0.15 m, and as

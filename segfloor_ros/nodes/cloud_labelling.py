@@ -13,9 +13,9 @@ from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
-from segfloor_ros.files.saved_map import MapFile
-from segfloor_ros.messages import maps as clouds
-from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.files.results import MapFile
+from segfloor_ros.messages import arrays as clouds
+from segfloor_ros.messages.arrays import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import FRESH_S, to_ns
 from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart

@@ -15,7 +15,7 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.configuration import FloorSegmentationNodeSettings
 from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
-from segfloor_ros.messages.images import (
+from segfloor_ros.messages.arrays import (
     disparity_message,
     free_scan_message,
     grey8_image,

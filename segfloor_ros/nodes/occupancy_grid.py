@@ -11,11 +11,10 @@ from rclpy.timer import Timer
 
 from segfloor_ros.configuration import OccupancyGridNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.files.saved_map import MapFile
+from segfloor_ros.files.results import MapFile
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.messages.images import scan_arrays
-from segfloor_ros.messages.maps import features_arrays, grid_message, labelled_arrays
+from segfloor_ros.messages.arrays import features_arrays, grid_message, labelled_arrays, scan_arrays
 from segfloor_ros.messages.poses import path_arrays
 from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node

@@ -14,8 +14,8 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
 from segfloor_ros.configuration import SimulatedRobotNodeSettings
+from segfloor_ros.messages.arrays import camera_info_message, image_message
 from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.images import camera_info_message, image_message
 from segfloor_ros.messages.poses import (
     imu_message,
     odometry_message,

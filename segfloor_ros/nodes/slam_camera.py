@@ -32,8 +32,8 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.rig.check import InputFault
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
+from segfloor_ros.messages.arrays import same_calibration
 from segfloor_ros.messages.diagnostics import LASTS_S, RECENT, Level
-from segfloor_ros.messages.images import same_calibration
 from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.shared.reporter import offered_best_effort

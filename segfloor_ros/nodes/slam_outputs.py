@@ -24,12 +24,18 @@ from segfloor_ros.camera.images import shrink_factor, shrunk_camera, shrunk_imag
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.files.saved_map import MapFile, read_map_file, write_map_file
-from segfloor_ros.messages import maps as clouds
+from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.messages import arrays as clouds
 from segfloor_ros.messages import poses
+from segfloor_ros.messages.arrays import (
+    camera_info_message,
+    image_message,
+    map_file_message,
+    map_file_of,
+    map_start_message,
+    rectified_calibration,
+)
 from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.maps import map_file_message, map_file_of, map_start_message
 from segfloor_ros.messages.topics import (
     CORRECTED,
     FRAME_PARTS,

@@ -22,7 +22,7 @@ from segfloor_ros.camera.images import imu_sample, measures_motion, wheel_pose, 
 from segfloor_ros.camera.model import Measurement, WheelPose
 from segfloor_ros.camera.sources.files import is_upright
 from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.messages.images import grey8_image
+from segfloor_ros.messages.arrays import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import FRESH_S, IMAGES, PATIENCE_S, SENSORS, best_effort, to_ns
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S

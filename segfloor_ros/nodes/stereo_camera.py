@@ -29,8 +29,8 @@ from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, StereoCameraNodeSettings
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.messages.arrays import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.diagnostics import RECORDING, Level
-from segfloor_ros.messages.images import camera_info_message, compressed_message, image_message
 from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
 from segfloor_ros.messages.ros_bag import use_rosbag2_py
 from segfloor_ros.messages.topics import (

@@ -7,7 +7,7 @@ import time
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.saved_map import MapFile
+from segfloor_ros.files.results import MapFile
 from segfloor_ros.geometry import MAX_DISORDER_NS
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.topics import FRAME_DONE, make_header

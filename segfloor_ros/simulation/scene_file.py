@@ -24,7 +24,7 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
-from segfloor_ros.navigation.costmap import Ways, graph_of
+from segfloor_ros.navigation import Ways, graph_of
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
 from segfloor_ros.simulation.scene import Scene, Wall

@@ -22,9 +22,8 @@ from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.settings import StageSettings, setting
 
 if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
-    from segfloor_ros.slam.map.records import KeyframeRecord
-    from segfloor_ros.slam.map.sparse_map import SparseMap
     from segfloor_ros.slam.rig import Observations
+    from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
     from segfloor_ros.slam.tracking.features import Features
     from segfloor_ros.slam.tracking.images import Region
     from segfloor_ros.slam.tracking.pose import PoseEstimate

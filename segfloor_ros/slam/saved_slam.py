@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, WheelPose
 from segfloor_ros.errors import CalibrationError, InputError, MapError
-from segfloor_ros.files.saved_map import Arrays, MapFile, joined, split
+from segfloor_ros.files.results import Arrays, MapFile, joined, split
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Retirement
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
+from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Retirement, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 
 if TYPE_CHECKING:  # which uses this module

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig.check import RigCheck
-from segfloor_ros.files.saved_map import Arrays
+from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
 from segfloor_ros.slam.results import (
@@ -34,6 +32,7 @@ from segfloor_ros.slam.results import (
 )
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState

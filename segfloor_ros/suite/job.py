@@ -186,8 +186,8 @@ def _recording(entry: Entry, folder: Path) -> Path:
     if entry.source != SCENE:
         return local_copy(entry.input, folder / 'recordings')
     # Imported here: the simulator takes time that other commands should not wait for.
-    from segfloor_ros.simulation.drive_files import RecordingOptions, render_once
     from segfloor_ros.simulation.scene_file import open_scene
+    from segfloor_ros.simulation.simulation import RecordingOptions, render_once
 
     scene = open_scene(entry.input, entry.scene_assignments)
     recording = folder / 'renderings' / _digest_of_text(repr((__version__, scene)))

@@ -10,8 +10,8 @@ import pytest
 from camera_recordings import HEIGHT, MS, WIDTH, calibration, opened
 
 from segfloor_ros.camera.calibration.files import write_ros_calibration
-from segfloor_ros.camera.sources import device
-from segfloor_ros.camera.sources.device import is_device
+from segfloor_ros.camera.sources import opening as device
+from segfloor_ros.camera.sources.opening import is_device
 from segfloor_ros.errors import CalibrationError, InputError
 
 

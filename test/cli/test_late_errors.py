@@ -30,7 +30,7 @@ from segfloor_ros.camera.model import (
     is_sound,
 )
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.files.saved_map import read_map_file
+from segfloor_ros.files.results import read_map_file
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.stereo_slam import StereoSlam

@@ -20,7 +20,7 @@ from stereo_drive import room_drive
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.topic_recorder import TopicRecord, stamp_of
-from segfloor_ros.messages.images import camera_info_message, image_message
+from segfloor_ros.messages.arrays import camera_info_message, image_message
 
 STOP_S = 30.0
 ARRIVAL = Duration(seconds=30)

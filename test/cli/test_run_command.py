@@ -14,7 +14,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.evaluation.report import write_report
-from segfloor_ros.files.saved_map import read_map_file
+from segfloor_ros.files.results import read_map_file
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
 from segfloor_ros.slam.results import StereoSlamSettings
 

@@ -134,7 +134,7 @@ def test_running_nodes_are_shown_until_an_interrupt(tmp_path):
     pytest.importorskip('rerun', reason='rerun is not installed')
     rclpy = pytest.importorskip('rclpy', reason='ROS is not installed')
     from segfloor_ros.cli.replay_nodes import isolated_environment
-    from segfloor_ros.messages.maps import grid_message
+    from segfloor_ros.messages.arrays import grid_message
     from segfloor_ros.messages.topics import TOPICS
 
     environment, shown = isolated_environment(), tmp_path / 'live.rrd'

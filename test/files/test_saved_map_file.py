@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.saved_map import (
+from segfloor_ros.files.results import (
     MapFile,
     from_bytes,
     joined,

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from segfloor_ros.grid.fold import EvidenceFolder
 from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence
 from segfloor_ros.grid.map_file import ZERO, OccupancyGridSettings
+from segfloor_ros.grid.mapper import EvidenceFolder
 
 POSE = (2.025, -1.025, math.pi / 2)
 """In the middle of a cell, turned to the left: what is ahead lies along y, the left along -x."""

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from segfloor_ros.grid.fold import draw_rays
 from segfloor_ros.grid.map_file import (
     FREE,
     FREE_FROM,
@@ -16,6 +15,7 @@ from segfloor_ros.grid.map_file import (
     render,
     steps,
 )
+from segfloor_ros.grid.mapper import draw_rays
 
 PATH = np.array([[0.05, 0.05]])
 

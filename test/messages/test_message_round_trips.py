@@ -14,13 +14,18 @@ from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.geometry import make_transform, se3_exp
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages import images, poses
-from segfloor_ros.messages import images as floor
-from segfloor_ros.messages import maps as clouds
-from segfloor_ros.messages import maps as map_files
+from segfloor_ros.messages import arrays as clouds
+from segfloor_ros.messages import arrays as floor
+from segfloor_ros.messages import arrays as images
+from segfloor_ros.messages import arrays as map_files
+from segfloor_ros.messages import poses
+from segfloor_ros.messages.arrays import (
+    camera_info_message,
+    map_start_message,
+    map_start_ns,
+    rectified_calibration,
+)
 from segfloor_ros.messages.diagnostics import Level, Status, status_message, statuses
-from segfloor_ros.messages.images import camera_info_message, rectified_calibration
-from segfloor_ros.messages.maps import map_start_message, map_start_ns
 from segfloor_ros.messages.topics import to_ns, to_time
 from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 

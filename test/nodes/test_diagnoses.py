@@ -19,8 +19,8 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.floor.plane.mount import MountCheck
+from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.poses import odometry_message, transform_message
 from segfloor_ros.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode

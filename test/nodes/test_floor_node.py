@@ -8,7 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.floor.observation import FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
-from segfloor_ros.messages.images import (
+from segfloor_ros.messages.arrays import (
     camera_info_message,
     grey8_image,
     image_message,

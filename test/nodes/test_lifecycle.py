@@ -12,7 +12,7 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cloud.labelled_cloud import CloudLabelling, CloudLabellingSettings
-from segfloor_ros.messages.maps import labelled_arrays
+from segfloor_ros.messages.arrays import labelled_arrays
 from segfloor_ros.messages.topics import NODES, published_by, subscribed_by, to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode

@@ -11,8 +11,8 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, LASTS_S, Level
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words

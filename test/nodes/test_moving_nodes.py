@@ -9,13 +9,15 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.floor.observation import FLOOR
-from segfloor_ros.messages.images import (
+from segfloor_ros.messages.arrays import (
+    FEATURE_DTYPE,
+    MOVING_DTYPE,
     camera_info_message,
+    cloud_array,
     grey8_image,
     image_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.maps import FEATURE_DTYPE, MOVING_DTYPE, cloud_array
 from segfloor_ros.messages.poses import transform_message
 from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode

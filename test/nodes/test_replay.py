@@ -19,7 +19,7 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli.main import main
 from segfloor_ros.cli.replay_nodes import unconnected
-from segfloor_ros.files.saved_map import read_map_file
+from segfloor_ros.files.results import read_map_file
 from segfloor_ros.grid.map_file import FREE, load_map
 from segfloor_ros.messages.topics import NODES, TOPICS, published_by
 from segfloor_ros.trajectory import read_trajectory

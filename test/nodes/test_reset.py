@@ -11,8 +11,13 @@ from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.maps import labelled_arrays, map_start_message
+from segfloor_ros.messages.arrays import (
+    camera_info_message,
+    image_message,
+    labelled_arrays,
+    map_start_message,
+    rectified_calibration,
+)
 from segfloor_ros.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode

@@ -16,11 +16,11 @@ from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.cloud.labelled_cloud import UNKNOWN, LabelledPoints
-from segfloor_ros.files.saved_map import MapFile
+from segfloor_ros.files.results import MapFile
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGrid
+from segfloor_ros.messages.arrays import labelled_arrays
 from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.maps import labelled_arrays
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
 from segfloor_ros.nodes.shared.maps import KeptState

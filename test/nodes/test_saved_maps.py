@@ -16,9 +16,9 @@ from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.saved_map import read_map_file
+from segfloor_ros.files.results import read_map_file
 from segfloor_ros.geometry import invert
-from segfloor_ros.messages.images import camera_info_message, image_message, rectified_calibration
+from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.poses import pose_array, pose_message
 from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode

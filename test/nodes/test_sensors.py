@@ -16,7 +16,7 @@ from stereo_room import MOUNT, depth_of_room
 from segfloor_ros.camera.images import imu_sample, wheel_pose
 from segfloor_ros.camera.model import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
-from segfloor_ros.messages.images import grey8_image, right_image
+from segfloor_ros.messages.arrays import grey8_image, right_image
 from segfloor_ros.messages.poses import imu_message, pose_array, transform_message, wheel_message
 from segfloor_ros.messages.topics import KEYFRAMES, to_ns
 from segfloor_ros.nodes import slam_camera

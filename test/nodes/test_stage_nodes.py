@@ -34,15 +34,16 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGridSettings, load_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.images import (
+from segfloor_ros.messages.arrays import (
     camera_info_message,
     compressed_message,
     grey8_image,
     image_message,
+    labelled_arrays,
     rectified_calibration,
+    sparse_cloud_arrays,
 )
-from segfloor_ros.messages.maps import labelled_arrays, sparse_cloud_arrays
+from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array, transform_message
 from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.files.saved_map import MapFile, from_bytes, to_bytes
+from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import OffsetEstimate

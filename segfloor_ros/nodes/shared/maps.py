@@ -21,10 +21,14 @@ from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header, UInt8MultiArray
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import replacing
-from segfloor_ros.files.saved_map import Arrays, MapFile, read_map_file, write_to
+from segfloor_ros.files.results import Arrays, MapFile, read_map_file, replacing, write_to
+from segfloor_ros.messages.arrays import (
+    is_of_loaded_map,
+    map_file_message,
+    map_file_of,
+    map_start_ns,
+)
 from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.maps import is_of_loaded_map, map_file_message, map_file_of, map_start_ns
 from segfloor_ros.messages.topics import (
     KEYFRAME_DONE,
     KEYFRAMES,

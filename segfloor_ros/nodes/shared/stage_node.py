@@ -17,7 +17,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.configuration import NodeSettings
 from segfloor_ros.errors import SegfloorError
-from segfloor_ros.files.saved_map import MapFile
+from segfloor_ros.files.results import MapFile
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S
 from segfloor_ros.messages.topics import TOPICS, Topic, published_by
 from segfloor_ros.nodes.shared.inputs import CHECK_S, Inputs

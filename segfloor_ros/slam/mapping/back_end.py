@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 
 from segfloor_ros.camera.model import Up
-from segfloor_ros.files.saved_map import Arrays
+from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.places.loop_closing import (
@@ -32,6 +30,7 @@ from segfloor_ros.slam.places.loops import LoopDetector
 from segfloor_ros.slam.results import StereoSlamSettings, Track
 from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.normal_equations import (
     Factor,
     Linearisation,
@@ -41,6 +39,7 @@ from segfloor_ros.slam.rig import (
     residuals,
     squared_norms,
 )
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""

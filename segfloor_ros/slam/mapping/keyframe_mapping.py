@@ -19,8 +19,6 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoFrame, Up
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust, gather
 from segfloor_ros.slam.mapping.normal_equations import factors_of
 from segfloor_ros.slam.results import (
@@ -32,6 +30,7 @@ from segfloor_ros.slam.results import (
     ObservedFeatures,
 )
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX, Images
 from segfloor_ros.slam.tracking.map_tracking import predict_points

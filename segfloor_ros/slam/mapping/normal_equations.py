@@ -28,7 +28,6 @@ from scipy.sparse.linalg import splu
 
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
-from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.rig import (
     SMALLEST,
     chi2_limit,
@@ -38,6 +37,7 @@ from segfloor_ros.slam.rig import (
     with_moment,
 )
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
+from segfloor_ros.slam.sparse_map import KeyframeRecord
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.images import is_disparity, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord
 from segfloor_ros.slam.moving.scene_flow import (
     MAX_MOVING_SHARE,
     TOLERANCE_PX,
@@ -36,6 +35,7 @@ from segfloor_ros.slam.moving.scene_flow import (
 from segfloor_ros.slam.places.known_views import MIN_FRAMES
 from segfloor_ros.slam.results import CHANCE_SHARE, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
+from segfloor_ros.slam.sparse_map import KeyframeRecord
 from segfloor_ros.slam.tracking.images import Region
 from segfloor_ros.slam.tracking.pose import FLOOR_M
 

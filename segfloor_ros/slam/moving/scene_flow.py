@@ -20,10 +20,10 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.sparse_map import MAX_PATCH_ZOOM
 from segfloor_ros.slam.results import PROOF, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
+from segfloor_ros.slam.sparse_map import MAX_PATCH_ZOOM
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, SMALL_WIDTH_PX, follow_pixels
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import MAJORITY
 from segfloor_ros.slam.rig import NEIGHBOURS, in_view
+from segfloor_ros.slam.sparse_map import SparseMap
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by

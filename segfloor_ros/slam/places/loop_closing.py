@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from segfloor_ros.files.saved_map import Arrays
+from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
-from segfloor_ros.slam.map.records import KeyframeRecord, LoopEdge, Match
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.known_views import views_near
@@ -41,6 +39,7 @@ from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocal
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
+from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Match, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.pose import CONVERGED

@@ -16,8 +16,6 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord, Match
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import ALIKE_SHARE, views_near
 from segfloor_ros.slam.places.place_recognition import (
     BEST_GROUPS,
@@ -26,6 +24,7 @@ from segfloor_ros.slam.places.place_recognition import (
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX, in_view
+from segfloor_ros.slam.sparse_map import KeyframeRecord, Match, SparseMap
 from segfloor_ros.slam.tracking.images import Images
 
 MAX_MISSES = 1

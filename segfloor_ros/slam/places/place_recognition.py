@@ -26,13 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.files.saved_map import Arrays, joined, split
+from segfloor_ros.files.results import Arrays, joined, split
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import COLUMNS, ROWS
 from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.images import Images
 from segfloor_ros.slam.tracking.map_tracking import Tracker

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array, transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import ENOUGH, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.features import spread
 from segfloor_ros.slam.tracking.images import (
     SIGMA_FLOW_PX,

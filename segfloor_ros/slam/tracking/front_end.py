@@ -10,8 +10,6 @@ import numpy as np
 from segfloor_ros.camera.images import is_disparity
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import ALIKE_SHARE
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
@@ -31,6 +29,7 @@ from segfloor_ros.slam.results import (
     Track,
 )
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.following import Follower
 from segfloor_ros.slam.tracking.images import (

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.known_views import (
     SEEN_BY_SEVERAL,
     View,
@@ -26,6 +25,7 @@ from segfloor_ros.slam.places.known_views import (
 )
 from segfloor_ros.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, in_view
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.features import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, make_transform, se3_exp, se3_log, transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import ENOUGH, MAJORITY, PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
@@ -33,6 +32,7 @@ from segfloor_ros.slam.rig import (
     weighted_jacobian,
     with_moment,
 )
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.patch_alignment import LEAST_SHIFT, _shift_information
 
 ROUNDS = 3

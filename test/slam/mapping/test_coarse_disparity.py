@@ -6,10 +6,10 @@ import pytest
 from hand_made_maps import CAMERA
 
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper, guess_disparity
 from segfloor_ros.slam.results import NO_POINT, ObservedFeatures
 from segfloor_ros.slam.rig import Observations, Rig
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.images import Images
 

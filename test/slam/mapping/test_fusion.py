@@ -5,10 +5,10 @@ from hand_made_maps import add, keyframe
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import find_duplicates, fuse_duplicates
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.sparse_map import SparseMap
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
 

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.slam.map.records import KeyframeRecord
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -16,6 +14,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
 )
 from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.saved_slam import fill_map
+from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from tools.map_costs import CAMERA, bend, made_up_map, ring
 
 COUNT = 80

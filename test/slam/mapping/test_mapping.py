@@ -7,10 +7,10 @@ import pytest
 from hand_made_maps import CAMERA, SCENES, add, seen
 
 from segfloor_ros.geometry import make_transform, se3_exp, transform_points
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 

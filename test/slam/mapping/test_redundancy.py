@@ -7,10 +7,10 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.geometry import make_transform
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.mapping.keyframe_mapping import redundant_share, retire_redundant
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 

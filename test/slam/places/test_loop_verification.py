@@ -8,11 +8,10 @@ from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.map.records import Match
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.places.loops import LoopChecks, Sightings
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Observations, Rig
+from segfloor_ros.slam.sparse_map import Match, SparseMap
 
 MOUNT = Mount(0.4, 0.15)
 POINTS = SCENES['wall']

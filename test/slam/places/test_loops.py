@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
-from segfloor_ros.slam.map.records import Match
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import plan_closing
 from segfloor_ros.slam.places.loops import LoopChecks
 from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.sparse_map import Match
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -3,9 +3,9 @@
 import numpy as np
 from hand_made_maps import CAMERA, add, keyframe
 
-from segfloor_ros.slam.map.sparse_map import SparseMap
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.sparse_map import SparseMap
 
 
 def two_keyframes():

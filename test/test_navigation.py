@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import make_transform
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from segfloor_ros.navigation.costmap import Costmap
-from segfloor_ros.navigation.explorer import STOP, Body, Explorer, Goal
+from segfloor_ros.navigation import STOP, Body, Costmap, Explorer, Goal
 
 CELL_M = 0.1
 BODY = Body(radius_m=0.15, blind_m=0.3, speed_m_s=0.4, turn_rad_s=0.8)
