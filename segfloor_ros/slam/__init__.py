@@ -2,5 +2,6 @@
 
 In: rectified stereo frames, and where present depth, wheel odometry and an IMU.
 Out: a pose per frame, a keyframe with its features per new view, and the sparse map (`results.py`).
-The way in is `stereo_slam.StereoSlam`; the rooms: tracking, mapping, map, places, sensors, moving.
+The way in is `stereo_slam.StereoSlam`; the map is `sparse_map.SparseMap`; the rooms: tracking,
+mapping, places, sensors, moving.
 """
