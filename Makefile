@@ -36,7 +36,8 @@ $(VENV)/bin/python:
 	    echo "making $(VENV) with $$python"; exec "$$python" -m venv --clear $(VENV); \
 	  fi; \
 	done; \
-	echo 'no Python 3.10 to 3.13 with venv was found; name one: make PYTHON=/path/to/python' >&2; \
+	echo 'no Python 3.10 to 3.13 with venv was found (Debian, Ubuntu: apt-get install python3-venv);' \
+	  'name one: make PYTHON=/path/to/python' >&2; \
 	exit 1
 
 $(STAMP): constraints.txt setup.py setup.cfg pyproject.toml | $(VENV)/bin/python

@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator
+from ctypes import ArgumentError
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -300,7 +301,7 @@ def import_mujoco() -> Any:
         raise RenderingError(
             "simulating needs MuJoCo: pip install 'segfloor_ros[sim]' (or pip install mujoco)"
         ) from None
-    except (AttributeError, OSError, RuntimeError):
+    except (ArgumentError, AttributeError, OSError, RuntimeError):
         raise RenderingError(_NO_GL) from None
     return mujoco
 
@@ -313,8 +314,8 @@ def _open_renderer(mujoco: Any, model: Any, width: int, height: int) -> Any:
 
 
 _NO_GL = (
-    'no OpenGL library for rendering without a display: on Debian or Ubuntu install '
-    'libegl1 and libgl1-mesa-dri (apt-get install libegl1 libgl1-mesa-dri)'
+    'no OpenGL library for rendering without a display: on Debian or Ubuntu '
+    'apt-get install libegl1 libgl1-mesa-dri libopengl0'
 )
 
 

@@ -212,15 +212,17 @@ def test_a_path_into_an_obstacle_is_refused():
         simulate(path={'waypoints': [[0, 0], [2.5, 0.6]]})
 
 
-def test_without_a_gl_library_one_line_names_the_package(tmp_path):
-    # A ctypes that finds no GL library, as on a machine without one.
+@pytest.mark.parametrize('missing', ['GL', '(?<!E)GL'])
+def test_without_a_gl_library_one_line_names_the_package(tmp_path, missing):
+    # A ctypes that finds no GL library, or EGL alone, as on a machine without them.
     (tmp_path / 'sitecustomize.py').write_text(
-        'import ctypes, ctypes.util\n'
+        'import ctypes, ctypes.util, re\n'
+        f'missing = re.compile({missing!r}).search\n'
         'find, init = ctypes.util.find_library, ctypes.CDLL.__init__\n'
         'def no_gl(self, name, *rest, **more):\n'
-        '    if name and "GL" in str(name): raise OSError(name)\n'
+        '    if name and missing(str(name)): raise OSError(name)\n'
         '    init(self, name, *rest, **more)\n'
-        'ctypes.util.find_library = lambda name: None if "GL" in name else find(name)\n'
+        'ctypes.util.find_library = lambda name: None if missing(name) else find(name)\n'
         'ctypes.CDLL.__init__ = no_gl\n'
     )
     program = (
