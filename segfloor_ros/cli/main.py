@@ -14,6 +14,7 @@ from segfloor_ros.cli.check import check_suite
 from segfloor_ros.cli.commands import benchmark, demo, params, replay, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
 from segfloor_ros.cli.explore import explore
+from segfloor_ros.cli.maps import app as maps
 from segfloor_ros.cli.recordings import calibrate, convert, info, record, view
 from segfloor_ros.cli.terminal import print_error
 from segfloor_ros.cli.view import SUFFIX
@@ -40,6 +41,7 @@ for command in (
     app.command()(command)
 app.command('check')(check_suite)
 app.add_typer(evaluate, name='evaluate')
+app.add_typer(maps, name='map')
 
 
 def _print_version(is_asked: bool) -> None:

@@ -99,7 +99,7 @@ class OccupancyGridMapper:
         no longer in it is forgotten, or where it is all there was, waits for their return. Raises
         MapError when the keyframe is not in the path.
         """
-        poses = _planar(path.T_map_base)
+        poses = planar(path.T_map_base)
         self._follow(path.stamp_ns, poses)
         at = int(np.searchsorted(path.stamp_ns, stamp_ns))
         if at == len(path.stamp_ns) or path.stamp_ns[at] != stamp_ns:
@@ -158,7 +158,7 @@ class OccupancyGridMapper:
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
 
 
-def _planar(T_map_base: Array) -> NDArray[np.float64]:
+def planar(T_map_base: Array) -> NDArray[np.float64]:
     """Return x, y and yaw (K, 3) of poses (K, 4, 4)."""
     yaw = np.arctan2(T_map_base[:, 1, 0], T_map_base[:, 0, 0])
     return np.stack([T_map_base[:, 0, 3], T_map_base[:, 1, 3], yaw], axis=1)

@@ -54,8 +54,15 @@ def save_slam(slam: StereoSlam, camera: StereoCamera) -> MapFile:
     """Return what SLAM knows. Raises MapError before there is a map."""
     if slam.mount is None or not slam.map.keyframes:
         raise MapError('there is no map yet that could be saved')
-    header = {'camera': asdict(camera), 'mount': asdict(slam.mount)}
-    return MapFile(header, {PART: slam.to_arrays()})
+    arrays = slam.to_arrays()
+    own_ns = arrays['keyframe_stamp_ns'][arrays['keyframe_stamp_ns'] >= 0].tolist()
+    sessions = slam.sessions
+    if own_ns:
+        own = {'first_ns': own_ns[0], 'last_ns': own_ns[-1], 'keyframes': len(own_ns)}
+        # A drive that goes on after it was broken off is in the list already.
+        sessions = [s for s in sessions if s['first_ns'] != own_ns[0]] + [own]
+    header = {'camera': asdict(camera), 'mount': asdict(slam.mount), 'sessions': sessions}
+    return MapFile(header, {PART: arrays})
 
 
 def load_slam(
@@ -74,7 +81,7 @@ def load_slam(
     """
     try:
         check_camera(saved, camera, name)
-        mount, arrays = _mount(saved), saved.parts[PART]
+        mount, arrays = mount_of(saved), saved.parts[PART]
         if not all(np.isfinite(arrays[column]).all() for column in PLACES):
             raise ValueError('places that are nowhere')
         stamp_ns = arrays['keyframe_stamp_ns']
@@ -85,6 +92,7 @@ def load_slam(
             'num_ever': arrays['num_ever'] + skipped,
         }
         slam.load(moved, mount, localize, last)
+        slam.sessions = list(saved.header.get('sessions', []))
         return loaded_map(saved, shift_ns)
     except (ArithmeticError, LookupError, ValueError, TypeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
@@ -123,14 +131,19 @@ def check_camera(saved: MapFile, camera: StereoCamera, name: str) -> None:
 
 def loaded_map(saved: MapFile, shift_ns: int) -> LoadedMap:
     """Return what a saved map holds for the stages behind SLAM."""
-    T_map_world, arrays = _mount(saved).T_base_left, saved.parts[PART]
+    T_map_world, arrays = mount_of(saved).T_base_left, saved.parts[PART]
     T_map_base = T_map_world @ invert(arrays['keyframe_T_camera_world']) @ invert(T_map_world)
     xyz = transform_points(T_map_world, arrays['point_xyz_world']).astype(np.float32)
     path = KeyframePath(arrays['keyframe_stamp_ns'] + shift_ns, T_map_base)
     return LoadedMap(path, SparseCloud(arrays['point_stable_id'], xyz), shift_ns)
 
 
-def _mount(saved: MapFile) -> Mount:
+def gap_ns(first: Arrays, second: Arrays) -> int:
+    """Return by how much the stamps of a second map are to grow to come after those of a first."""
+    return int(first['keyframe_stamp_ns'][-1] - BEFORE_ALL_NS - second['keyframe_stamp_ns'][0])
+
+
+def mount_of(saved: MapFile) -> Mount:
     """Return the mount that a map was made with. Raises KeyError, TypeError or ValueError."""
     values = saved.header['mount']
     if not all(type(value) in (int, float) and math.isfinite(value) for value in values.values()):

@@ -66,7 +66,8 @@ class StereoSlam:
     then `provisional` is the newest pose.
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
     adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
-    what is wrong with the images. front_end, back_end: tracking and mapping.
+    what is wrong with the images. sessions: the drives that made the map it goes on with.
+    front_end, back_end: tracking and mapping.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class StereoSlam:
     ) -> None:
         self.rig = Rig(camera, mount)
         self.map = SparseMap(self.rig)
+        self.sessions: list[dict[str, int]] = []
         self._mount_meter = mount_meter
         self._camera = camera
         self._settings = settings

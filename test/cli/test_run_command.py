@@ -328,6 +328,12 @@ def test_a_saved_map_is_localized_in(recording, result, tmp_path):
     assert done.returncode == 0, done.stderr
     for name in ('trajectory.txt', 'map.pgm'):
         assert (first / name).read_bytes() == (result[0] / name).read_bytes()
+    facts = json.loads(segfloor('map', 'info', saved, '--json').stdout)
+    summary = json.loads((first / 'summary.json').read_text())
+    assert [facts['keyframes'], facts['camera_height_m']] == [summary['keyframes'], MOUNT.height_m]
+    assert [s['keyframes'] for s in facts['sessions']] == [facts['keyframes']]
+    assert segfloor('map', 'export', saved, tmp_path / 'on_disk.yaml').returncode == 0
+    assert (tmp_path / 'on_disk.pgm').read_bytes() == (first / 'map.pgm').read_bytes()
     second = tmp_path / 'second'
     done = segfloor('run', recording, '--out', second, '--load-map', saved, '--localize')
     assert done.returncode == 0, done.stderr

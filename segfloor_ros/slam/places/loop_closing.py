@@ -10,6 +10,9 @@ Minimises the sum of e^T W e with e_ij = log(T_i_j Z_i_j^-1) over T_i_j = T_i T_
 Levenberg-Marquardt (Grisetti et al., A Tutorial on Graph-Based SLAM, 2010). Edges can be robust:
 one that contradicts the others loses its weight (Agarwal et al., Robust Map Optimization
 using Dynamic Covariance Scaling, ICRA 2013).
+
+Two saved maps, of several robots or of days that were mapped apart, become one in the same way: the
+keyframes of the second are looked for in the first by what they observed, one after the other.
 """
 
 from __future__ import annotations
@@ -21,15 +24,22 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
-from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
+from segfloor_ros.slam.mapping.bundle_adjustment import (
+    apply_global,
+    copy_map,
+    move_keyframes,
+    solve_global,
+)
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.known_views import views_near
 from segfloor_ros.slam.places.loops import (
     LINK_SIGMA,
     LOOP_FACTOR,
     LoopChecks,
+    LoopDetector,
     Sightings,
     drift,
     match_of,
@@ -37,11 +47,11 @@ from segfloor_ros.slam.places.loops import (
 )
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, chi2_limit
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Match, SparseMap
 from segfloor_ros.slam.tracking.features import Features
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
 
 STEPS = 20
@@ -51,6 +61,9 @@ TIMES_A_LOOP = 2
 With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
 be no further away than it can have driven, too.
 """
+
+OFFSET = 'disparity_offset'
+"""What a map knows of the disparity offset, by name."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +252,7 @@ class KnownMap:
         self._checks = LoopChecks(own, self._map)
         self._sightings = Sightings(own, TIMES_A_LOOP)
 
-    def recognise(self, keyframe: KeyframeRecord, images: Images) -> bool:
+    def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
         match = self._look(keyframe, images)
         is_possible = match is not None and self._is_possible(keyframe, match)
@@ -250,12 +263,12 @@ class KnownMap:
             return False
         return not self._checks.objection(keyframe, match)
 
-    def is_seen(self, images: Images, features: Features, stamp_ns: int) -> bool:
+    def is_seen(self, images: Pixels, features: Features, stamp_ns: int) -> bool:
         """Whether enough frames in a row see the known map, this one the last of them."""
         found = self._relocaliser.find_surely(images, features, stamp_ns)
         return found is not None
 
-    def _look(self, keyframe: KeyframeRecord, images: Images) -> Match | None:
+    def _look(self, keyframe: KeyframeRecord, images: Pixels) -> Match | None:
         """Look for the view where the keyframes before saw it, else in the whole known map."""
         features = keyframe.features
         if self._sightings.matches:
@@ -312,3 +325,51 @@ class KnownMap:
         rows = np.minimum(rows, len(self._own.stable_id) - 1)
         there = (self._own.stable_id[rows] == stable_ids) & self._own.alive[rows]
         return np.where(there, rows, -1)
+
+
+def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
+    """Return two maps as one; None where no place of the first is seen in the second. rig: of the
+    first, and of the second as the rig of the first would have measured it (`as_seen_by`), with ids
+    and stamps that come after those of the first.
+    """
+    rig.offset.estimate = OffsetEstimate(*first[OFFSET].tolist())
+    merged = SparseMap(rig)
+    fill_map(merged, second)
+    known = KnownMap(merged, first, of_drive=False)
+    alive = [keyframe for keyframe in merged.keyframes if keyframe.retired is None]
+    if not any(known.recognise(keyframe, keyframe.observations) for keyframe in alive):
+        return None
+    words = known.merge({name: second[name] for name in ('words', 'word_count')})
+    places = PlaceRecognition(merged)
+    places.from_arrays(words)
+    _close_loops(merged, places, len(first['keyframe_stamp_ns']))
+    return map_to_arrays(merged) | places.to_arrays() | {OFFSET: first[OFFSET]}
+
+
+def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> None:
+    """Close the loops that keyframes from index `begin` on see, and adjust the whole map."""
+    loops = LoopDetector(merged, places)
+    for keyframe in merged.keyframes[begin:]:
+        if keyframe.retired is not None:
+            continue
+        matches = loops.detect(keyframe, keyframe.observations)
+        if matches:
+            closing = plan_closing(merged, matches)
+            apply_closing(merged, closing, solve_closing(closing))
+    copied = copy_map(merged, merged.rig.offset.estimate, None)
+    apply_global(merged, solve_global(merged.rig.camera, copied, lambda: True))
+
+
+def as_seen_by(camera: StereoCamera, offset_px: float, own: StereoCamera, arrays: Arrays) -> Arrays:
+    """Return a map, made with camera `own`, as another rectified one would have measured it, whose
+    disparities have an offset.
+    """
+    zoom = np.array([camera.fx / own.fx, camera.fy / own.fy, 1.0])
+    zoom[2] = camera.disparity_times_depth / own.disparity_times_depth
+    before = np.array([own.cx, own.cy, float(arrays[OFFSET][0])])
+    now = np.array([camera.cx, camera.cy, offset_px])
+    uvd_px = (arrays['feature_uvd_px'].astype(np.float64) - before) * zoom + now
+    return arrays | {
+        'feature_uvd_px': uvd_px.astype(np.float32),
+        'feature_sigma_px': (arrays['feature_sigma_px'] * zoom).astype(np.float16),
+    }

@@ -25,7 +25,7 @@ from segfloor_ros.slam.places.place_recognition import (
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX, in_view
 from segfloor_ros.slam.sparse_map import KeyframeRecord, Match, SparseMap
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.map_tracking import Pixels
 
 MAX_MISSES = 1
 
@@ -87,7 +87,7 @@ class LoopDetector:
         """Believe in no loop."""
         self._sightings = Sightings(self._map)
 
-    def detect(self, keyframe: KeyframeRecord, images: Images) -> list[Match]:
+    def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
         lengths = path_lengths(self._map, keyframe.index)
         near, far = self._sides(keyframe, lengths)
@@ -145,7 +145,7 @@ class LoopDetector:
     def _find(
         self,
         keyframe: KeyframeRecord,
-        images: Images,
+        images: Pixels,
         far: NDArray[np.bool_],
         known: NDArray[np.int32],
     ) -> Match | None:
@@ -161,7 +161,7 @@ class LoopDetector:
     def _follow(
         self,
         keyframe: KeyframeRecord,
-        images: Images,
+        images: Pixels,
         far: NDArray[np.bool_],
         known: NDArray[np.int32],
     ) -> Match | None:

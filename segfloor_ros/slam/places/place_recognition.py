@@ -33,8 +33,7 @@ from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features, hamming
-from segfloor_ros.slam.tracking.images import Images
-from segfloor_ros.slam.tracking.map_tracking import Tracker
+from segfloor_ros.slam.tracking.map_tracking import Pixels, Tracker
 
 FILE = 'vocabulary.npy'
 BRANCHES = 30
@@ -133,7 +132,7 @@ class PlaceRecognition:
         others = others[score[others] > 0][: LOCAL_KEYFRAMES - 1]
         return np.append(index, others).astype(np.intp)
 
-    def locate(self, images: Images, features: Features, ids: NDArray[np.int32]) -> Track | None:
+    def locate(self, images: Pixels, features: Features, ids: NDArray[np.int32]) -> Track | None:
         """Find a camera among points `ids` (N,); None unless it sees them."""
         observations = self._tracker.pixel_observations(features)
         tree = cKDTree(features.uv_px)
@@ -143,7 +142,7 @@ class PlaceRecognition:
         return self.confirm(images, features, ids, estimate.T_camera_world)
 
     def confirm(
-        self, images: Images, features: Features, ids: NDArray[np.int32], T_camera_world: Array
+        self, images: Pixels, features: Features, ids: NDArray[np.int32], T_camera_world: Array
     ) -> Track | None:
         """Find a camera that should be at a pose from which points `ids` (N,) are seen; None
         unless it sees them.
@@ -288,7 +287,7 @@ class Relocaliser:
 
     def find_surely(
         self,
-        images: Images,
+        images: Pixels,
         features: Features,
         stamp_ns: int,
         is_possible: Callable[[Array], bool] | None = None,
@@ -313,7 +312,7 @@ class Relocaliser:
         return found
 
     def find(
-        self, images: Images, features: Features, is_possible: Callable[[Array], bool] | None = None
+        self, images: Pixels, features: Features, is_possible: Callable[[Array], bool] | None = None
     ) -> Track | None:
         """Return a frame with its pose; None where no place of the map is seen, or two that look
         alike. is_possible: whether the camera can be at a pose T_camera_world (4, 4).

@@ -51,6 +51,10 @@ NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
 """Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
 this very frame; by a prediction; and when that finds too little."""
 
+Pixels = Images | Observations
+"""What the features of a frame are measured in: its images, or where these are gone, as of a saved
+keyframe, what was measured in them."""
+
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
 
@@ -96,7 +100,7 @@ class Tracker:
 
     def track_at(
         self,
-        images: Images,
+        images: Pixels,
         features: Features,
         local_ids: NDArray[np.int32],
         T_camera_world: Array,
@@ -109,16 +113,21 @@ class Tracker:
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
-        observations, offset_px = self.pixel_observations(features), self._map.rig.offset.value_px
-        seen = predict_points(self._map, local_ids, T_camera_world, images.excluded)
+        offset_px = self._map.rig.offset.value_px
+        if isinstance(images, Images):
+            observations, excluded = self.pixel_observations(features), images.excluded
+        else:
+            observations, excluded = images, None
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
         tree = cKDTree(features.uv_px)
         points, rows = self._search(features, tree, seen, NARROW_PX)
         if len(rows) < (ENOUGH if known is None else 1):
             return None
         ids = seen.ids[points]
-        align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
-        guess_px = seen.uvd_px[points, 2] + offset_px
-        measure_disparity(images, observations, rows, guess_px)
+        if isinstance(images, Images):
+            align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
+            guess_px = seen.uvd_px[points, 2] + offset_px
+            measure_disparity(images, observations, rows, guess_px)
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:

@@ -1,0 +1,117 @@
+"""`segfloor map`: what can be done with saved maps without driving."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import typer
+
+from segfloor_ros.cli.terminal import Json, console, print_json, value_table
+from segfloor_ros.files.results import write_file, write_map_file
+from segfloor_ros.grid.map_file import save_map
+from segfloor_ros.map_files import changes, draw_changes, merge, open_map
+
+app = typer.Typer(help='Look at saved maps, compare them, make one of two.')
+
+FirstMap = Annotated[Path, typer.Argument(metavar='A', help='File of --save-map.')]
+SecondMap = Annotated[Path, typer.Argument(metavar='B', help='File of --save-map.')]
+
+
+@app.command('info')
+def info(
+    path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map.')],
+    as_json: Json = False,
+) -> None:
+    """Say what a saved map holds: drives with dates, keyframes, areas, camera.
+
+    \b
+    segfloor map info building.map
+    """
+    facts = open_map(path).facts() | {'file_mb': round(path.stat().st_size / 1e6, 2)}
+    if as_json:
+        return print_json(facts)
+    console.print(value_table('map', list(_rows(facts)), str(path)))
+
+
+def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    width, height = facts['size_m']
+    rows = [
+        ('size', f'{width:.1f} x {height:.1f} m'),
+        ('free', f'{facts["free_m2"]:.1f} m²'),
+        ('occupied', f'{facts["occupied_m2"]:.1f} m²'),
+        ('way of the keyframes', f'{facts["path_m"]:.1f} m'),
+        ('keyframes', str(facts['keyframes'])),
+        ('points', str(facts['points'])),
+        ('loops', str(facts['loops'])),
+        ('camera', f'{facts["camera"]}, {facts["camera_height_m"]:.2f} m above the floor'),
+        ('file', f'{facts["file_mb"]:.1f} MB'),
+    ]
+    for number, session in enumerate(facts['sessions'], 1):
+        began, ended = session['first_ns'] / 1e9, session['last_ns'] / 1e9
+        words = f'{_date(began)}, {ended - began:.0f} s, {session["keyframes"]} keyframes'
+        rows.append((f'drive {number}', words))
+    return rows
+
+
+def _date(seconds: float) -> str:
+    """Return a time of the recording's clock; recordings without dates begin near 0."""
+    if seconds < datetime.timedelta(days=365).total_seconds():
+        return f'at {seconds:.0f} s'
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
+
+
+@app.command('export')
+def export(
+    path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map.')],
+    out: Annotated[Path, typer.Argument(metavar='MAP.yaml', help='Map for map_server and Nav2.')],
+) -> None:
+    """Write the occupancy grid of a saved map, as Nav2's map_server reads it.
+
+    \b
+    segfloor map export building.map building.yaml
+    """
+    save_map(open_map(path).grid(), out)
+    typer.echo(f'map: {out}')
+
+
+@app.command('merge')
+def merge_maps(
+    first: FirstMap,
+    second: SecondMap,
+    out: Annotated[Path, typer.Argument(metavar='OUT', help='The map of both.')],
+) -> None:
+    """Make one map of two that show some of the same places, in the frame of the first.
+
+    \b
+    segfloor map merge robot1.map robot2.map building.map
+    """
+    write_map_file(out, merge(open_map(first), open_map(second)).file)
+    typer.echo(f'map: {out}')
+
+
+@app.command('diff')
+def diff(
+    first: FirstMap,
+    second: SecondMap,
+    out: Annotated[Path, typer.Argument(metavar='OUT.png', help='Picture.')],
+    as_json: Json = False,
+) -> None:
+    """Draw what appeared (red) and what is gone (green) from one map to the other.
+
+    \b
+    segfloor map diff monday.map friday.map changes.png
+    """
+    grid, change = changes(open_map(first), open_map(second))
+    write_file(out, cv2.imencode('.png', draw_changes(grid, change))[1].tobytes())
+    cell_m2 = grid.resolution_m**2
+    areas = {
+        f'{name}_m2': round(float((change == sign).sum() * cell_m2), 2)
+        for name, sign in (('appeared', 1), ('gone', -1))
+    }
+    if as_json:
+        return print_json(areas)
+    rows = [(name.removesuffix('_m2'), f'{area:.2f} m²') for name, area in areas.items()]
+    console.print(value_table('change', [*rows, ('picture', str(out))]))

@@ -1,0 +1,160 @@
+"""Saved maps, merged and compared without driving."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.camera.model import StereoCamera
+from segfloor_ros.configuration import resolve
+from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.files.results import from_bytes, to_bytes
+from segfloor_ros.geometry import invert
+from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
+from segfloor_ros.grid.map_file import FREE
+from segfloor_ros.map_files import (
+    APPEARED_BGR,
+    GONE_BGR,
+    SavedMap,
+    changes,
+    draw_changes,
+    merge,
+    open_map,
+)
+from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.slam.saved_slam import loaded_map
+
+OTHER_CAMERA = StereoCamera(320, 240, 163.0, 162.0, 157.0, 120.5, 0.125)
+"""Of a robot of the same build."""
+
+THERE = [planar_pose(0.06 * k, 0.0, 0.01 * k) for k in range(24)]
+BESIDE = [planar_pose(0.2 + 0.06 * k, 0.1, 0.05 - 0.004 * k) for k in range(24)]
+
+
+def mapped(poses, seed=0, camera=CAMERA, noise=0, height_m=MOUNT.height_m):
+    """Return the map of a drive through a room, as its file gives it back."""
+    room = StereoRoom(seed)
+    room.reset_noise(noise)
+    mount = {'height_m': height_m, 'pitch_rad': MOUNT.pitch_rad, 'roll_rad': 0.0}
+    given = [f'stereo_slam.camera_{name}={value}' for name, value in mount.items()]
+    pipeline = Pipeline(camera, resolve(assignments=given))
+    for k, pose in enumerate(poses):
+        pipeline.process(room.frame(k, pose, camera=camera))
+    pipeline.finish_tracking()
+    pipeline.finish()
+    return SavedMap(f'{seed}.map', from_bytes(to_bytes(pipeline.save()), 'x'))
+
+
+@pytest.fixture(scope='module')
+def first():
+    return mapped(THERE)
+
+
+@pytest.fixture(scope='module')
+def second():
+    return mapped(BESIDE, camera=OTHER_CAMERA, noise=1)
+
+
+@pytest.fixture(scope='module')
+def merged(first, second):
+    return merge(first, second)
+
+
+def paths(saved, count):
+    """Return the poses of the first keyframes, and of the others, with their frames."""
+    poses, frames = loaded_map(saved.file, 0).path.T_map_base, saved.slam['keyframe_frame_index']
+    return (poses[:count], frames[:count]), (poses[count:], frames[count:])
+
+
+def test_two_robots_maps_are_one_in_the_frame_of_the_first(first, second, merged):
+    drives = paths(merged, len(first.slam['keyframe_stamp_ns']))
+    for (poses, frames), truth in zip(drives, (THERE, BESIDE), strict=True):
+        assert len(frames) >= 5
+        true = np.array([invert(THERE[0]) @ truth[k] for k in frames.tolist()])
+        assert np.linalg.norm((invert(true) @ poses)[:, :3, 3], axis=1).max() < 0.03
+    points = [len(m.slam['point_stable_id']) for m in (first, second, merged)]
+    assert points[2] < sum(points[:2])
+    assert len(merged.slam['loop_ends']) >= 6
+
+
+def test_labels_and_evidence_move_along(first, second, merged):
+    parts = merged.file.parts
+    np.testing.assert_array_equal(parts['cloud']['point_id'], parts['slam']['point_stable_id'])
+    assert set(parts['grid']['stamp_ns']) <= set(parts['slam']['keyframe_stamp_ns'])
+    assert np.all(np.diff(parts['slam']['keyframe_stamp_ns']) > 0)
+    free = [(m.grid().cells == FREE).sum() for m in (first, second, merged)]
+    assert max(free[:2]) < free[2] < sum(free[:2])
+
+
+def test_a_robot_goes_on_with_a_merged_map(merged):
+    pipeline = Pipeline(CAMERA, resolve(assignments=[]))
+    pipeline.load(from_bytes(to_bytes(merged.file), 'x'), 'x', localize=True)
+    room, results = StereoRoom(0), []
+    for k, pose in enumerate(BESIDE):
+        results += pipeline.process(room.frame(k, pose))
+    pipeline.close()
+    tracked = [r for r in results if r.tracked]
+    assert len(tracked) >= 20
+    errors = [
+        np.linalg.norm((invert(BESIDE[r.index]) @ r.T_map_odom @ r.T_odom_base)[:3, 3])
+        for r in tracked
+    ]
+    assert np.median(errors) < 0.02
+
+
+def test_each_drive_is_in_the_list_of_sessions(first, merged):
+    assert len(first.facts()['sessions']) == 1
+    sessions = merged.facts()['sessions']
+    assert len(sessions) == 2
+    assert sum(s['keyframes'] for s in sessions) == merged.facts()['keyframes']
+
+
+def with_post(saved, xy_m):
+    """Return a map in which every keyframe sees a post of four cells there as well."""
+    grid, evidence = saved.file.parts['grid'], []
+    cells = xy_m[:, None] + np.array([[0.0, 0.0, 0.05, 0.05], [0.0, 0.05, 0.0, 0.05]])
+    for seen, (x, y, yaw) in zip(evidence_from_arrays(grid), grid['pose'], strict=True):
+        c, s = np.cos(yaw), np.sin(yaw)
+        post = np.array([[c, s], [-s, c]]) @ (cells - [[x], [y]])
+        positions_m = np.concatenate([seen.positions_m, post.astype(np.float16)], axis=1)
+        evidence.append(replace(seen, positions_m=positions_m))
+    parts = saved.file.parts | {'grid': grid | evidence_to_arrays(evidence)}
+    return SavedMap('later.map', replace(saved.file, parts=parts))
+
+
+def test_what_has_come_and_what_has_gone(first):
+    xy_m = np.array([2.0, 0.2])
+    later = with_post(first, xy_m)
+    for pair, sign in (((first, later), 1), ((later, first), -1)):
+        whole, change = changes(*pair)
+        assert set(np.unique(change)) == {0, sign}
+        at = (np.argwhere(change == sign)[:, ::-1] + 0.5) * whole.resolution_m
+        assert np.abs(at + whole.origin_xy_m - xy_m).max() < 0.15
+        colours = draw_changes(whole, change).reshape(-1, 3)
+        assert {APPEARED_BGR, GONE_BGR} & set(map(tuple, colours.tolist())) == {
+            APPEARED_BGR if sign > 0 else GONE_BGR
+        }
+
+
+def test_nothing_has_changed_where_nothing_did(first, second):
+    _, change = changes(first, second)
+    assert (change != 0).sum() <= 4
+
+
+def test_maps_of_different_places_stay_apart(first):
+    with pytest.raises(MapError, match=r'77\.map: shows no place of 0\.map'):
+        merge(first, mapped(THERE, seed=77))
+
+
+def test_a_camera_that_is_mounted_otherwise_is_said(first, second):
+    header = second.file.header | {'mount': second.file.header['mount'] | {'height_m': 0.9}}
+    with pytest.raises(InputError, match=r'0\.90 m above the floor, not 0\.40 m'):
+        merge(first, SavedMap('tall.map', replace(second.file, header=header)))
+
+
+def test_a_file_without_all_parts_is_one_line(first, tmp_path):
+    path = tmp_path / 'x.map'
+    path.write_bytes(to_bytes(replace(first.file, parts={'slam': first.slam})))
+    with pytest.raises(InputError, match=r'x\.map: parts of the map do not fit'):
+        open_map(path)
