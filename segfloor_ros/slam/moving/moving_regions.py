@@ -33,7 +33,7 @@ from segfloor_ros.slam.moving.scene_flow import (
     static_scale,
 )
 from segfloor_ros.slam.places.known_views import MIN_FRAMES
-from segfloor_ros.slam.results import CHANCE_SHARE, MovingPoints
+from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
 from segfloor_ros.slam.tracking.images import Region
@@ -54,13 +54,12 @@ SHIN_M, FOOT_M = 0.3, 0.2
 FOOT_STEPS_PX = (1.5, 2.5, 4.0, 6.5, 10.0, 16.0, 26.0, 64.0)
 """Disparities between which feet are taken to be of one size."""
 
-MOSTLY = 2.0
-"""A thing moves of which so many times more moved than stood still."""
-
 REACH_M = 0.4
 """From corners of someone who walks to hands and feet."""
 
-NOISE_GREY = 1.0
+GAINS = 0.5, 2.0
+"""Of the right image's contrast against the left one's."""
+
 MISFIT_OF_TEXTURE = 0.7
 """Patches that show different things differ by more than this share of their texture."""
 
@@ -117,6 +116,7 @@ class MovingRegions:
         self._found: NDArray[np.uint8] | None = None
         self._meter = MovingPointMeter()
         self._frames_since = 0
+        self._exposure = 1.0, 0.0
 
     def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
         """Whether to search a frame."""
@@ -163,15 +163,35 @@ class MovingRegions:
             self._pair = small_left, None
             return shrunk(right.astype(np.float32, copy=False), self._small.size)
         small_right = cv2.resize(right, self._small.size, interpolation=cv2.INTER_AREA)
-        self._pair = small_left, small_right
         # Without a margin the matcher leaves the leftmost columns empty.
         wide = (
             cv2.copyMakeBorder(i, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE)
-            for i in (small_left, small_right)
+            for i in (small_left, self._as_bright(small_right))
         )
         found = self._matcher.compute(*wide)[:, DISPARITIES:].astype(np.float32) / 16
         found[found > np.arange(self._small.size[0]) + 1] = 0.0
+        self._compare_exposures(small_left, small_right, found)
+        self._pair = small_left, self._as_bright(small_right)
         return np.maximum(found, 0.0)
+
+    def _as_bright(self, right: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a right image (h, w) as bright as the left one, as far as is known."""
+        gain, offset = self._exposure
+        return np.asarray(cv2.addWeighted(right, gain, right, 0.0, offset), np.uint8)
+
+    def _compare_exposures(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], disparity: Disparity
+    ) -> None:
+        """Note gain and offset between two images (h, w), by what both show."""
+        is_matched = (disparity > 0).astype(np.uint8)
+        if np.count_nonzero(is_matched) < MIN_AREA_PX:
+            return
+        (mean_l, spread_l), (mean_r, spread_r) = (
+            cv2.meanStdDev(image, mask=is_matched)
+            for image in (left, self._small.from_right(right, disparity))
+        )
+        gain = float(np.clip(spread_l[0, 0] / max(float(spread_r[0, 0]), 1.0), *GAINS))
+        self._exposure = gain, float(mean_l[0, 0]) - gain * float(mean_r[0, 0])
 
     def remember(self, keyframe: KeyframeRecord, disparity: Disparity) -> None:
         """Take in what a keyframe saw."""
@@ -279,16 +299,16 @@ class MovingRegions:
         if self._pair[1] is None:
             return np.ones(disparity.shape, np.uint8)
         left, right = (image.astype(np.float32) for image in self._pair if image is not None)
-        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self._small.size))
 
         def misfit(d: Disparity) -> Disparity:
-            moved = cv2.remap(right, u - d, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            return np.asarray(cv2.blur(cv2.absdiff(left, moved), (5, 5)), np.float32)
+            difference = cv2.absdiff(left, self._small.from_right(right, d))
+            return np.asarray(cv2.blur(difference, (5, 5)), np.float32)
 
         rival = np.minimum.reduce([misfit(background + step) for step in (-0.5, 0.0, 0.5)])
         texture = cv2.blur(cv2.absdiff(left, cv2.blur(left, (5, 5))), (5, 5))
-        clearly = np.maximum(1.5 * misfit(disparity), MISFIT_OF_TEXTURE * texture)
-        return (rival > clearly + NOISE_GREY).astype(np.uint8)
+        own = misfit(disparity)
+        limit = MISFIT_OF_TEXTURE * texture + np.median(own[disparity > 0])
+        return ((own < limit) & (limit < rival)).astype(np.uint8)
 
     def _chosen(self, T_world_camera: Array, depth_m: float) -> list[DepthView]:
         """Return a few views that look at what the camera sees from much the same side, spread over
@@ -311,10 +331,10 @@ class MovingRegions:
         """
         found = votes.moving & high
         _, labels = cv2.connectedComponents(np.where(_edges(disparity), 0, high).astype(np.uint8))
-        moved, still = (
-            np.bincount(labels.ravel(), weights=of.ravel()) for of in (found, votes.still)
+        moved, voted = (
+            np.bincount(labels.ravel(), weights=of.ravel()) for of in (found, votes.all)
         )
-        moves = (moved > MOSTLY * still) & (moved >= MIN_AREA_PX)
+        moves = (moved > MAJORITY * voted) & (moved >= MIN_AREA_PX)
         for label in np.flatnonzero(moves[1:]) + 1:
             seed = ((labels == label) & (found > 0)).astype(np.uint8)
             depth_m = self._small.disparity_m / np.median(disparity[seed > 0])

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.results import PROOF, MovingPoints
+from segfloor_ros.slam.results import MAJORITY, PROOF, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.sparse_map import MAX_PATCH_ZOOM
@@ -87,10 +87,13 @@ class FlowView:
 
 @dataclass(frozen=True)
 class FlowVotes:
-    """Where (h, w) corners moved, and where they stood still: 1, else 0."""
+    """Where (h, w) corners moved, where they stood still, and where any are, also those that were
+    not found again: 1, else 0.
+    """
 
     moving: NDArray[np.uint8]
     still: NDArray[np.uint8]
+    all: NDArray[np.uint8]
 
 
 class SceneFlow:
@@ -120,10 +123,10 @@ class SceneFlow:
         if odd.sum() > MAX_MOVING_SHARE * (moved | still).sum():
             moved, still = moved_before, still & ~moved_before
         disparity = self._camera.at(view.disparity, uv)
-        moved = _outvoting(uv, disparity, moved, still)
+        voters = sure | still
+        moved = _outvoting(uv, disparity, moved, voters)
         return FlowVotes(
-            _discs(view.disparity, uv[moved], disparity[moved]),
-            _discs(view.disparity, uv[still], disparity[still]),
+            *(_discs(view.disparity, uv[of], disparity[of]) for of in (moved, still, voters))
         )
 
     def _earlier(self, now_ns: int) -> list[FlowView]:
@@ -210,9 +213,11 @@ def _distance_to_segment(p: Array, a: Array, b: Array) -> Array:
 
 
 def _outvoting(
-    uv: Array, disparity: Array, moved: NDArray[np.bool_], still: NDArray[np.bool_]
+    uv: Array, disparity: Array, moved: NDArray[np.bool_], voters: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return the corners (N,) that moved and whose neighbours at the same depth mostly did, too."""
+    """Return the corners (N,) that moved and whose neighbours at the same depth mostly did, too. Of
+    those who vote, whoever was not found again does not say that it moved.
+    """
     result = moved.copy()
     if not moved.any():
         return result
@@ -220,7 +225,7 @@ def _outvoting(
     for i in np.flatnonzero(moved):
         near = np.array(tree.query_ball_point(uv[i], NEIGHBOUR_PX))
         near = near[np.abs(disparity[near] - disparity[i]) < 2 * TOLERANCE_PX]
-        result[i] = moved[near].sum() >= PROOF and moved[near].sum() > still[near].sum()
+        result[i] = moved[near].sum() >= max(PROOF, MAJORITY * voters[near].sum())
     return result
 
 
@@ -252,6 +257,11 @@ class SmallCamera:
         full_u, full_v = ((axis + 0.5) * factor - 0.5 for axis in (u, v))
         rays = [(full_u - camera.cx) / camera.fx, (full_v - camera.cy) / camera.fy, np.ones_like(u)]
         self.rays = np.stack(rays).reshape(3, -1).astype(np.float32)
+
+    def from_right(self, right: NDArray[Any], disparity: Disparity) -> NDArray[Any]:
+        """Return what a right image (h, w) shows of the left one's pixels by a disparity (h, w)."""
+        u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in self.size))
+        return cv2.remap(right, u - disparity, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def contains(self, uv: Array) -> NDArray[np.bool_]:
         """Return which pixels (N, 2) lie in the image."""

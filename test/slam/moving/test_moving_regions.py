@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from stereo_room import CAMERA
@@ -39,8 +40,16 @@ def regions():
     return made
 
 
-def found_share(regions, texture, disparity_px):
-    regions.measure(*pair(texture, disparity_px))
+def found_share(regions, texture, disparity_px, alike=1.0):
+    """Shares found of a thing before the wall, and beside it. disparity_px: of the thing. alike:
+    how much of it the right image shows there.
+    """
+    left, right = (image.copy() for image in pair(texture, WALL_PX))
+    thing = np.s_[40:200, 120:200]
+    other = np.flip(texture)[40:200, 120:200]
+    columns = np.arange(120, 200) - round(FACTOR * disparity_px)
+    right[40:200, columns] = alike * left[thing] + (1 - alike) * other
+    regions.measure(left, right)
     seen = np.full((CAMERA.height // FACTOR, CAMERA.width // FACTOR), WALL_PX, np.float32)
     seen[20:100, 60:100] = NEARER_PX
     found = regions.find(seen, np.eye(4), None)
@@ -60,6 +69,11 @@ def test_what_a_single_view_saw_through_does_not_move():
     assert found_share(made, noise(600), NEARER_PX) == (0.0, 0.0)
 
 
+def test_a_match_that_the_pair_does_not_show_does_not_move(regions):
+    inside, _ = found_share(regions, noise(600), NEARER_PX, alike=0.4)
+    assert inside == 0
+
+
 def test_a_pattern_that_repeats_does_not_move(regions):
     tile = noise(round(FACTOR * (NEARER_PX - WALL_PX)))
     inside, _ = found_share(regions, np.tile(tile, 40)[:, :600], NEARER_PX)
@@ -72,15 +86,17 @@ def test_a_thing_of_which_most_corners_moved_moves_as_a_whole_where_it_stood_bef
     seen[20:100, 60:100] = NEARER_PX
     for _ in range(5):
         made.remember(SimpleNamespace(T_camera_world=np.eye(4)), seen)
-    made.measure(*pair(noise(600), NEARER_PX))
+    made.measure(*pair(noise(600), WALL_PX))
     moving, still = np.zeros(seen.shape, np.uint8), np.zeros(seen.shape, np.uint8)
     moving[50:60, 75:85] = still[50:60, 120:130] = 1
-    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
+    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still, moving | still))
     assert (found[30:90, 64:96] > 0).mean() > 0.95
     assert not found[:, 110:].any()
-    still[25:45, 62:98] = 1
-    found = made.find(seen, np.eye(4), None, FlowVotes(moving, still))
-    assert (found[30:90, 64:96] > 0).mean() < 0.2
+    others = moving | still
+    others[25:45, 62:98] = 1
+    for stands in (others - moving, still):  # they stand still, or were not found again
+        found = made.find(seen, np.eye(4), None, FlowVotes(moving, stands, others))
+        assert (found[30:90, 64:96] > 0).mean() < 0.2
 
 
 def test_a_strip_no_wider_than_a_block_does_not_move(regions):
@@ -133,3 +149,15 @@ def test_what_is_found_once_does_not_move_yet(regions):
         assert not moving[:, 125:].any()
     assert shares[0] == shares[1] == shares[3] == 0
     assert shares[2] > 0.9
+
+
+def test_eyes_of_different_brightness_see_the_same_wall(regions):
+    shade = cv2.GaussianBlur(noise(600).astype(np.float32), (0, 0), 15.0)
+    shade *= 40 / shade.std()
+    texture = shade - shade.mean() + 128 + 0.05 * noise(600)
+    left, right = (np.clip(image, 0, 255).astype(np.uint8) for image in pair(texture, WALL_PX))
+    darker = cv2.addWeighted(right, 0.8, right, 0.0, -20.0)
+    for _ in range(3):
+        found = regions.search(StereoFrame(0, 0, left, darker), np.eye(4), np.eye(4), None)
+        assert not found.moving.any()
+    assert (np.abs(found.disparity - WALL_PX) < 0.5).mean() > 0.9
