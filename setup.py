@@ -74,14 +74,16 @@ setup(
         ],
         'cluster': ['distributed>=2024.5', 'fsspec>=2024.5'],
         'sim': ['mujoco>=3.3'],
+        'onnx': ['onnxruntime>=1.17'],
         'view': ["rerun-sdk>=0.41; python_version >= '3.11'"],
         'all': ['segfloor_ros[ros,cli,cluster,sim,view]'],
         # colcon takes the tests to be pytest's by this name.
-        'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
+        'test': ['onnx>=1.16', 'pytest', 'pytest-timeout', 'pytest-xdist'],
         'dev': [
             'colcon-common-extensions',
             'mkdocs-material>=9.5',
             'mypy',
+            'onnx>=1.16',
             'pytest',
             'pytest-timeout',
             'pytest-xdist',

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 from segfloor_ros import results_folder
 from segfloor_ros.camera.model import MeasurementLog, Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.rig.check import SETTLED_FRAMES
-from segfloor_ros.camera.sources import StereoSource
+from segfloor_ros.camera.sources import StereoSource, prefetched
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.files.results import (
@@ -32,6 +32,7 @@ from segfloor_ros.files.results import (
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
+from segfloor_ros.semantics.network import Network
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
@@ -141,7 +142,8 @@ def no_floor(name: str, frames: int) -> str:
 class LockstepRun:
     """One run of a source through the pipeline, with everything noted that the results folder
     needs. interrupted: ends the drive after the frame at which it is set. path_only: no map is
-    made, and no floor is looked for. watcher: sees the drive while it is under way.
+    made, and no floor is looked for. watcher: sees the drive while it is under way. network:
+    looks at its images.
 
     note: what there is to say about the map that was to be saved. broken_off: why the recording
     could not be read to its end. no_map: why only a path came of the drive.
@@ -158,6 +160,7 @@ class LockstepRun:
         interrupted: threading.Event | None = None,
         path_only: bool = False,
         watcher: Watcher | None = None,
+        network: Network | None = None,
     ) -> None:
         self._watcher = watcher
         self._source = source
@@ -166,7 +169,9 @@ class LockstepRun:
         self._save_masks = save_masks
         self._save_debug = save_debug
         self._memory = MemoryLog()
-        self._pipeline = Pipeline(source.camera, configuration, self._on_keyframe, path_only)
+        self._pipeline = Pipeline(
+            source.camera, configuration, self._on_keyframe, path_only, network
+        )
         # Other frames are masked by a segmentation of their own, of which the map does not hear.
         self._other_frames = FloorSegmentation(source.camera, configuration.floor_segmentation)
         self.note = self.no_map = ''
@@ -263,7 +268,7 @@ class LockstepRun:
     def _process_frames(self, on_progress: ProgressListener | None) -> None:
         measurements = MeasurementLog(self._source.sensors)
         try:
-            for frame in self._source.frames():
+            for frame in self._masked_frames():
                 self._frames += 1
                 slam = self._pipeline.slam
                 for measurement in measurements.until(frame.stamp_ns + slam.sensors.lag_ns):
@@ -289,6 +294,11 @@ class LockstepRun:
             if not self._frames:
                 raise
             self.broken_off = error
+
+    def _masked_frames(self) -> Iterator[StereoFrame]:
+        """Yield the frames; where there is a network, it looks at them on a thread of its own."""
+        frames, labeller = self._source.frames(), self._pipeline.labeller
+        return frames if labeller is None else prefetched(labeller.with_masks(frames))
 
     def _say_faults(self) -> None:
         for fault in self._pipeline.slam.rig_check.faults.values():
@@ -323,7 +333,11 @@ class LockstepRun:
         if result.keyframe is not None or self._known_mount is None:
             return
         T_map_base = result.T_map_odom @ result.T_odom_base if result.tracked else None
-        floor = self._other_frames.process(frame.left, frame.right, self._known_mount, T_map_base)
+        labeller = self._pipeline.labeller
+        said = None if labeller is None else labeller.says(frame.stamp_ns, frame.left)
+        floor = self._other_frames.process(
+            frame.left, frame.right, self._known_mount, T_map_base, said=said
+        )
         self._folder.add_picture('floor_masks', f'{frame.index:06d}', floor.mask)
 
     def _on_keyframe(self, keyframe: Keyframe, floor: FloorObservation) -> None:
@@ -373,7 +387,10 @@ class LockstepRun:
             loop_times_s=self._loop_times_s,
             map_updates=pipeline.keyframe_stages.map_updates,
             sensors=self._sensors_used(),
-            sensor_remarks=[*slam.sensors.remarks.values()],
+            sensor_remarks=[
+                *slam.sensors.remarks.values(),
+                *pipeline.keyframe_stages.network_remarks,
+            ],
             input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=pipeline.failed_keyframes,

@@ -23,6 +23,8 @@ from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
+from segfloor_ros.semantics.frames import ImageLabeller
+from segfloor_ros.semantics.network import Network
 from segfloor_ros.slam.results import (
     FrameResult,
     Keyframe,
@@ -59,21 +61,29 @@ class KeyframeStages:
     """The three stages behind SLAM, keyframe by keyframe: the one place that knows their order."""
 
     def __init__(
-        self, camera: StereoCamera, configuration: Configuration, times: StageTimes
+        self,
+        camera: StereoCamera,
+        configuration: Configuration,
+        times: StageTimes,
+        labeller: ImageLabeller | None = None,
     ) -> None:
         self.labelled: LabelledPoints | None = None
         self.map_updates = 0
         self._is_loaded = False
         self._times = times
+        self._labeller = labeller
         self._floor = FloorSegmentation(camera, configuration.floor_segmentation)
         self._labelling = CloudLabelling(configuration.cloud_labelling)
         self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
 
     def process(self, keyframe: Keyframe, mount: Mount) -> FloorObservation:
         """Take in one keyframe."""
+        said = None
+        if self._labeller is not None:
+            said = self._labeller.says(keyframe.stamp_ns, keyframe.left)
         with self._times.measure('floor_segmentation'):
             floor = self._floor.process(
-                keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving
+                keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving, said
             )
         path, cloud = keyframe.path, keyframe.cloud
         self.update_map(
@@ -92,6 +102,14 @@ class KeyframeStages:
                 keyframe.stamp_ns, self.labelled, keyframe.features, keyframe.path, keyframe.scan
             )
         self.map_updates += 1
+
+    @property
+    def network_remarks(self) -> list[str]:
+        """What is wrong with what the network sees, in words."""
+        if self._labeller is None:
+            return []
+        of_floor = self._floor.network.remark
+        return [*self._labeller.remarks, *([of_floor] if of_floor else [])]
 
     def note_points(self, cloud: SparseCloud) -> None:
         """Take in the points of a keyframe whose floor is not segmented."""
@@ -124,7 +142,8 @@ class Pipeline:
     Nothing flows back from the worker to SLAM, so the result does not depend on timing. A keyframe
     at which a stage fails does not reach the map, the others do. failed_keyframes: how many did
     not; fault: of the last of them, in words. path_only: whether SLAM runs alone, also where no
-    floor shows the mount; the camera is then taken for the base, and there is no map.
+    floor shows the mount; the camera is then taken for the base, and there is no map. network:
+    looks at the frames, if there is one.
     """
 
     def __init__(
@@ -133,13 +152,15 @@ class Pipeline:
         configuration: Configuration,
         on_keyframe: KeyframeListener | None = None,
         path_only: bool = False,
+        network: Network | None = None,
     ) -> None:
         self.times = StageTimes()
         self.camera = camera
         self.path_only = path_only
         mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
         self.slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
-        self.keyframe_stages = KeyframeStages(camera, configuration, self.times)
+        self.labeller = None if network is None else ImageLabeller(network, self.times)
+        self.keyframe_stages = KeyframeStages(camera, configuration, self.times, self.labeller)
         self.failed_keyframes, self.fault = 0, ''
         self._on_keyframe = on_keyframe
         self._worker = ThreadPoolExecutor(1, 'keyframes')
@@ -153,6 +174,8 @@ class Pipeline:
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Take in the next frame; returns the tracking results that are ready, oldest first."""
         results = self.slam.process(frame)
+        if self.labeller is not None and self.labeller.is_late:
+            self._add_late_mask(frame)
         for result in results:
             if result.keyframe is not None and self.path_only:
                 self.keyframe_stages.note_points(result.keyframe.cloud)
@@ -197,6 +220,14 @@ class Pipeline:
     def close(self) -> None:
         """Drop what is pending, e.g. after an error."""
         self._worker.shutdown(cancel_futures=True)
+
+    def _add_late_mask(self, frame: StereoFrame) -> None:
+        """Let the network look at a frame that has become a keyframe."""
+        assert self.labeller is not None
+        keyframes = self.slam.map.keyframes
+        if keyframes and keyframes[-1].stamp_ns == frame.stamp_ns:
+            mask = self.labeller.moving(frame.stamp_ns, frame.left)
+            self.slam.add_late_mask(frame.stamp_ns, mask)
 
     def _submit(self, keyframe: Keyframe) -> None:
         while len(self._pending) >= MAX_KEYFRAMES_UNDER_WAY:

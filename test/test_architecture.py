@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'segfloor_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
 ROS_FREE_ROOMS = (
     'camera', 'slam', 'floor', 'cloud', 'grid', 'evaluation', 'simulation', 'navigation',
+    'semantics',
 )  # fmt: skip
 ROS = {
     'rclpy', 'rcl_interfaces', 'tf2_ros', 'launch', 'launch_ros', 'ament_index_python', 'cv_bridge',
@@ -29,6 +30,7 @@ ONLY_IN = {
     'fsspec': ('suite',),
     'junitparser': ('suite',),
     'rerun': ('cli',),
+    'onnxruntime': ('semantics',),
 }
 FLOW = ('camera', 'slam', 'floor', 'cloud', 'grid')
 """Data flows one way: a stage may know the data of the stages before it, not of those behind it."""

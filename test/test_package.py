@@ -21,7 +21,9 @@ NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling'
 IMPORT_OF_KEY = {'python3-numpy': 'numpy', 'python3-opencv': 'cv2', 'python3-scipy': 'scipy',
                  'python3-yaml': 'yaml', 'python3-typer': 'typer', 'python3-rich': 'rich',
                  'python3-matplotlib': 'matplotlib'}  # fmt: skip
-OF_EXTRAS = {'evo', 'rosbags', 'mujoco', 'junitparser', 'fsspec', 'distributed', 'rerun'}
+OF_EXTRAS = {
+    'evo', 'rosbags', 'mujoco', 'junitparser', 'fsspec', 'distributed', 'rerun', 'onnxruntime',
+}  # fmt: skip
 """What has no key of rosdep: commands that need one of them say so in one line."""
 START_S = 60.0
 

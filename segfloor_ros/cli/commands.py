@@ -44,6 +44,7 @@ from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
+from segfloor_ros.semantics.network import Network
 
 DEFAULT = BenchmarkPlan()
 
@@ -57,6 +58,7 @@ DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 @terminal.with_options
 def run(
     options: terminal.DriveOptions,
+    network: terminal.NetworkFile = None,
     save_debug: Annotated[
         bool,
         typer.Option(
@@ -73,6 +75,7 @@ def run(
     segfloor run sequences/06 --params kitti --frames 200 --out map06
     """
     maps = options.maps
+    sees = None if network is None else Network(network)
     configuration, source = options.open()
     with open_view(options.view) as view:
         with (
@@ -89,6 +92,7 @@ def run(
                 interrupt,
                 options.no_map,
                 view,
+                sees,
             )
             result = drive.execute(progress)
             folder.write(result)
@@ -298,6 +302,13 @@ def simulate(
     disparity: Annotated[
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
     ] = False,
+    labels: Annotated[
+        bool,
+        typer.Option(
+            '--labels',
+            help='With each mask the class of each pixel, and which person or car it is.',
+        ),
+    ] = False,
     supersampling: Annotated[
         int, typer.Option(callback=within(1, 4), help='Render so many times finer than the image.')
     ] = 1,
@@ -322,10 +333,10 @@ def simulate(
 
     kind = [f'camera.kind={camera}'] if camera is not None else []
     described = open_scene(scene, [*kind, *(set_values or ())])
-    wanted = RecordingOptions(floor_every, disparity)
+    wanted = RecordingOptions(floor_every, disparity, labels)
     with (
         about(scene),
-        Simulation(described, supersampling) as simulation,
+        Simulation(described, supersampling, labels=labels) as simulation,
         terminal.progress_bar('rendering', simulation.frame_count) as progress,
     ):
         record(simulation, out, wanted, progress)

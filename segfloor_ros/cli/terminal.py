@@ -210,6 +210,15 @@ Masks = Annotated[
         'recorded, 255 = moving.',
     ),
 ]
+NetworkFile = Annotated[
+    Path | None,
+    typer.Option(
+        '--network',
+        metavar='FILE.onnx',
+        help='Segmentation network: tells what moves and what is floor; a YAML file of the same '
+        'name says how.',
+    ),
+]
 Ignore = Annotated[
     str | None,
     typer.Option('--ignore', help='Sensors to leave out, with commas: wheel_odometry, imu.'),

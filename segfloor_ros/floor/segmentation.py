@@ -49,7 +49,9 @@ from segfloor_ros.floor.mask.filling import (
     fill_gaps,
     fill_regions,
     trim_to_edges,
+    with_floor,
 )
+from segfloor_ros.floor.mask.network_floor import NetworkFloor
 from segfloor_ros.floor.mask.pixel_evidence import (
     Comparison,
     Evidence,
@@ -59,6 +61,7 @@ from segfloor_ros.floor.mask.pixel_evidence import (
 )
 from segfloor_ros.floor.observation import (
     FLOOR,
+    MOVING,
     NO_EVIDENCE,
     NOT_FLOOR,
     FloorObservation,
@@ -95,7 +98,9 @@ MASK_COLOURS = {
 
 
 class FloorSegmentation:
-    """Finds the floor in rectified stereo pairs of one camera. times: told what each step takes."""
+    """Finds the floor in rectified stereo pairs of one camera. times: told what each step takes.
+    network: how far what a network says of the floor can be believed.
+    """
 
     def __init__(
         self,
@@ -106,6 +111,7 @@ class FloorSegmentation:
         self._times = times or NoTimes()
         self._camera = camera
         self._settings = settings
+        self.network = NetworkFloor()
         self._mount: Mount | None = None
         self._matcher: TwoScaleMatcher
         self._overhead: OverheadMatcher
@@ -118,6 +124,7 @@ class FloorSegmentation:
         mount: Mount,
         T_map_base: Array | None = None,
         moving: NDArray[np.uint8] | None = None,
+        said: NDArray[np.uint8] | None = None,
     ) -> FloorObservation:
         """Return the floor of a rectified grey pair (H, W) uint8; of a depth camera, right is its
         disparity (H, W) float32.
@@ -125,7 +132,9 @@ class FloorSegmentation:
         mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
         the map, where known: the floor may be level there. moving: mask
         (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
-        what it hides is unknown. The black border that rectification leaves is treated alike.
+        what it hides is unknown. The black border that rectification leaves is treated alike. said:
+        (H, W) uint8, what a network says of the left image: `FLOOR`; `NOT_FLOOR`, what stands there
+        whatever its depth; `MOVING`, or `NO_EVIDENCE`.
         """
         measure = self._times.measure
         self._prepare(mount)
@@ -134,6 +143,8 @@ class FloorSegmentation:
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
             moving = union(moving, blank_border(left))
+            if said is not None:
+                moving = union(moving, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
             right, measured = stereo_view(left, right)
             left_rows, right_rows = left[first_row:], right[first_row:]
             noise = noise_grey(left_rows)
@@ -147,6 +158,8 @@ class FloorSegmentation:
             disparity = self._disparity(first_row, left, right) if measured is None else measured
             if moving is not None:
                 disparity[moving > 0] = 0
+            if said is not None:
+                disparity[said == NOT_FLOOR] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
@@ -166,8 +179,14 @@ class FloorSegmentation:
                 view, profile, below, left_view, texture, enough, compared, is_measured
             )
             clear_hidden(evidence.mask, moving, columns)
+            below_said = None if said is None else said[columns]
+            if below_said is not None:
+                evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
+                self.network.note(below_said, evidence.mask)
         with measure('filling'):
-            mask = self._fill(view, profile, below, evidence, left_rows, textured, compared)
+            mask = self._fill(
+                view, profile, below, evidence, left_rows, textured, compared, below_said
+            )
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(
@@ -175,6 +194,8 @@ class FloorSegmentation:
             )
         with measure('scan'):
             feet_xy = _feet(view, profile, mask, row_slope(left_view), textured)
+            if below_said is not None:
+                feet_xy = np.hstack([feet_xy, _barriers(view, profile, below_said)])
             scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy)
         return self._observation(view, profile, disparity, mask, scan, counted)
 
@@ -271,9 +292,11 @@ class FloorSegmentation:
         left_rows: NDArray[np.uint8],
         textured: NDArray[np.bool_],
         compared: Comparison,
+        said: NDArray[np.uint8] | None,
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
         like floor. The more floor is known the better is known how it looks, so this is done twice.
+        Nor does it contradict a network that was right so far.
         """
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
@@ -284,6 +307,9 @@ class FloorSegmentation:
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
             odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
+        if said is not None and self.network.is_trusted:
+            undenied = compared.consistent & ~compared.denied
+            mask = with_floor(mask, (said == FLOOR) & undenied)
         return drop_islands(mask)
 
     def _scan(
@@ -325,6 +351,21 @@ def _feet(
     rows, columns = blank_feet(view, mask, slope, textured)
     derolled = rows + view.shear_px[columns] + view.first_row
     return view.positions(rows, columns, profile.at_rows(derolled).astype(np.float32))
+
+
+def _barriers(
+    view: FloorView, profile: FloorProfile, said: NDArray[np.uint8]
+) -> NDArray[np.float32]:
+    """Return where what stands there whatever its depth, of what a network says (R, W), meets the
+    floor, (2, N) in the base's x-y plane: its lowest pixel in each column, unless the image ends.
+    """
+    rows = said.shape[0] - 1 - (said[::-1] == NOT_FLOOR).argmax(axis=0)
+    found = np.flatnonzero((said == NOT_FLOOR).any(axis=0) & (rows < said.shape[0] - 1))
+    rows = rows[found]
+    derolled = rows + view.shear_px[found] + view.first_row
+    below = derolled > view.line.horizon
+    floor_px = profile.at_rows(derolled[below]).astype(np.float32)
+    return view.positions(rows[below], found[below], floor_px)
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator
 from ctypes import ArgumentError
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
@@ -44,7 +45,14 @@ from segfloor_ros.simulation.motion import (
     wheel_readings,
 )
 from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.solids import floors, is_moving, obstacles, part_poses, true_map
+from segfloor_ros.simulation.solids import (
+    CLASSES,
+    floors,
+    is_moving,
+    obstacles,
+    part_poses,
+    true_map,
+)
 from segfloor_ros.simulation.world import CAMERAS, RIG, World, build_world, mover_bodies
 
 GREY_OF_RGB = np.array([0.299, 0.587, 0.114], np.float32)
@@ -87,6 +95,16 @@ class FrameTruth:
     disparity_px: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class FrameLabels:
+    """What is seen in one frame's rectified left image, (H, W) uint8: labels: numbers of `CLASSES`,
+    255 where there is nothing; instances: of people and cars, from 1 on, elsewhere 0.
+    """
+
+    labels: NDArray[np.uint8]
+    instances: NDArray[np.uint8]
+
+
 class Motion(Protocol):
     """Tells where the rectified left optical frame is (4, 4) at a time."""
 
@@ -98,9 +116,16 @@ class Simulation:
     """Drives through a scene. Use as a context manager; raises RenderingError where nothing can
     be rendered and InputError for an impossible scene. supersampling: the pictures are
     rendered this many times finer than the camera's pixels. robot: moves in place of the drive.
+    labels: `labels` will be asked for.
     """
 
-    def __init__(self, scene: Scene, supersampling: int = 1, robot: Motion | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        supersampling: int = 1,
+        robot: Motion | None = None,
+        labels: bool = False,
+    ):
         self.scene, self._finer = scene, supersampling
         self.drive: Drive = plan_drive(scene.path, scene.camera.rate_hz)
         self.camera = rectified_camera(scene.camera)
@@ -114,7 +139,8 @@ class Simulation:
         if robot is None:
             _check_clear(self.true_map, self.drive)
         width, height = self.imaging.width * supersampling, self.imaging.height * supersampling
-        world = build_world(scene, max(width, self.camera.width), max(height, self.camera.height))
+        size = max(width, self.camera.width), max(height, self.camera.height)
+        world = build_world(scene, *size, by_class=labels)
         self._renderer = WorldRenderer(scene, world)
         focal_px = self.imaging.focal_px * supersampling
         self._pictures = View(self._renderer, width, height, focal_px)
@@ -158,6 +184,14 @@ class Simulation:
         disparity_px = np.float32(self.camera.disparity_times_depth) / depth_m
         floor = self._truth.mask(CAMERAS[0], self._renderer.floor_ids)
         return FrameTruth(floor, depth_m, disparity_px)
+
+    def labels(self, index: int) -> FrameLabels:
+        """Render what is seen in one frame's rectified left image."""
+        time_s = float(self.drive.times_s[index])
+        self._renderer.move(self._moved.T_world_left(time_s), time_s)
+        geoms = self._truth.geoms(CAMERAS[0])
+        of_geom, instance_of_geom = self._renderer.labels
+        return FrameLabels(of_geom[geoms], instance_of_geom[geoms])
 
     def wheels(self) -> WheelReadings | None:
         """Return what the wheels tell of the whole drive, where the scene has such."""
@@ -225,7 +259,18 @@ class WorldRenderer:
         self._mocap = {
             name: int(self.model.body(name).mocapid[0]) for name in [RIG, *chain(*self._movers)]
         }
+        self._labels = world.labels
         self.floor_ids = [self.model.geom(name).id for name in world.floor_geoms]
+
+    @cached_property
+    def labels(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The class and the instance of each geom; the last ones are those of nothing."""
+        names = [self.model.geom(i).name for i in range(self.model.ngeom)]
+        label = [CLASSES.index(self._labels[name]) for name in names]
+        owner = {name: i for i, parts in enumerate(self._movers, 1) for name in parts}
+        body = [self.model.body(i).name for i in self.model.geom_bodyid]
+        instance = [owner.get(name, 0) for name in body]
+        return np.array([*label, 255], np.uint8), np.array([*instance, 0], np.uint8)
 
     def move(self, T_world_left: Array, time_s: float) -> None:
         """Put the rig at a pose of the left optical frame, and what moves where it is at a time."""
@@ -280,11 +325,14 @@ class View:
 
     def mask(self, camera: str, geoms: list[int]) -> NDArray[np.uint8]:
         """Return the mask (H, W) uint8: 255 where the camera sees one of the geoms, 0 elsewhere."""
+        return np.where(np.isin(self.geoms(camera), geoms), 255, 0).astype(np.uint8)
+
+    def geoms(self, camera: str) -> NDArray[np.intp]:
+        """Return the geom (H, W) that the camera sees in each pixel, -1 for none."""
         self._renderer.enable_segmentation_rendering()
         ids = self._render(camera)
         self._renderer.disable_segmentation_rendering()
-        seen = (ids[..., 1] == self._geom_type) & np.isin(ids[..., 0], geoms)
-        return np.where(seen, 255, 0).astype(np.uint8)
+        return np.where(ids[..., 1] == self._geom_type, ids[..., 0], -1).astype(np.intp)
 
     def _render(self, camera: str) -> NDArray[Any]:
         self._model.cam_fovy[:] = self._fov_y_deg
@@ -322,11 +370,13 @@ _NO_GL = (
 @dataclass(frozen=True)
 class RecordingOptions:
     """What to write. floor_every: every how many frames a floor mask, 0 for none. disparity: a true
-    disparity with each mask.
+    disparity with each mask. labels: with each mask, the class of each pixel, and the number of
+    each person and car.
     """
 
     floor_every: int = 10
     disparity: bool = False
+    labels: bool = False
 
 
 def record(
@@ -354,6 +404,10 @@ def _record_into(
     write_truth(folder, simulation)
     _write_calibration(folder, simulation)
     _write_sensors(folder, simulation)
+    if options.labels:
+        (folder / 'labels').mkdir()
+        names = yaml.safe_dump(dict(enumerate(CLASSES)), sort_keys=False)
+        (folder / 'labels' / 'classes.yaml').write_text(names)
     poses = []
     for frame in simulation.frames():
         _write_images(folder, frame, simulation.scene.camera.rectified)
@@ -440,6 +494,10 @@ def _write_frame_truth(
     if options.disparity:
         scaled = np.clip(np.round(truth.disparity_px * DISPARITY_SCALE), 0, 65535)
         _write_png(folder / 'disparity' / f'{index:06d}.png', scaled.astype(np.uint16))
+    if options.labels:
+        seen = simulation.labels(index)
+        _write_png(folder / 'labels' / f'{index:06d}.png', seen.labels)
+        _write_png(folder / 'instances' / f'{index:06d}.png', seen.instances)
 
 
 def _write_poses(path: Path, T_world_left: Array) -> None:
@@ -468,7 +526,10 @@ def render_once(
     wanted = hashlib.sha256(repr((__version__, scene, options)).encode()).hexdigest() + '\n'
     if stamp.is_file() and stamp.read_text() == wanted:
         return
-    with Simulation(scene) as simulation, folder_in_the_making(recording) as made:
+    with (
+        Simulation(scene, labels=options.labels) as simulation,
+        folder_in_the_making(recording) as made,
+    ):
         _record_into(made, simulation, options, on_start(simulation.frame_count))
         (made / RENDERED).write_text(wanted)
         move_into_place(made, recording)

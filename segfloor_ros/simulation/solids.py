@@ -4,7 +4,7 @@ follow, and those of the people and cars that move through it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -46,6 +46,12 @@ MOVING_WITHIN_S = 0.2
 
 SIDES = (1, -1)
 
+GLASS = 'glass'
+"""The texture of what is seen through, and its class."""
+
+CLASSES = ('floor', 'wall', 'ceiling', 'box', 'furniture', 'person', 'car', GLASS)
+"""Names of what there is, by the number it has in a label image."""
+
 
 @dataclass(frozen=True)
 class Body:
@@ -82,6 +88,7 @@ class Prism:
     """A solid over a convex footprint (K, 2), counter-clockwise, between the heights bottom_m and
     top_m (K,) of its corners. is_floor: its top can be driven on. is_sheet: a sheet on a wall,
     its picture shown once on each side; no obstacle. smooth: shade the sides as one round surface.
+    label: one of `CLASSES`.
     """
 
     footprint: Array
@@ -91,6 +98,7 @@ class Prism:
     is_floor: bool = False
     is_sheet: bool = False
     smooth: bool = False
+    label: str = CLASSES[0]
 
 
 def block(
@@ -121,13 +129,23 @@ def cylinder(
 
 def obstacles(scene: Scene) -> list[Prism]:
     """Return the solids of a scene that stand still and are not floor, sheets on walls included."""
-    solids = [prism for wall in scene.walls for prism in _wall(wall)]
-    solids += [block(b.at, b.size, b.texture, b.yaw_deg, b.bottom_m) for b in scene.boxes]
-    solids += [
+    walls = [prism for wall in scene.walls for prism in _wall(wall)]
+    boxes = [block(b.at, b.size, b.texture, b.yaw_deg, b.bottom_m) for b in scene.boxes]
+    boxes += [
         cylinder(c.at, c.radius_m, c.height_m, c.texture, c.bottom_m) for c in scene.cylinders
     ]
-    solids += [prism for thing in scene.furniture for prism in _furniture(thing)]
-    return solids + _posters(scene)
+    furniture = [prism for thing in scene.furniture for prism in _furniture(thing)]
+    return [
+        *_labelled('wall', walls),
+        *_labelled('box', boxes),
+        *_labelled('furniture', furniture),
+        *_labelled('wall', _posters(scene)),
+    ]
+
+
+def _labelled(label: str, solids: list[Prism]) -> list[Prism]:
+    """Return solids of a class; those of glass are glass."""
+    return [replace(p, label=GLASS if p.texture == GLASS else label) for p in solids]
 
 
 def floors(scene: Scene) -> list[Prism]:
@@ -306,7 +324,7 @@ def _top_at(prism: Prism, points: Array) -> Array:
 def part_solids(mover: Mover) -> list[list[Prism]]:
     """Return the solids of each part of a mover, in the frame of the part's joint."""
     if isinstance(mover, Car):
-        return [_car_solids(mover)]
+        return [_labelled('car', _car_solids(mover))]
     scale, cloth, trousers = mover.height_m / Person.height_m, mover.texture, 'cloth:7'
     torso = [
         block((0.0, 0.0), (0.22, 0.36, 0.54), cloth, bottom_m=0.0),
@@ -321,7 +339,7 @@ def part_solids(mover: Mover) -> list[list[Prism]]:
     upper_arm = [cylinder((0.0, 0.0), 0.055, 0.32, cloth, -0.29)]
     forearm = [cylinder((0.0, 0.0), 0.045, 0.27, 'concrete', -0.26)]
     parts = [torso, *([thigh, shin, upper_arm, forearm] * 2)]
-    return [[_scaled(prism, scale) for prism in part] for part in parts]
+    return [_labelled('person', [_scaled(prism, scale) for prism in part]) for part in parts]
 
 
 def part_poses(mover: Mover, time_s: float) -> Array:

@@ -213,6 +213,7 @@ GENERATORS: dict[str, tuple[Callable[[int, np.random.Generator], Image], int, fl
     'panels': (panels, 1024, 2.4),
     'cloth': (cloth, 512, 0.9),
     'metal': (metal, 512, 1.0),
+    'glass': (partial(plain, 235), 64, 1.0),
 }
 """Generator, size in pixels and side in metres of each texture."""
 

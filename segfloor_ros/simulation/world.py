@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from segfloor_ros.geometry import Array
 from segfloor_ros.simulation.scene import Lighting, Scene
-from segfloor_ros.simulation.solids import Prism, floors, obstacles, part_solids
+from segfloor_ros.simulation.solids import GLASS, Prism, floors, obstacles, part_solids
 from segfloor_ros.simulation.textures import Texture, make_texture
 
 SHADOW_PX = 4096
 """Side of the picture of the shadows, which the sun casts within 12 m of the origin."""
+
+GLASS_ALPHA = 0.12
+"""Share of its own brightness that a pane adds to what is seen through it."""
 
 RIG = 'rig'
 
@@ -107,7 +110,8 @@ def cap(prism: Prism, up: int, side_m: float) -> Mesh:
 @dataclass
 class World:
     """A MuJoCo model: xml with its binary files, names of the floor's geoms, and the parts that it
-    is put together from.
+    is put together from. labels: the class of each geom by name;
+    by_class: whether no geom belongs to two, which may change rounding in a few pixels.
     """
 
     scene: Scene
@@ -116,6 +120,8 @@ class World:
     bodies: list[str] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
     floor_geoms: list[str] = field(default_factory=list)
+    labels: dict[str, str] = field(default_factory=dict)
+    by_class: bool = False
     xml: str = ''
 
     def texture(self, name: str) -> Texture:
@@ -125,29 +131,35 @@ class World:
             made = make_texture(base, self.scene.seed * 100 + int(variant or 0))
             self.textures[name] = made
             self.files[f'{name}.png'] = cv2.imencode('.png', made.pixels)[1].tobytes()
+            alpha = GLASS_ALPHA if base == GLASS else 1
             self.assets.append(
                 f'<texture name="{name}" type="2d" file="{name}.png"/>'
-                f'<material name="{name}" texture="{name}" specular="0" shininess="0"/>'
+                f'<material name="{name}" texture="{name}" specular="0" shininess="0" '
+                f'rgba="1 1 1 {alpha:g}"/>'
             )
         return self.textures[name]
 
     def solids(self, prisms: list[Prism], prefix: str) -> list[str]:
-        """Add the prisms, one geom per texture; return the geoms as text. The tops of floors are
-        geoms of their own, so that they can be told apart in a picture.
+        """Add the prisms, one geom per texture, or per texture and class; return the geoms as
+        text. The tops of floors are geoms of their own, so that they can be told apart in a
+        picture.
         """
-        parts: dict[tuple[str, bool], list[Mesh]] = {}
+        parts: dict[tuple[str, bool, str], list[Mesh]] = {}
         for prism in prisms:
             side_m = self.texture(prism.texture).side_m
-            upright = parts.setdefault((prism.texture, False), [])
+            label = prism.label if self.by_class else ''
+            upright = parts.setdefault((prism.texture, False, label), [])
             upright.append(sides(prism, side_m))
-            parts.setdefault((prism.texture, prism.is_floor), []).append(cap(prism, 1, side_m))
+            top = parts.setdefault((prism.texture, prism.is_floor, label), [])
+            top.append(cap(prism, 1, side_m))
             upright.append(cap(prism, -1, side_m))
         return [
-            self._geom(f'{prefix}_{index}', texture, merge(meshes), is_floor)
-            for index, ((texture, is_floor), meshes) in enumerate(parts.items())
+            self._geom(f'{prefix}_{index}', texture, merge(meshes), is_floor, label)
+            for index, ((texture, is_floor, label), meshes) in enumerate(parts.items())
         ]
 
-    def _geom(self, name: str, texture: str, mesh: Mesh, is_floor: bool) -> str:
+    def _geom(self, name: str, texture: str, mesh: Mesh, is_floor: bool, label: str) -> str:
+        self.labels[name] = label
         self.assets.append(
             f'<mesh name="{name}" inertia="shell" vertex="{_numbers(mesh.vertices)}" '
             f'normal="{_numbers(mesh.normals)}" texcoord="{_numbers(mesh.uv)}" '
@@ -161,12 +173,13 @@ class World:
         )
 
 
-def build_world(scene: Scene, width: int, height: int) -> World:
-    """Return the model of a scene for pictures no larger than a size in pixels.
+def build_world(scene: Scene, width: int, height: int, by_class: bool = False) -> World:
+    """Return the model of a scene for pictures no larger than a size in pixels. by_class: of
+    `World`.
 
     Raises InputError for an unknown texture or furniture.
     """
-    world = World(scene)
+    world = World(scene, by_class=by_class)
     _add_ground(world)
     world.bodies += world.solids(obstacles(scene), 'solid')
     if scene.slopes or scene.floor_patches:
@@ -187,6 +200,7 @@ def mover_bodies(scene: Scene) -> list[list[str]]:
 def _add_ground(world: World) -> None:
     floor, ceiling = world.scene.floor, world.scene.ceiling
     world.floor_geoms.append('ground')
+    world.labels |= {'ground': 'floor', 'ceiling': 'ceiling'}
     _add_plane(world, 'ground', 0.0, floor.texture, floor.reflectance)
     if ceiling.height_m > 0:
         _add_plane(world, 'ceiling', ceiling.height_m, ceiling.texture, 0.0)

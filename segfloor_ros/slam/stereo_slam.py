@@ -20,6 +20,7 @@ from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
 from segfloor_ros.slam.results import (
+    NO_POINT,
     UNKNOWN_COVARIANCE,
     FrameResult,
     HeldResults,
@@ -34,7 +35,7 @@ from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.front_end import FrontEnd
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import Images, Region, dilate, is_inside
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState
 from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes
@@ -46,6 +47,9 @@ of one that got lost or was broken off. After that it maps on its own."""
 HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
 ORB-SLAM2, 2017, does the same)."""
+
+LATE_KEYFRAMES = 10
+"""A network that is slower than so many keyframes is of no use."""
 
 REPEATED = 'tracking: the image is the one before; the motion is taken to go on'
 NOTHING_SEEN = 'too few known points in view'
@@ -176,6 +180,21 @@ class StereoSlam:
         """Add a result to those that are held back, and return what is ready."""
         self._held.add(result)
         return [] if self.back_end.submap is Submap.LOST else self._held.release(self.mount)
+
+    def add_late_mask(self, stamp_ns: int, mask: Region) -> None:
+        """Take the points back that a keyframe has made where, as a mask (H, W) of its left image
+        says that comes later, something moves (255). Other stamps say nothing.
+        """
+        recent = self.map.keyframes[-LATE_KEYFRAMES:]
+        keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
+        if keyframe is None or self.front_end.is_fixed:
+            return
+        self._take_adjustment(wait=True)
+        wide = dilate(mask, self._settings.mask_dilation_px)
+        ids = keyframe.point_id[is_inside(wide, keyframe.observations.uvd_px[:, :2])]
+        ids = ids[ids != NO_POINT]
+        self.map.remove_points(ids[self.map.points['born'][ids] >= keyframe.index])
+        self.front_end.drop_dead()
 
     def finish(self) -> list[FrameResult]:
         """Return the results that are still held back after the last frame: as lost, for no place

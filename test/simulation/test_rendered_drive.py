@@ -37,9 +37,9 @@ ROOM = {
 }
 
 
-def simulate(**changes):
+def simulate(labels=False, **changes):
     try:
-        return Simulation(scene_from_mapping({**ROOM, **changes}, 'test'))
+        return Simulation(scene_from_mapping({**ROOM, **changes}, 'test'), labels=labels)
     except RenderingError as error:
         pytest.skip(str(error))
 
@@ -184,6 +184,33 @@ def test_recording_has_the_layout_of_a_kitti_folder_with_truth(room, tmp_path):
     assert float(rows['P1'].split()[3]) == pytest.approx(-80.0 * 0.12)
     with pytest.raises(InputError, match='exists already'):
         record(room, out, RecordingOptions())
+
+
+def test_labels_say_what_each_pixel_shows_and_whose_it_is(tmp_path):
+    people = [{'points': [[2.0, -0.8], [2.0, 0.8]], 'start_s': 9.0}]
+    cars = [{'points': [[1.5, 0.3], [3.0, 0.3]], 'size': [0.4, 0.3, 0.3], 'start_s': 9.0}]
+    pane = [{'at': [1.2, -0.5], 'size': [0.02, 0.3, 1.0], 'texture': 'glass'}]
+    path = {'waypoints': [[0, 0], [0.1, 0]]}
+    with simulate(True, people=people, cars=cars, boxes=pane, path=path) as stage:
+        record(stage, tmp_path / 'd', RecordingOptions(floor_every=1, labels=True))
+        floor, behind = stage.truth(0).floor, stage.frame(0).left
+    with simulate(people=people, cars=cars, boxes=[], path=path) as stage:
+        without = stage.frame(0).left
+    names = yaml.safe_load((tmp_path / 'd' / 'labels' / 'classes.yaml').read_text())
+    number = {name: value for value, name in names.items()}
+    labels, instances = (
+        cv2.imread(str(tmp_path / 'd' / kind / '000000.png'), cv2.IMREAD_UNCHANGED)
+        for kind in ('labels', 'instances')
+    )
+    np.testing.assert_array_equal(labels == number['floor'], floor == 255)
+    np.testing.assert_array_equal(instances == 1, labels == number['person'])
+    np.testing.assert_array_equal(instances == 2, labels == number['car'])
+    assert (instances == 1).any() and (instances == 2).any()
+    seen_through = labels == number['glass']
+    assert seen_through.sum() > 100
+    # A pane hides little of what is behind it.
+    difference = np.abs(behind.astype(float) - without)[seen_through]
+    assert 3 < np.median(difference) < 40
 
 
 def test_unrectified_recording_has_ros_calibrations(tmp_path):

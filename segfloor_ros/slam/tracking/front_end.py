@@ -112,6 +112,10 @@ class FrontEnd:
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
         self.motion.move_map(T_reference_before, T_reference_after)
+        self.drop_dead()
+
+    def drop_dead(self) -> None:
+        """Forget points that are not part of the map any more."""
         self.local.drop_dead()
         self.follower.drop_dead()
 

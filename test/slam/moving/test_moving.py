@@ -9,7 +9,7 @@ from moving_drive import MovingDrive
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import dilate, is_inside, union
 
@@ -93,6 +93,27 @@ def test_what_crosses_is_found_without_masks():
         if truth.mean() > 0.05:
             overlaps.append((found & truth).sum() / truth.sum())
     assert np.median(overlaps) > 0.8
+
+
+def test_a_late_mask_takes_the_points_back_that_its_keyframe_has_made():
+    drive = MovingDrive(standing)
+    slam = StereoSlam(CAMERA, StereoSlamSettings(detect_moving=False), MOUNT)
+    for index in range(12):
+        slam.process(drive.frame(index))
+    keyframe = slam.map.keyframes[-1]
+    inside = is_inside(drive.mask(keyframe.frame_index), keyframe.observations.uvd_px[:, :2])
+    ids = keyframe.point_id.copy()
+    own = (ids != NO_POINT) & (slam.map.points['born'][ids] == keyframe.index)
+    assert (own & inside).any() and (own & ~inside).any()
+    slam.add_late_mask(keyframe.stamp_ns + 1, drive.mask(keyframe.frame_index))
+    np.testing.assert_array_equal(keyframe.point_id, ids)
+    slam.add_late_mask(keyframe.stamp_ns, drive.mask(keyframe.frame_index))
+    assert (keyframe.point_id[own & inside] == NO_POINT).all()
+    assert not slam.map.alive[ids[own & inside]].any()
+    wide = dilate(drive.mask(keyframe.frame_index), 6)
+    far = own & ~is_inside(wide, keyframe.observations.uvd_px[:, :2])
+    np.testing.assert_array_equal(keyframe.point_id[far], ids[far])
+    assert slam.process(drive.frame(12))[0].tracked
 
 
 @pytest.mark.parametrize('place', [lambda index: None, standing])

@@ -1,0 +1,219 @@
+"""A segmentation network in an ONNX file, with a YAML file beside it that says how to use it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import silent_libraries
+from segfloor_ros.files.whole import read_bytes, read_yaml
+from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
+from segfloor_ros.semantics.outputs import KINDS, UNLABELLED, Segments
+from segfloor_ros.settings import suggestion
+
+Run = Callable[[NDArray[np.float32]], list[NDArray[Any]]]
+"""Gets the input (1, C, h, w) and returns the outputs in the order of the file."""
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """How a network is used, as its YAML file says.
+
+    classes: names, by number. moves: those that are left out of tracking and map; floor: those
+    that may be driven on; barrier: those that stand in the way whatever their depth, as glass
+    does. input: width and height. The input is (image - mean) * scale, from images of 0 to 255;
+    one mean: grey, three: red, green, blue. score: of the least certain instance. every: each so
+    many frames are looked at; 0: keyframes alone. runtime: what runs it.
+    """
+
+    kind: str
+    input: list[int]
+    classes: list[str]
+    mean: list[float] = dataclasses.field(default_factory=lambda: [0.0, 0.0, 0.0])
+    scale: list[float] = dataclasses.field(default_factory=lambda: [1 / 255])
+    moves: list[str] = dataclasses.field(default_factory=list)
+    floor: list[str] = dataclasses.field(default_factory=list)
+    barrier: list[str] = dataclasses.field(default_factory=list)
+    score: float = 0.5
+    every: int = 1
+    runtime: str = 'opencv'
+
+    @staticmethod
+    def read(path: Path) -> NetworkSettings:
+        """Read a YAML file. Raises InputError naming the file and what is wrong with it."""
+        document = read_yaml(path, 'kind, input and classes of a network')
+        types = typing.get_type_hints(NetworkSettings)
+        for name in document:
+            if name not in types:
+                raise InputError(f'{path}: unknown key {name}{suggestion(str(name), list(types))}')
+        for name in ('kind', 'input', 'classes'):
+            if name not in document:
+                raise InputError(f'{path}: {name} is missing')
+        try:
+            settings = NetworkSettings(**{n: _of_type(types[n], v) for n, v in document.items()})
+        except (TypeError, ValueError) as error:
+            raise InputError(f'{path}: {error}') from None
+        settings.check(path)
+        return settings
+
+    def check(self, path: Path) -> None:
+        """Raise InputError, by the file's name, for values that do not fit together."""
+        roles = [*self.moves, *self.floor, *self.barrier]
+        unknown = next((name for name in roles if name not in self.classes), '')
+        problems = {
+            f'kind {self.kind!r} is none of {", ".join(KINDS)}': self.kind not in KINDS,
+            f'runtime {self.runtime!r} is none of {", ".join(RUNTIMES)}': (
+                self.runtime not in RUNTIMES
+            ),
+            'input: expected width and height': len(self.input) != 2 or min(self.input) < 1,
+            'mean: expected one number (grey) or three': len(self.mean) not in (1, 3),
+            'scale: expected one number, or as many as mean': (
+                len(self.scale) not in (1, len(self.mean))
+            ),
+            'score: expected 0 to 1': not 0 <= self.score <= 1,
+            'every: expected 0 or more': self.every < 0,
+            f'classes: expected 1 to {UNLABELLED} names': (not 0 < len(self.classes) <= UNLABELLED),
+            f'{unknown!r} is not among the classes': bool(unknown),
+        }
+        for words, is_wrong in problems.items():
+            if is_wrong:
+                raise InputError(f'{path}: {words}')
+
+    def is_of(self, names: list[str]) -> NDArray[np.bool_]:
+        """Return which of the 256 numbers of a label image belong to classes of these names."""
+        chosen = np.zeros(UNLABELLED + 1, np.bool_)
+        chosen[: len(self.classes)] = [name in names for name in self.classes]
+        return chosen
+
+    def as_json(self) -> str:
+        """Return the names of the classes by number, and what they stand for."""
+        names = dict(enumerate(self.classes))
+        roles = {'moves': self.moves, 'floor': self.floor, 'barrier': self.barrier}
+        return json.dumps({'names': names, 'unlabelled': UNLABELLED, **roles})
+
+
+class Network:
+    """Runs a network. Raises InputError, in one line, for files that are missing, damaged or not
+    understood, and for one whose output is not what its YAML file says.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if path.suffix != '.onnx':
+            raise InputError(f'{path}: is no ONNX file; export the network as NAME.onnx')
+        data = read_bytes(path)
+        described = path.with_suffix('.yaml')
+        if not described.is_file():
+            raise InputError(f'{described}: is missing; it says what the network sees')
+        self.name = str(path)
+        self.settings = NetworkSettings.read(described)
+        self._run = RUNTIMES[self.settings.runtime](path, data)
+        self._says = np.full(UNLABELLED + 1, NO_EVIDENCE, np.uint8)
+        for names, value in (
+            (self.settings.floor, FLOOR),
+            (self.settings.barrier, NOT_FLOOR),
+            (self.settings.moves, MOVING),
+        ):
+            self._says[self.settings.is_of(names)] = value
+        width, height = self.settings.input
+        self.infer(np.zeros((height, width), np.uint8))
+
+    def infer(self, image: NDArray[np.uint8]) -> Segments:
+        """Return what is in an image, grey (H, W) or BGR (H, W, 3)."""
+        own = self.settings
+        channels = len(own.mean)
+        if image.ndim == 2 and channels == 3:
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+        elif image.ndim == 3:
+            code = cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGR2GRAY
+            image = cv2.cvtColor(image, code)
+        height, width = image.shape[:2]
+        scaled = cv2.resize(image, tuple(own.input), interpolation=cv2.INTER_AREA)
+        pixels = scaled.reshape(own.input[1], own.input[0], channels).astype(np.float32)
+        pixels = (pixels - np.array(own.mean, np.float32)) * np.array(own.scale, np.float32)
+        given = np.ascontiguousarray(pixels.transpose(2, 0, 1)[None])
+        try:
+            with silent_libraries():
+                outputs = self._run(given)
+        except Exception as error:  # whatever the libraries raise
+            what = f'cannot be run on an input of {own.input[0]}x{own.input[1]}'
+            raise InputError(f'{self.name}: {what} ({_first_line(error)})') from None
+        try:
+            return KINDS[own.kind](outputs, own, (width, height))
+        except (ValueError, IndexError, TypeError, StopIteration):
+            shapes = ', '.join(str(list(output.shape)) for output in outputs)
+            what = f'{own.kind} with {len(own.classes)} classes'
+            raise InputError(f'{self.name}: returns {shapes}, which is not {what}') from None
+
+    def says(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return what labels (H, W) mean for the floor: `FLOOR`, `NOT_FLOOR` for what stands there
+        whatever its depth, `MOVING` and elsewhere `NO_EVIDENCE`.
+        """
+        return cv2.LUT(labels, self._says)
+
+
+def _opencv(path: Path, data: bytes) -> Run:
+    try:
+        with silent_libraries():
+            network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+            names = network.getUnconnectedOutLayersNames()
+    except (cv2.error, SystemError) as error:
+        raise InputError(
+            f'{path}: OpenCV cannot read this network ({_first_line(error)}); export it anew, or '
+            'set runtime: onnxruntime in its YAML file'
+        ) from None
+
+    def run(given: NDArray[np.float32]) -> list[NDArray[Any]]:
+        network.setInput(given)
+        return [np.asarray(output) for output in network.forward(names)]
+
+    return run
+
+
+def _onnxruntime(path: Path, data: bytes) -> Run:
+    try:
+        import onnxruntime
+    except ImportError:
+        raise InputError(
+            f"{path}: needs onnxruntime: pip install 'segfloor_ros[onnx]' (or onnxruntime)"
+        ) from None
+    try:
+        providers = onnxruntime.get_available_providers()
+        session = onnxruntime.InferenceSession(data, providers=providers)
+    except Exception as error:  # of types that it does not document
+        raise InputError(
+            f'{path}: onnxruntime cannot read this network ({_first_line(error)})'
+        ) from None
+    name = session.get_inputs()[0].name
+    return lambda given: session.run(None, {name: given})
+
+
+RUNTIMES: dict[str, Callable[[Path, bytes], Run]] = {'opencv': _opencv, 'onnxruntime': _onnxruntime}
+
+
+def _of_type(kind: Any, value: Any) -> Any:
+    """Return a value of YAML as a field takes it. Raises ValueError for another type."""
+    if typing.get_origin(kind) is list:
+        values = value if isinstance(value, list) else [value]
+        return [_of_type(typing.get_args(kind)[0], one) for one in values]
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind or (kind is float and not math.isfinite(value)):
+        raise ValueError(f'{value!r} where {kind.__name__} is expected')
+    return value
+
+
+def _first_line(error: BaseException) -> str:
+    """Return what an error of a library says, short."""
+    lines = str(error).replace('OpenCV', '').splitlines() or [type(error).__name__]
+    return lines[0].rpartition('error: ')[2].strip()[:80]
