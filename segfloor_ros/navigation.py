@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from segfloor_ros.floor.observation import FloorScan
+from segfloor_ros.floor.observation import CELL_M, FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -25,9 +25,6 @@ Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 
 REPLAN_S = 1.0
-
-MARGIN_M = 0.05
-"""Kept from obstacles: a cell of the map."""
 
 LOOKAHEAD_S = 1.5
 """The way ahead that pure pursuit aims at, in time; less where it would cut a corner."""
@@ -308,7 +305,7 @@ class Explorer:
         """Choose what to drive to, and the way there."""
         assert self.grid is not None
         body, driven = self.body, np.array([*self._driven, pose[:2]])
-        radius_m = body.radius_m + MARGIN_M
+        radius_m = body.radius_m + CELL_M  # as far from obstacles as they are known
         self._costmap = costmap = Costmap(
             self.grid, radius_m, 2 * radius_m, self.obstacles, driven, body.blind_m + radius_m
         )
@@ -429,7 +426,7 @@ class Explorer:
             ahead + 1 < len(self.path)
             and away_m[ahead] < LOOKAHEAD_S * body.speed_m_s
             and self._costmap.least_room_m(pose[:2], self.path[ahead + 1])
-            > body.radius_m + MARGIN_M / 2
+            > body.radius_m + CELL_M / 2
         ):
             ahead += 1
         off = _bearing(self.path[ahead], pose)

@@ -27,21 +27,14 @@ UNITS = {'_m': 'm', '_s': 's', '_px': 'px', '_hz': 'Hz', '_rad': 'rad', '_mps': 
 """Of a setting by the end of its name, unless it says otherwise."""
 
 
-GONE = {
-    'tracked_points': 'it is a constant now',
-    'keyframe_min_frames': 'it is a constant now',
-    'keyframe_motion_ratio': 'it is a constant now',
-    'keyframe_turn_rad': 'it is a constant now',
-    'disparity_offset_sigma_px': 'it is a constant now',
+CONSTANTS = (
+    *('tracked_points', 'keyframe_min_frames', 'keyframe_motion_ratio', 'keyframe_turn_rad'),
+    *('disparity_offset_sigma_px', 'height_sigma_m', 'max_mask_log_odds', 'max_height_log_odds'),
+    *('coarse_above_px', 'obstacle_height_m', 'fill_support', 'fill_gap_m'),
+)
+GONE = dict.fromkeys(CONSTANTS, 'it is a constant now') | {
     'level_ground': 'it brought no more than noise',
-    'height_sigma_m': 'it is a constant now',
-    'max_mask_log_odds': 'it is a constant now',
-    'max_height_log_odds': 'it is a constant now',
     'max_hit_error_m': 'it follows from resolution_m',
-    'coarse_above_px': 'it is a constant now',
-    'obstacle_height_m': 'it is a constant now',
-    'fill_support': 'it is a constant now',
-    'fill_gap_m': 'it is a constant now',
     'scan_gap_m': 'it follows from step_height_m',
 }
 """Settings of earlier versions, and what became of them."""

@@ -116,7 +116,7 @@ def check_suite(
         _finish(result, out, described, known)
     if baseline_to_write is not None:
         write_baseline(result, baseline_to_write)
-        console.print(f'baseline: {baseline_to_write}', highlight=False, soft_wrap=True)
+        console.print(f'baseline: {baseline_to_write}', soft_wrap=True)
     if not result.holds:
         raise typer.Exit(1)
 
@@ -220,13 +220,13 @@ def _finish(result: SuiteResult, out: Path, described: Suite, baseline: Baseline
             print_error(f"{name}: is not in the baseline, so only the suite's own bounds hold")
     with os_errors(f'{out}: cannot be written'):
         add_files(out, {JUNIT: junit(result), PAGE: page(result, out)})
-    console.print(f'junit: {out / JUNIT}', highlight=False, soft_wrap=True)
-    console.print(f'page: {out / PAGE}', highlight=False, soft_wrap=True)
+    console.print(f'junit: {out / JUNIT}', soft_wrap=True)
+    console.print(f'page: {out / PAGE}', soft_wrap=True)
 
 
 def _print_progress(checked: Checked, done: int, total: int) -> None:
     origin = 'kept' if checked.reused else f'{checked.seconds:.0f} s'
-    console.print(f'{done}/{total} {checked.name}: {checked.state} ({origin})', highlight=False)
+    console.print(f'{done}/{total} {checked.name}: {checked.state} ({origin})')
 
 
 def _table(result: SuiteResult, described: Suite) -> Table:

@@ -191,8 +191,7 @@ def replay(
         terminal.print_summary(options.input, result.summary)
         console.print(
             f'nodes connected in {found.discovery_s:.1f} s, stopped in {found.shutdown_s:.1f} s; '
-            f'keyframes that failed: {found.failed_keyframes}',
-            highlight=False,
+            f'keyframes that failed: {found.failed_keyframes}'
         )
         status = interrupt.status or found.status
         terminal.finish_run(
@@ -239,12 +238,11 @@ def _print_scores(out: Path) -> None:
     path = score_trajectory(match_files(out, DRIVE))
     console.print(
         f'path: {path.path_length_m:.1f} m, {100 * path.tracked:.1f} % of the frames tracked, '
-        f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)',
-        highlight=False,
+        f'error {100 * path.ate_rmse_m:.1f} cm (RMSE after alignment)'
     )
     add_files(out, {'overlay.png': overlay_png(compare(grid, truth))})
-    console.print(f'map on the truth: {out / "overlay.png"}', highlight=False, soft_wrap=True)
-    console.print(str(write_report(out, DRIVE)), highlight=False, soft_wrap=True)
+    console.print(f'map on the truth: {out / "overlay.png"}', soft_wrap=True)
+    console.print(str(write_report(out, DRIVE)), soft_wrap=True)
 
 
 def params() -> None:
@@ -344,7 +342,7 @@ def simulate(
         facts = (
             f'{simulation.frame_count} pairs, {simulation.drive.length_m:.1f} m, {seconds:.0f} s'
         )
-    console.print(f'{facts}: {out}', highlight=False)
+    console.print(f'{facts}: {out}')
 
 
 def benchmark(

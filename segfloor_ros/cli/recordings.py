@@ -55,7 +55,7 @@ def info(
     if known and as_json:
         return terminal.print_json({'name': name, 'kind': known})
     if known:
-        return console.print(f'{name}: {known}', highlight=False, soft_wrap=True)
+        return console.print(f'{name}: {known}', soft_wrap=True)
     source = open_source(options.configuration(ignore=ignore, depth=depth).stereo_camera)
     with terminal.progress_bar('reading', source.frame_count) as progress:
         found = inspect_recording(source, name, progress)
@@ -64,7 +64,7 @@ def info(
     console.print(value_table('recording', _rows(found), found.name))
     console.print(_stream_table(found.streams))
     for line in found.to_mend or ['nothing to mend']:
-        console.print(f'- {line}', highlight=False, soft_wrap=True)
+        console.print(f'- {line}', soft_wrap=True)
 
 
 def _known_output(path: Path) -> str:
@@ -144,7 +144,7 @@ def record(
         else:
             settings = terminal.configuration(params, assignments, device).stereo_camera
             is_full = _record_device(out, open_source(settings), images, seconds, interrupt)
-    console.print(f'{_size_mb(out):.1f} MB: {out}', highlight=False)
+    console.print(f'{_size_mb(out):.1f} MB: {out}')
     if is_full:
         raise InputError(f'{out}: the disk is almost full; what came until then is in the file')
 
@@ -193,7 +193,7 @@ def _record_device(
             if interrupt.is_set() or is_full or (seconds and elapsed_s >= seconds):
                 break
     rate = f' at {(pairs - 1) / elapsed_s:.1f} Hz' if elapsed_s else ''
-    console.print(f'{pairs} pairs{rate}', highlight=False)
+    console.print(f'{pairs} pairs{rate}')
     return is_full
 
 
@@ -254,7 +254,7 @@ def convert(
     depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
     with terminal.progress_bar('converting', source.frame_count) as progress:
         pairs = write_bag(source, out, images, progress, depth)
-    console.print(f'{pairs} pairs, {_size_mb(out):.1f} MB: {out}', highlight=False)
+    console.print(f'{pairs} pairs, {_size_mb(out):.1f} MB: {out}')
 
 
 def calibrate(
@@ -341,7 +341,7 @@ def _print_calibration(result: CalibrationResult, folder: Path) -> None:
     console.print(value_table('calibration', rows, str(folder)))
     page = write_calibration_page(result, rows, folder)
     for path in (*(folder / name for name in FILES), page):
-        console.print(str(path), highlight=False, soft_wrap=True)
+        console.print(str(path), soft_wrap=True)
 
 
 def _check_calibration(source: StereoSource, board: Board | None) -> None:

@@ -35,8 +35,8 @@ from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
 from segfloor_ros.settings import suggestion
 
-console = Console(markup=False)
-error_console = Console(stderr=True, soft_wrap=True, markup=False)
+console = Console(markup=False, highlight=False)
+error_console = Console(stderr=True, soft_wrap=True, markup=False, highlight=False)
 
 Progress = Callable[..., None]
 """Told how many steps are done and, as `note`, the state in words."""
@@ -119,7 +119,7 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 def print_error(message: str) -> None:
     """Print one line on standard error."""
-    error_console.print(f'segfloor: {printable(message)}', highlight=False)
+    error_console.print(f'segfloor: {printable(message)}')
 
 
 def end_if_interrupted(interrupt: Interrupt) -> None:
@@ -143,7 +143,7 @@ def finish_run(
     """
     has_map = (folder.path / MAP).is_file()
     place = f'map: {folder.path / MAP}' if has_map else f'path: {folder.path / "trajectory.txt"}'
-    console.print(place, highlight=False, soft_wrap=True)
+    console.print(place, soft_wrap=True)
     problems = list(folder.problems)
     if report:
         # Imported here: Matplotlib takes a second that other commands should not wait for.
@@ -153,7 +153,7 @@ def finish_run(
         truth = recording if (recording / 'map.yaml').is_file() else None
         try:
             written = write_report(folder.path, truth)
-            console.print(f'report: {written}', highlight=False, soft_wrap=True)
+            console.print(f'report: {written}', soft_wrap=True)
         except Exception as error:  # whatever it is, the results are there
             problems.append(f'there is no report: {str(error) or type(error).__name__}')
     for line in (*problems, *remarks):

@@ -19,11 +19,7 @@ from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_
 from segfloor_ros.evaluation.maps import MapTruth, Mask, Pose2d, from_frame, resample
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
-from segfloor_ros.navigation import Goal, room_around
-
-AT_GOAL_M = 0.3
-"""A goal is reached where the robot truly is within this of it: the planner's own 0.15 m, and as
-much again for the map."""
+from segfloor_ros.navigation import ARRIVED_M, Goal, room_around
 
 FILM_FRAMES = 60
 """At most, ten of them in a second."""
@@ -90,7 +86,9 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
 
 def _is_at(goal: Goal, T_world_base: Array, start: Pose2d) -> bool:
     (true,) = from_frame(goal.point[None], start)
-    return bool(goal.is_reached) and bool(np.hypot(*(true - T_world_base[:2, 3])) <= AT_GOAL_M)
+    away_m = float(np.hypot(*(true - T_world_base[:2, 3])))
+    # The planner's own reach, and as much again for the map.
+    return bool(goal.is_reached) and away_m <= 2 * ARRIVED_M
 
 
 def picture(found: Exploration, truth: OccupancyGrid) -> bytes:

@@ -34,7 +34,7 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.maps import MapTruth, load_truth
 from segfloor_ros.files.images import check_same_size, read_grey, read_mask
 from segfloor_ros.files.whole import read_text
-from segfloor_ros.floor.observation import FloorSegmentationSettings
+from segfloor_ros.floor.observation import CELL_M, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import (
@@ -51,15 +51,11 @@ from segfloor_ros.trajectory import read_trajectory
 FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
 """Of points; what nothing is known of has the grey that it has in a map."""
 
-STEPS = 1, 2, 5
-"""Lengths of a scale bar, times a power of ten."""
-
 CORNER_TINT, CORNER_PX = (40, 140, 250), 4
 
 STRIP_WIDTH_PX = 480
 MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
-PATH_CELL_M = 0.05
 
 STRIP_LENGTH = 6
 
@@ -150,14 +146,12 @@ def _tinted(item: MaskedFrame) -> bytes:
 
 
 def _show_ends(axes: Axes, data: ReportData) -> None:
-    """Mark where the drive starts and ends, and how long a metre is."""
+    """Mark where the drive starts and ends, and how long the way from tick to tick is."""
     start, end = data.trajectory[[0, -1], :2, 3]
     axes.plot(*start, 'o', color='tab:green', label='start')
     axes.plot(*end, 's', color='tab:purple', label='end')
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    longest = (right - left) / 4
-    tens = 10.0 ** np.floor(np.log10(longest))
-    length = max(step * tens for step in STEPS if step * tens <= longest)
+    length = float(np.diff(axes.get_xticks()[:2])[0])
     x, y = left + (right - left) / 40, bottom + (top - bottom) / 40
     axes.plot([x, x + length], [y, y], color='black', linewidth=3, solid_capstyle='butt')
     axes.annotate(f'{length:g} m', (x + length / 2, y), (0, 4), textcoords='offset points',
@@ -324,9 +318,9 @@ def _grid(path: Path, trajectory: Array) -> OccupancyGrid:
     if path.exists():
         return load_map(path)
     lowest, highest = (trajectory[:, :2, 3].min(0) - 1.0, trajectory[:, :2, 3].max(0) + 1.0)
-    columns, rows = np.ceil((highest - lowest) / PATH_CELL_M).astype(int)
+    columns, rows = np.ceil((highest - lowest) / CELL_M).astype(int)
     unknown = np.full((rows, columns), -1, np.int8)
-    return OccupancyGrid(unknown, PATH_CELL_M, (float(lowest[0]), float(lowest[1])))
+    return OccupancyGrid(unknown, CELL_M, (float(lowest[0]), float(lowest[1])))
 
 
 def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFrame]:

@@ -13,13 +13,13 @@ from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.calibration.files import read_body_pose
+from segfloor_ros.camera.sources.image_folders import TUM_TOLERANCE_S
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number, read_json, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array, invert, make_transform
 from segfloor_ros.trajectory import read_trajectory
 
-MAX_STAMP_DIFFERENCE_S = 0.02
 STEP_M = 1.0
 """Of path: errors are those of such steps, and the first one of a plot says what is ahead."""
 
@@ -103,14 +103,14 @@ def match(
     )
     try:
         evo_truth, evo_estimate = sync.associate_trajectories(
-            evo_truth, evo_estimate, max_diff=MAX_STAMP_DIFFERENCE_S
+            evo_truth, evo_estimate, max_diff=TUM_TOLERANCE_S
         )
     except sync.SyncException:
         evo_truth.reduce_to_ids([])
     if evo_truth.num_poses < MIN_MATCHES:
         raise InputError(
             f'only {evo_truth.num_poses} poses of the two trajectories are within '
-            f'{MAX_STAMP_DIFFERENCE_S} s of each other: are both of the same recording?'
+            f'{TUM_TOLERANCE_S} s of each other: are both of the same recording?'
         )
     matched_truth, matched_estimate = (
         np.array(evo_truth.poses_se3),

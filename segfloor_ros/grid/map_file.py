@@ -25,8 +25,7 @@ from segfloor_ros.files.results import replacing
 from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.settings import StageSettings, setting
 
-OCCUPIED_THRESH = 0.65
-FREE_THRESH = 0.196
+OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 MODES = ('trinary', 'scale', 'raw')
 

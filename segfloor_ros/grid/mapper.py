@@ -53,8 +53,7 @@ _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
 
 _MOVE_SHARE = 0.25
-_LEAST_MOVE_M = 0.005
-"""The map follows keyframes that moved by more than this share of a cell, and by this much."""
+"""The map follows keyframes that moved by more than this share of a cell."""
 
 UNDO_BYTES = 4_000_000
 _MAX_STRIDE_M = 2.0
@@ -140,7 +139,6 @@ class OccupancyGridMapper:
         moved_m = np.hypot(now[:, 0] - then[:, 0], now[:, 1] - then[:, 1])
         turn = np.abs(np.remainder(now[:, 2] - then[:, 2] + np.pi, 2 * np.pi) - np.pi)
         limit_m = _MOVE_SHARE * self._settings.resolution_m
-        limit_m = max(limit_m, _LEAST_MOVE_M)
         moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
         if len(moved):
             self._history.move(int(moved[0]), now[moved[0] :])

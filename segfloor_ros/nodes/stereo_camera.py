@@ -26,7 +26,11 @@ from segfloor_ros.camera.model import (
 )
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
-from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, StereoCameraNodeSettings
+from segfloor_ros.configuration import (
+    MAX_KEYFRAMES_UNDER_WAY,
+    StereoCameraNodeSettings,
+    StereoSlamNodeSettings,
+)
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.messages.arrays import camera_info_message, compressed_message, image_message
@@ -49,7 +53,7 @@ from segfloor_ros.nodes.shared.transforms import TfLink
 
 WAITING = 'waiting'
 
-MAX_FRAMES_UNDER_WAY = 3
+MAX_FRAMES_UNDER_WAY = StereoSlamNodeSettings.max_waiting_frames
 """Frames that may be between the camera and SLAM: no more than SLAM lets wait before it skips any
 (`max_waiting_frames`), and enough for it to find the next one when it has done with one.
 """

@@ -16,6 +16,7 @@ from scipy.ndimage import affine_transform
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.calibration.parameters import FISHEYE_RESOLUTION, EyeCalibration
+from segfloor_ros.camera.images import SAME_SURFACE_SHARE
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import Array
@@ -40,8 +41,6 @@ BLUR_STEP_PX = 2
 """Of the fastest turn, between two moments at which a picture is rendered while it is exposed."""
 
 HOLE_SIZE_PX = 12.0
-EDGE_RATIO = 0.05
-"""Relative step of the depth at which a sensor sees neither side."""
 
 
 def rectified_camera(rig: CameraRig) -> StereoCamera:
@@ -302,7 +301,7 @@ def depth_reading_mm(
     hole = patches < np.quantile(patches, sensor.hole_share)
     kernel = np.ones((3, 3), np.uint8)
     near_m, far_m = cv2.erode(true_m, kernel), cv2.dilate(true_m, kernel)
-    edge = far_m > near_m * (1 + EDGE_RATIO)
+    edge = far_m > near_m * (1 + SAME_SURFACE_SHARE)
     flying = edge & (rng.random(true_m.shape) < sensor.flying_share)
     between_m = near_m + (far_m - near_m) * rng.random(true_m.shape)
     depth_m = np.where(flying, between_m, depth_m)

@@ -22,7 +22,6 @@ from segfloor_ros.camera.images import is_disparity
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 _BLOCK_PX = 8
-_HALF_PX = _BLOCK_PX // 2
 _QUIET_GREY = 3
 _SIGNIFICANT_GREY = 8
 """Larger steps are edges of things, wherever they are."""
@@ -121,7 +120,8 @@ def is_blocky(image: NDArray[np.uint8]) -> bool:
     """Tell whether quiet parts of a grey image (H, W) have larger steps on the grid of eight pixels
     than within its blocks, along the rows or along the columns.
     """
-    return max(_blockiness(image[::_HALF_PX]), _blockiness(image[:, ::_HALF_PX].T)) > _MIN_RATIO
+    half = _BLOCK_PX // 2
+    return max(_blockiness(image[::half]), _blockiness(image[:, ::half].T)) > _MIN_RATIO
 
 
 def _blockiness(image: NDArray[np.uint8]) -> float:
@@ -146,18 +146,19 @@ def _smooth_columns(grey: NDArray[np.float32]) -> None:
 
     Only steps that are larger than what goes on in the half blocks beside them.
     """
-    last = grey.shape[1] - _HALF_PX + 1
+    half = _BLOCK_PX // 2
+    last = grey.shape[1] - half + 1
 
     def column(offset: int) -> NDArray[np.float32]:
         return grey[:, _BLOCK_PX + offset : last + offset : _BLOCK_PX]
 
     step = column(0) - column(-1)
     size = np.abs(step)
-    activity = np.abs(column(-1) - column(-_HALF_PX))
-    activity += np.abs(column(_HALF_PX - 1) - column(0))
+    activity = np.abs(column(-1) - column(-half))
+    activity += np.abs(column(half - 1) - column(0))
     step[(size >= _MAX_STEP_GREY) | (activity >= np.maximum(size, 2))] = 0
-    for i in range(_HALF_PX):
-        share = step * np.float32(0.5 - (i + 0.5) / (2 * _HALF_PX))
+    for i in range(half):
+        share = step * np.float32(0.5 - (i + 0.5) / _BLOCK_PX)
         before, after = column(-1 - i), column(i)
         before += share
         after -= share
