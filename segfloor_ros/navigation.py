@@ -39,8 +39,7 @@ LOOK_S = 2.0
 
 FACED_RAD = np.radians(10)
 
-PATIENCE_S = 8.0
-MOST_TRIES = 3
+PATIENCE_S, MOST_TRIES = 8.0, 3
 """Without getting on for so long the robot turns, to see more; after so many tries it gives up."""
 
 OBSTACLE_REACH_M = 3.0

@@ -53,11 +53,11 @@ FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
 
 CORNER_TINT, CORNER_PX = (40, 140, 250), 4
 
-STRIP_WIDTH_PX = 480
 MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
 
-STRIP_LENGTH = 6
+STRIP_LENGTH, STRIP_WIDTH_PX = 6, 480
+"""Keyframes that are shown, and the width of each."""
 
 
 def map_picture(data: ReportData) -> bytes:

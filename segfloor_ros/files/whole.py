@@ -34,8 +34,7 @@ END_NS = 2**31 * 10**9
 
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
-MAX_YAML_BYTES = 1 << 18
-MAX_DEPTH = 40
+MAX_YAML_BYTES, MAX_DEPTH = 1 << 18, 40
 Key = tuple[str | int, ...]
 """Where a value is: names of entries and numbers of list items from the top."""
 

@@ -25,10 +25,8 @@ REMARKS_APART = ' | '
 HEALTH = 'health'
 """Kind of the status that says once a second how a node fares."""
 
-HEALTH_PERIOD_S = 1.0
-
-LASTS_S = 3.0
-"""What is looked for once a second is over when it was not seen for so long: a problem, somebody
+HEALTH_PERIOD_S, LASTS_S = 1.0, 3.0
+"""How often what lasts is looked for, and after how long without it it is over: a problem, somebody
 who needs a node, the images of a camera.
 """
 

@@ -58,9 +58,9 @@ V4L2_MANUAL, V4L2_AUTOMATIC = 1, 3
 V4L2_EXPOSURE_S = 1e-4
 """Unit of V4L2_CID_EXPOSURE_ABSOLUTE."""
 
-RETRY_S = 0.5
-PATIENCE_S = 10.0
-"""A camera that is unplugged is opened again if it is back within this time."""
+RETRY_S, PATIENCE_S = 0.5, 10.0
+"""A camera that is unplugged is looked for so often, and opened again if it is back within the
+other."""
 
 
 def open_source(settings: StereoCameraSettings) -> StereoSource:

@@ -45,7 +45,7 @@ from segfloor_ros.slam.places.loops import (
     match_of,
     median_depth_m,
 )
-from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
+from segfloor_ros.slam.places.place_recognition import TIMES_SURE, PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
@@ -55,12 +55,6 @@ from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
 
 STEPS = 20
-
-TIMES_A_LOOP = 2
-"""No drift limits where the known map can be: so many times the sightings of a loop are asked for.
-With as many as for a loop, walls with the same paper were taken for one. A camera that got lost can
-be no further away than it can have driven, too.
-"""
 
 OFFSET = 'disparity_offset'
 """What a map knows of the disparity offset, by name."""
@@ -250,7 +244,7 @@ class KnownMap:
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
         self._checks = LoopChecks(own, self._map)
-        self._sightings = Sightings(own, TIMES_A_LOOP)
+        self._sightings = Sightings(own, TIMES_SURE)
 
     def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""

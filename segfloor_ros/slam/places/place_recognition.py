@@ -36,12 +36,10 @@ from segfloor_ros.slam.tracking.features import Features, hamming
 from segfloor_ros.slam.tracking.map_tracking import Pixels, Tracker
 
 FILE = 'vocabulary.npy'
-BRANCHES = 30
-LEVELS = 3
+BRANCHES, LEVELS = 30, 3
 NUM_WORDS = BRANCHES**LEVELS
 
-SPEED_FACTOR = 2.0
-LEAST_SPEED_MPS = 0.75
+SPEED_FACTOR, LEAST_SPEED_MPS = 2.0, 0.75
 """A robot that is lost moves at most so many times as fast as it ever did, this at least: it may be
 carried at a walking pace.
 """
@@ -49,11 +47,15 @@ carried at a walking pace.
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone are not sure."""
 
-FRAMES_IN_A_ROW = 2
+TIMES_SURE = 2
+"""Where nothing limits where a place can be, so many times the evidence is asked for: walls with
+the same paper, and shelves that stand twice in a building, are taken for one now and then. Of the
+frames of a camera that is lost, away from where it was lost, each as far from where the one before
+found it as it can have moved since; of keyframes that see a known map, as many times those of a
+loop."""
+
 MIN_AGREEMENT = 0.7
-"""Away from where it was lost, so many frames must find the camera, each as far from where the one
-before did as it can have moved since, and show what is expected in so many parts of the image: a
-shelf that stands twice in a building shows now and then enough for one frame, by chance."""
+"""Share of the parts of the image that must show what is expected in each of these frames."""
 
 NARROW_SEARCHES = 100
 """Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
@@ -306,7 +308,7 @@ class Relocaliser:
         way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - before_ns)
         self._in_a_row = self._in_a_row + 1 if _follows(found, last, SAME[0] + way_m) else 1
         self._last_found = stamp_ns, found.T_camera_world
-        if self._in_a_row < FRAMES_IN_A_ROW and not expected:
+        if self._in_a_row < TIMES_SURE and not expected:
             return None
         self._last_found, self._near = None, None
         return found
