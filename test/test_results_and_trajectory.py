@@ -53,6 +53,9 @@ def test_a_frame_whose_keyframe_is_gone_goes_with_the_one_before():
     poses = [TrackedPose(0, moved(0.0), 0), TrackedPose(1, moved(0.5), 77)]
     result = corrected_trajectory(poses, KeyframePath(np.array([0]), moved(3.0)[None]))
     np.testing.assert_allclose(result.poses[:, 0, 3], [3.0, 3.5])
+    poses = [TrackedPose(k, moved(0.5 * k), k if k < 2 else 77) for k in range(3)]
+    path = KeyframePath(np.array([0, 1]), np.stack([moved(3.0), moved(7.0)]))
+    np.testing.assert_allclose(corrected_trajectory(poses, path).poses[:, 0, 3], [3.0, 7.0, 7.5])
 
 
 def test_tum_lines_are_seconds_metres_and_a_unit_quaternion(tmp_path):

@@ -154,7 +154,8 @@ class SlamTopics:
         if self._out.listeners('pose' + suffix):
             T_map_base = result.T_map_odom @ result.T_odom_base
             at = result.stamp_ns, own.map_frame
-            message = poses.pose_with_covariance_message(*at, T_map_base, covariance)
+            in_map = poses.never_certain(result.covariance_in_map)
+            message = poses.pose_with_covariance_message(*at, T_map_base, in_map)
             self._out.publish('pose' + suffix, message)
         at, T_odom_base = (result.stamp_ns, own.odom_frame), result.T_odom_base
         odometry = poses.odometry_message(
@@ -169,7 +170,7 @@ class SlamTopics:
         self._publish_pair(KEYFRAME_PARTS, stamp_ns, images, self._calibration)
         moving = np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
-        covariance = poses.never_certain(result.covariance)
+        covariance = poses.never_certain(result.covariance_in_map)
         pose = poses.odometry_message(*at, own.base_frame, keyframe.T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
         out.publish('keyframe/features', clouds.features_message(*at, keyframe.features))

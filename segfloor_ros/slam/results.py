@@ -160,6 +160,12 @@ class FrameResult:
     in_submap: bool = False
     repeated: bool = False
 
+    @property
+    def covariance_in_map(self) -> Array:
+        """The covariance (6, 6) in the axes of `map`."""
+        axes = np.kron(np.eye(2), self.T_map_odom[:3, :3])
+        return np.asarray(axes @ self.covariance @ axes.T)
+
 
 @dataclass(frozen=True)
 class ObservedFeatures:

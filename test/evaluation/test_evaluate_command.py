@@ -85,6 +85,21 @@ def test_map_with_a_trajectory_of_the_run(tmp_path):
     assert 2.0 < score['area_m2'] < 6.0
 
 
+def test_a_trajectory_of_the_run_lies_where_its_map_is_aligned(tmp_path):
+    """The same drive, in the frame of the estimate and, as `t x y yaw`, in that of the truth."""
+    truth, drive, true_drive = write_map(tmp_path / 'truth'), tmp_path / 't.txt', tmp_path / 'b.txt'
+    x, y, yaw = 2.0, 0.3, 2.2
+    drive.write_text(f'0 1.0 0.0 0 0 0 {np.sin(0.2)} {np.cos(0.2)}\n')
+    true_drive.write_text(f'0 {x + np.cos(yaw)} {y + np.sin(yaw)} {yaw + 0.4}\n')
+    align = ('--align', f'{x},{y},{yaw}', '--fov', '60', '--json')
+    here, there = (
+        json.loads(run('map', truth, truth, '--trajectory', file, *align))
+        for file in (drive, true_drive)
+    )
+    assert here['area_m2'] == there['area_m2'] > 0.5
+    assert here['cells'] == there['cells']
+
+
 def test_bad_alignment_and_bad_scene(tmp_path):
     scene = write_scene(tmp_path / 'scene')
     with pytest.raises(SettingsError, match='--align left'):

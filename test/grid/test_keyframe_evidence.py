@@ -7,7 +7,13 @@ import pytest
 
 from segfloor_ros.cloud.labelled_cloud import FLOOR, LabelledPoints
 from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
-from segfloor_ros.grid.keyframe_evidence import KeyframeEvidence, gather_evidence, slant
+from segfloor_ros.grid.keyframe_evidence import (
+    Fan,
+    find_jumps,
+    gather_evidence,
+    slant,
+    unit_vectors,
+)
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 from segfloor_ros.slam.results import KeyframeFeatures
 
@@ -44,6 +50,51 @@ def test_rays_end_one_sigma_short_of_their_point(length_m: float) -> None:
     assert ray_m == pytest.approx(length_m - ERROR_PER_M * length_m**2, rel=1e-3)
 
 
+NO_POINTS = LabelledPoints(
+    np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), np.zeros(0)
+)
+NO_FEATURES = KeyframeFeatures(
+    np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
+)
+
+
+def test_rays_through_what_the_scan_saw_standing_on_their_bearing_are_dropped() -> None:
+    """The scan's bearings do not begin ahead: to the left of its middle something stands."""
+    step = float(np.radians(1.0))
+    ranges = np.where(np.arange(90) < 30, 0.5, 2.0).astype(np.float32)
+    standing = np.where(np.arange(90) < 30, np.nan, 2.0).astype(np.float32)
+    scan = FloorScan(float(np.radians(-20.0)), step, ranges, standing, BLIND.range_max_m)
+    bearing = np.radians([0.0, 30.0])
+    xyz = 3 * np.stack([np.cos(bearing), np.sin(bearing), [0, 0]], axis=1).astype(np.float32)
+    ids = np.arange(2, dtype=np.int32)
+    points = LabelledPoints(ids, xyz, np.full(2, FLOOR, np.uint8), np.ones(2, np.float32))
+    features = KeyframeFeatures(np.zeros((2, 2), np.float32), ids, xyz)
+    settings = OccupancyGridSettings(max_range_m=50.0)
+    found = gather_evidence(points, features, np.eye(4), scan, settings)
+    assert found.num_rays == 1
+    x, y = found.positions_m[:, 0].astype(np.float64)
+    assert x > 2.5 and y == pytest.approx(0.0, abs=1e-3)
+
+
+def test_faces_with_bearings_between_them_that_saw_none_are_not_joined() -> None:
+    step = float(np.radians(1.0))
+    range_m = np.array([2, 2, np.nan, np.nan, np.nan, 2, 2], np.float32)
+    scan = FloorScan(0.0, step, np.full(7, 2, np.float32), range_m, 10.0)
+    found = gather_evidence(NO_POINTS, NO_FEATURES, np.eye(4), scan, OccupancyGridSettings())
+    assert (found.num_rays, found.num_contacts) == (0, 4)
+    ends, starts = (part.astype(np.float64) for part in np.split(found.positions_m, [4], axis=1))
+    lengths_m = np.hypot(*(ends - starts[:, :4]))
+    np.testing.assert_allclose(lengths_m, [2 * step, 0, 2 * step, 0], atol=0.005)
+
+
+def test_a_lone_longer_bearing_is_no_edge_of_the_fan() -> None:
+    """The ends are, and on either side of a gap the bearing that sees past what is nearer."""
+    lengths = np.array([2.0, 2, 5, 2, 2, 6, 6, 3])
+    directions = unit_vectors(0.1 * np.arange(8))
+    fan = Fan(np.zeros(2), 0.0, 0.1, directions, lengths, find_jumps(lengths))
+    assert fan.edges().tolist() == [True, False, False, False, False, True, True, True]
+
+
 def wall_askew(bearing_rad: np.ndarray) -> np.ndarray:
     """Return the ranges of a wall along x at y = 1 m."""
     return 1.0 / np.sin(bearing_rad)
@@ -60,13 +111,7 @@ def test_faces_are_moved_by_the_same_distance_across_them() -> None:
     bearing = np.radians(np.arange(30.0, 100.0, 0.5))
     range_m = wall_askew(bearing).astype(np.float32)
     scan = FloorScan(float(bearing[0]), float(np.radians(0.5)), range_m, range_m, 10.0)
-    points = LabelledPoints(
-        np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), np.zeros(0)
-    )
-    features = KeyframeFeatures(
-        np.zeros((0, 2), np.float32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
-    )
     settings = OccupancyGridSettings(occupied_share=0.2)
-    evidence: KeyframeEvidence = gather_evidence(points, features, np.eye(4), scan, settings)
+    evidence = gather_evidence(NO_POINTS, NO_FEATURES, np.eye(4), scan, settings)
     starts = evidence.positions_m[:, evidence.num_rays + evidence.num_contacts :]
     np.testing.assert_allclose(starts[1].astype(np.float64), 1.0 - 0.015, atol=0.003)

@@ -95,6 +95,32 @@ def test_moves_within_a_fraction_of_a_cell_change_nothing() -> None:
     assert same(mapper.grid(), recording.built_at_once(expected))
 
 
+def test_evidence_follows_a_turn_on_the_spot() -> None:
+    recording = Recording(20)
+    mapper = OccupancyGridMapper(OccupancyGridSettings())
+    for k in range(19):
+        recording.feed(mapper, k, path_of(recording.poses[: k + 1]))
+    poses = [(x, y, yaw + 0.1) for x, y, yaw in recording.poses]
+    recording.feed(mapper, 19, path_of(poses))
+    assert same(mapper.grid(), recording.built_at_once(poses))
+    assert not same(mapper.grid(), recording.built_at_once(recording.poses))
+
+
+def test_evidence_that_waited_comes_back_to_its_own_keyframes() -> None:
+    """A drive in another map, until the first one is recognised and its keyframes are back."""
+    recording = Recording(20)
+    whole, mapper = path_of(recording.poses), OccupancyGridMapper(OccupancyGridSettings())
+    for k in range(10):
+        recording.feed(mapper, k, path_of(recording.poses[: k + 1]))
+    for k in range(10, 19):
+        own = KeyframePath(whole.stamp_ns[10 : k + 1], whole.T_map_base[10 : k + 1])
+        recording.feed(mapper, k, own)
+        assert len(mapper.to_arrays()['stamp_ns']) == k - 9
+    recording.feed(mapper, 19, whole)
+    np.testing.assert_array_equal(mapper.to_arrays()['stamp_ns'], whole.stamp_ns)
+    assert same(mapper.grid(), recording.built_at_once(recording.poses))
+
+
 def test_evidence_of_removed_keyframes_goes_with_them() -> None:
     recording = Recording(20)
     mapper = OccupancyGridMapper(OccupancyGridSettings())

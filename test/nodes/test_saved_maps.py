@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,25 @@ def test_an_initial_pose_narrows_the_search(drive, loaded) -> None:
     answers = chain.drive(frames[7:9])
     assert [a.values['tracked'] for a in answers] == ['1', '1']
     assert float(answers[0].values['recovered_after_s']) == pytest.approx(0.3, abs=0.01)
+
+
+def test_an_initial_pose_that_is_unsure_of_the_heading_is_searched_all_around(drive, loaded):
+    frames, poses = drive
+    chain = loaded('-p', 'localize:=true')
+    given = chain.graph.publisher('initialpose')
+    chain.graph.connected([given])
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = 'map'
+    chain.listen_to_log()
+    for sigma_rad, x_m, frame, tracked in ((0.0, 0.1, frames[4], '0'), (1.0, 0.2, frames[5], '1')):
+        turned = invert(poses[0]) @ poses[4] @ planar_pose(x_m, 0.0, 1.5)
+        message.pose.pose = pose_message(turned)
+        message.pose.covariance[-1] = sigma_rad**2
+        given.publish(message)
+        said = f'looks within 1.5 m around x {turned[0, 3]:.2f}'
+        chain.graph.until(partial(chain.said, said), said)
+        (answer,) = chain.drive([frame])
+        assert answer.values['tracked'] == tracked
 
 
 def test_a_loaded_map_grows_in_the_same_frame_with_new_ids(saved, drive, loaded, tmp_path) -> None:

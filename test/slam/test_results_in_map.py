@@ -74,3 +74,16 @@ def test_a_tilted_mount_turns_the_axes_of_the_covariance() -> None:
     still = FrameResult(0, 0, True, np.eye(4), np.eye(4), along_view, 50, 'tracking', 0)
     found = in_map(still, make_transform(R_base_left, np.zeros(3))).covariance
     np.testing.assert_allclose(found, np.diag([0.0, 1e-4, 0.0, 0.0, 0.0, 0.0]), atol=1e-12)
+
+
+def test_the_covariance_in_the_map_is_turned_along_with_the_odometry() -> None:
+    """A quarter turn to the left: what is unsure ahead in `odom` is unsure to the left in `map`."""
+    T_map_odom = make_transform(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([3.0, 1.0, 0.0])
+    )
+    covariance = np.diag([4.0, 1.0, 0.5, 0.3, 0.1, 0.2])
+    covariance[0, 5] = covariance[5, 0] = 0.25
+    found = replace(result(covariance), T_map_odom=T_map_odom).covariance_in_map
+    expected = np.diag([1.0, 4.0, 0.5, 0.1, 0.3, 0.2])
+    expected[1, 5] = expected[5, 1] = 0.25
+    np.testing.assert_allclose(found, expected, atol=1e-12)
