@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'segfloor_ros'
 NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
-FURTHER_NODES = ('segfloor_pipeline', 'simulated_robot')
+FURTHER_NODES = ('segfloor_pipeline', 'simulated_robot', 'segfloor_masks')
 HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"__version__ = '(.+)'", (HERE / PACKAGE / '__init__.py').read_text())[1]
 

@@ -14,6 +14,7 @@ from segfloor_ros.messages.topics import (
     DIAGNOSTICS,
     FLOOR,
     GRID,
+    MASKS,
     NODES,
     PACED_BY,
     ROBOT,
@@ -57,6 +58,11 @@ follows every later correction of the keyframes.""",
 A differential-drive robot in a rendered scene, in place of a camera's driver: it drives as it is
 told, slips and runs into things (MuJoCo), and publishes what its camera, wheels and IMU measure,
 and what is true. It needs the extra `sim`. [How to explore](../explore.md) with it.""",
+    MASKS: """\
+Runs a segmentation network beside the other nodes: on every keyframe, and on the newest left image
+whenever it is done with the one before. Masks that come late are taken into account: points of
+their keyframe are taken back, and the floor of a keyframe waits for its mask while this node runs.
+[The network's files](../semantics.md).""",
 }
 
 PAUSE, RESET = ('`~/pause`', '`std_srvs/srv/SetBool`'), ('`~/reset`', '`std_srvs/srv/Trigger`')
@@ -91,6 +97,10 @@ SERVICES = {
     ROBOT: [
         (*PAUSE, 'Let the time stand still (true) or go on (false).'),
         (*RESET, 'Put the robot back to where it started.'),
+    ],
+    MASKS: [
+        (*PAUSE, 'Pause (true): look at no image. Go on (false).'),
+        (*RESET, 'Forget the images that wait.'),
     ],
     FLOOR: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
     CLOUD: [(*PAUSE, PAUSING), (*RESET, NEW_MAP)],
@@ -130,6 +140,7 @@ STATUS = {
     GRID: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',
     ROBOT: 'One status per frame sent (`frame_index`).',
+    MASKS: 'One status per image looked at.',
 }
 
 
@@ -200,7 +211,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 def main() -> None:
     """Write all pages."""
     PAGES.mkdir(exist_ok=True)
-    for node in (*NODES, ROBOT):
+    for node in (*NODES, ROBOT, MASKS):
         (PAGES / f'{node}.md').write_text(page(node))
 
 

@@ -45,6 +45,14 @@ ABOUT = {
     'keyframe/moving_mask': (
         'mono8 on the rectified left image of the keyframe: 255 where something moves.'
     ),
+    'keyframe/semantic_mask': (
+        'mono8 on the rectified left image of the keyframe, what a network says of the floor: 255 '
+        'floor, 0 stands in the way, 64 moves, 127 nothing.'
+    ),
+    'semantic_labels': (
+        'mono8 on a left image as received: the class of each pixel by number, 255 for none.'
+    ),
+    'semantic_classes': 'JSON: the names of the classes by number, and what they stand for.',
     'frame_done': 'The header of every frame that SLAM has done with: tracked, skipped or refused.',
     'camera_mount': 'Left optical frame in base_link: given, from tf, or measured from the floor.',
     'keyframe/odometry': 'base_link in map at the keyframe.',

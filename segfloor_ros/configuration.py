@@ -384,6 +384,15 @@ class SimulatedRobotNodeSettings(NodeSettings):
     right_frame: str = setting('right_camera_optical_frame', 'Optical frame of the right camera.')
 
 
+@dataclass(frozen=True)
+class SegfloorMasksNodeSettings(NodeSettings):
+    """Which network looks at the images."""
+
+    network: str = setting(
+        '', 'Segmentation network, FILE.onnx with FILE.yaml beside it, which says how it is used.'
+    )
+
+
 NODE_SETTINGS: dict[str, type[NodeSettings]] = {
     cls.stage_name(): cls
     for cls in (
@@ -393,6 +402,7 @@ NODE_SETTINGS: dict[str, type[NodeSettings]] = {
         CloudLabellingNodeSettings,
         OccupancyGridNodeSettings,
         SimulatedRobotNodeSettings,
+        SegfloorMasksNodeSettings,
     )
 }
 """The settings of the nodes by name."""

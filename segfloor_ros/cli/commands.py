@@ -58,7 +58,6 @@ DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 @terminal.with_options
 def run(
     options: terminal.DriveOptions,
-    network: terminal.NetworkFile = None,
     save_debug: Annotated[
         bool,
         typer.Option(
@@ -75,7 +74,7 @@ def run(
     segfloor run sequences/06 --params kitti --frames 200 --out map06
     """
     maps = options.maps
-    sees = None if network is None else Network(network)
+    sees = None if options.network is None else Network(options.network)
     configuration, source = options.open()
     with open_view(options.view) as view:
         with (
@@ -159,6 +158,8 @@ def replay(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
         )
     StereoCameraNodeSettings(rate=rate)  # refuses an impossible rate
+    if options.network is not None:
+        Network(options.network)  # one that cannot be read ends at once
     maps = options.maps
     # The camera node reads it; it is opened here so that bad input ends at once.
     configuration, source = options.open()
@@ -183,6 +184,7 @@ def replay(
                 loaded,
                 options.no_map,
                 view,
+                options.network,
             )
             result, found = session.execute()
             folder.write(result)

@@ -38,7 +38,7 @@ from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
 from segfloor_ros.messages.arrays import grid_of, labelled_arrays, sparse_cloud_arrays
 from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level, Status
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM
+from segfloor_ros.messages.topics import CAMERA, GRID, MASKS, NODES, SLAM
 from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import RunResult, summarise
 from segfloor_ros.slam.results import KeyframePath
@@ -72,7 +72,7 @@ class ReplaySession:
     """One replay: starts the nodes in a graph of their own, follows them, and stops them.
 
     interrupt: ends it early. loaded: the map that `maps` names to go on with. path_only: no map is
-    made, and no floor is looked for.
+    made, and no floor is looked for. network: of `segfloor_masks`, if that runs, too.
     """
 
     configuration: Configuration
@@ -85,6 +85,7 @@ class ReplaySession:
     loaded: MapFile | None = None
     path_only: bool = False
     view: View | None = None
+    network: Path | None = None
 
     def execute(self) -> tuple[RunResult, ReplayReport]:
         """Run the replay. An interrupt, a node that dies or a recording that breaks off ends it
@@ -94,6 +95,7 @@ class ReplaySession:
         InputError when the recording broke off, else MapError.
         """
         nodes = (CAMERA, SLAM) if self.path_only else NODES
+        nodes = nodes if self.network is None else (*nodes, MASKS)
         with running_nodes(self._parameters, self.params_file, self.on_mask, nodes) as graph:
             if self.view is not None:
                 graph.add(ViewNode(graph.recorder.context, self.view))
@@ -113,6 +115,9 @@ class ReplaySession:
         parameters[CAMERA]['ros__parameters'].update(playing)
         for node in NODES:
             parameters[node]['ros__parameters'].update(resume_within_s=0.0)
+        if self.network is not None:
+            network = str(self.network.absolute())
+            parameters[MASKS] = {'ros__parameters': {'network': network, 'resume_within_s': 0.0}}
         parameters[SLAM]['ros__parameters'].update(
             background=False,
             image_transport='raw',

@@ -282,6 +282,7 @@ class DriveOptions(InputOptions):
     ignore: Ignore = None
     depth: Depth = False
     masks: Masks = None
+    network: NetworkFile = None
     save_masks: SaveMask = SaveMasks.keyframes
     save_map: SaveMap = None
     load_map: LoadMap = None

@@ -36,7 +36,7 @@ from sensor_msgs.msg import (
     PointCloud2,
     TimeReference,
 )
-from std_msgs.msg import Header, UInt8MultiArray
+from std_msgs.msg import Header, String, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
 
 PROFILES = FilePath(str(resources.files('segfloor_ros.nodes') / 'fastdds.xml'))
@@ -56,10 +56,13 @@ NODES = (CAMERA, SLAM, FLOOR, CLOUD, GRID)
 ROBOT = 'simulated_robot'
 """In place of the camera, and of who else publishes what a robot measures."""
 
+MASKS = 'segfloor_masks'
+"""A network beside the nodes, where there is one."""
+
 OTHERS = ''
 """In place of a publisher: nodes outside of this package."""
 
-MOVING_MASK = 'keyframe/moving_mask'
+MOVING_MASK, SEMANTIC_MASK = 'keyframe/moving_mask', 'keyframe/semantic_mask'
 MAP_START = 'keyframe/map_start'
 MAP_LOADED, MAP_WANTED, MAP_PART = 'map_file/loaded', 'map_file/wanted', 'map_file/part'
 FRAME_DONE, KEYFRAME_DONE = 'frame_done', 'keyframe/done'
@@ -157,8 +160,9 @@ def _images(side: str) -> list[Topic]:
     """Return the topics of one camera; those for thin links are named as image_transport does."""
     raw, rectified = f'{side}/image_raw', f'{side}/image_rect'
     packed = '/compressed'
+    looks = (SLAM, MASKS)
     return [
-        Topic(raw, Image, IMAGES, CAMERA, (SLAM,), also_by=(ROBOT,)),
+        Topic(raw, Image, IMAGES, CAMERA, looks if side == 'left' else (SLAM,), also_by=(ROBOT,)),
         Topic(raw + packed, CompressedImage, IMAGES, CAMERA, (SLAM,), instead_of=raw),
         Topic(rectified, Image, IMAGES, OTHERS, (SLAM,), instead_of=raw),
         Topic(rectified + packed, CompressedImage, IMAGES, OTHERS, (SLAM,), instead_of=rectified),
@@ -200,10 +204,13 @@ _ALL = [
         OTHERS,
         (SLAM,),
         is_optional=True,
-        also_by=(CAMERA,),
+        also_by=(CAMERA, MASKS),
     ),
+    Topic('semantic_labels', Image, IMAGES, MASKS),
+    Topic('semantic_classes', String, LATCHED, MASKS),
     Topic('moving_points', PointCloud2, KEYFRAMES, SLAM),
     Topic(MOVING_MASK, Image, KEYFRAMES, SLAM, (FLOOR,), is_optional=True),
+    Topic(SEMANTIC_MASK, Image, KEYFRAMES, MASKS, (FLOOR,), is_optional=True),
     Topic(FRAME_DONE, Header, KEYFRAMES, SLAM),
     Topic('camera_mount', TransformStamped, LATCHED, SLAM, (FLOOR,)),
     Topic('keyframe/odometry', Odometry, KEYFRAMES, SLAM, (FLOOR, CLOUD, GRID)),

@@ -24,7 +24,13 @@ from segfloor_ros.messages.arrays import (
     scan_message,
 )
 from segfloor_ros.messages.poses import pose_array, transform_array
-from segfloor_ros.messages.topics import FRAME_PARTS, KEYFRAME_PARTS, MOVING_MASK, to_ns
+from segfloor_ros.messages.topics import (
+    FRAME_PARTS,
+    KEYFRAME_PARTS,
+    MOVING_MASK,
+    SEMANTIC_MASK,
+    to_ns,
+)
 from segfloor_ros.nodes.shared.maps import KeyframeJoin
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
@@ -95,7 +101,11 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (*KEYFRAME_PARTS, POSE)
         self._keyframes = KeyframeJoin(
-            self, parts, self._segment, may_process=self._has_mount, optional=(MOVING_MASK,)
+            self,
+            parts,
+            self._segment,
+            may_process=self._has_mount,
+            optional=(MOVING_MASK, SEMANTIC_MASK),
         )
 
     def reset_stage(self) -> None:
@@ -136,7 +146,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         frame_id = parts[KEYFRAME_PARTS[0]].header.frame_id
         T_map_base = pose_array(parts[POSE].pose.pose)
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
-        floor = stage.process(left, right, self.mount, T_map_base, moving)
+        said = grey8_image(parts[SEMANTIC_MASK], SEMANTIC_MASK) if SEMANTIC_MASK in parts else None
+        floor = stage.process(left, right, self.mount, T_map_base, moving, said)
         out, at = self.outputs, (stamp_ns, frame_id)
         out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
         scan = scan_message(stamp_ns, self._base_frame, floor.scan)
@@ -167,6 +178,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         if self._keyframes.waiting_count:
             text = 'no message on camera_mount; is stereo_slam running?'
             self.reporter.diagnose('camera_mount', text)
+        if self._stage is not None and self._stage.network.remark:
+            self.reporter.diagnose('network', self._stage.network.remark)
 
     def _stage_for(self, camera: StereoCamera) -> FloorSegmentation:
         if self._stage is None or camera != self._camera:

@@ -193,10 +193,16 @@ def _stamp_ns(message: Odometry | Imu) -> int:
 
 class MaskInput:
     """Receives masks and gives each frame the one of its stamp, or the latest that is not too old:
-    a network is slower than the camera, and no frame waits for it.
+    a network is slower than the camera, and no frame waits for it. on_mask: told the stamp of each.
     """
 
-    def __init__(self, node: AnyStageNode, timeout_s: float) -> None:
+    def __init__(
+        self,
+        node: AnyStageNode,
+        timeout_s: float,
+        on_mask: Callable[[int], None] = lambda stamp_ns: None,
+    ) -> None:
+        self._on_mask = on_mask
         self._timeout_ns = round(timeout_s * 1e9)
         self.reset()
         node.inputs.subscribe(MASKS, self.take)
@@ -211,16 +217,18 @@ class MaskInput:
         self.images[to_ns(message.header.stamp)] = message
         while len(self.images) > IMAGES.depth:
             del self.images[min(self.images)]
+        self._on_mask(to_ns(message.header.stamp))
 
     def mask_for(self, stamp_ns: int, rectifier: StereoRectifier) -> NDArray[np.uint8] | None:
         """Return the mask (H, W) uint8 on the rectified left image of a frame, None where there is
         none. Raises InputError for one that is no grey image, CalibrationError for a wrong size.
         """
         fitting = [at for at in self.images if stamp_ns - self._timeout_ns <= at <= stamp_ns]
-        if not fitting:
-            return None
-        mask = grey8_image(self.images[max(fitting)], MASKS)
-        return rectifier.rectify_mask(mask)
+        return self.mask_of(max(fitting), rectifier) if fitting else None
+
+    def mask_of(self, stamp_ns: int, rectifier: StereoRectifier) -> NDArray[np.uint8]:
+        """Return the mask of a stamp that is kept, like `mask_for`."""
+        return rectifier.rectify_mask(grey8_image(self.images[stamp_ns], MASKS))
 
 
 class InitialPose:

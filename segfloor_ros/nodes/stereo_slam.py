@@ -34,7 +34,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Make the topics."""
         self.slam: StereoSlam | None = None
         self._transforms = Transforms(self)
-        self.masks = MaskInput(self, self.settings.mask_timeout_s)
+        self.masks = MaskInput(self, self.settings.mask_timeout_s, self._take_late_mask)
         self._work = self.inputs.later(self._process_waiting)
         self._camera = StereoInput(self, self._work)
         self._sensors = SensorInput(self, self._transforms, self._look)
@@ -96,6 +96,13 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._sensors.adapt_reliability()
         missing = self._camera.missing_calibrations if self._camera.pairs else []
         self._camera.watch.find_problems(missing)
+
+    def _take_late_mask(self, stamp_ns: int) -> None:
+        """Take points back, where the mask is of a frame that was tracked already."""
+        last_ns = self._last_stamp_ns
+        if self.slam is not None and last_ns is not None and stamp_ns <= last_ns:
+            mask = self.masks.mask_of(stamp_ns, self._camera.rectifier)
+            self.slam.add_late_mask(stamp_ns, mask)
 
     def _look(self) -> None:
         if self._camera.pairs:

@@ -99,6 +99,7 @@ class StereoSlam:
         self._lost_ns: int | None = None
         self._patience_ns = LOST_NS
         self._began_unsure: tuple[Array, Array] | None = None
+        self._late: list[tuple[KeyframeRecord, Region]] = []
 
     @property
     def mount(self) -> Mount | None:
@@ -137,6 +138,7 @@ class StereoSlam:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
+            self._take_points_back()
             self.sensors.T_base_left = self.mount.T_base_left if self.mount else None
             fault = self.front_end.fault(frame)
             if self.front_end.repeats.is_carried and not fault:
@@ -183,17 +185,23 @@ class StereoSlam:
 
     def add_late_mask(self, stamp_ns: int, mask: Region) -> None:
         """Take the points back that a keyframe has made where, as a mask (H, W) of its left image
-        says that comes later, something moves (255). Other stamps say nothing.
+        says that comes later, something moves (255); with the next frame. A stamp of no keyframe
+        says nothing.
         """
         recent = self.map.keyframes[-LATE_KEYFRAMES:]
         keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
-        if keyframe is None or self.front_end.is_fixed:
+        if keyframe is not None and not self.front_end.is_fixed:
+            self._late.append((keyframe, dilate(mask, self._settings.mask_dilation_px)))
+
+    def _take_points_back(self) -> None:
+        """Remove the points that late masks concern, once nothing is being adjusted."""
+        if not self._late or self.back_end.holds_one:
             return
-        self._take_adjustment(wait=True)
-        wide = dilate(mask, self._settings.mask_dilation_px)
-        ids = keyframe.point_id[is_inside(wide, keyframe.observations.uvd_px[:, :2])]
-        ids = ids[ids != NO_POINT]
-        self.map.remove_points(ids[self.map.points['born'][ids] >= keyframe.index])
+        for keyframe, mask in self._late:
+            ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
+            ids = ids[ids != NO_POINT]
+            self.map.remove_points(ids[self.map.points['born'][ids] >= keyframe.index])
+        self._late.clear()
         self.front_end.drop_dead()
 
     def finish(self) -> list[FrameResult]:

@@ -90,6 +90,11 @@ class BackEnd:
         """Whether nothing is being solved that a new keyframe would have to wait for."""
         return self._local.idle
 
+    @property
+    def holds_one(self) -> bool:
+        """Whether there is an adjustment of a neighbourhood that is not in the map yet."""
+        return self._local.holds_one
+
     def wants_keyframe(self, track: Track | None) -> bool:
         """Whether a frame is to become a keyframe: not while a loop is being closed."""
         front_end = self._front_end

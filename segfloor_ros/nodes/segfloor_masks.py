@@ -1,0 +1,114 @@
+"""Node `segfloor_masks`: images in; what a segmentation network sees in them out."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+from segfloor_ros.configuration import SegfloorMasksNodeSettings
+from segfloor_ros.messages.arrays import grey8_image, image_message
+from segfloor_ros.messages.diagnostics import Level
+from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, SEMANTIC_MASK, best_effort, to_ns
+from segfloor_ros.nodes.shared.running import run_node
+from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.semantics.frames import ImageLabeller
+from segfloor_ros.semantics.network import Network
+
+IMAGE, KEYFRAME = 'left/image_raw', 'keyframe/left/image_rect'
+
+
+class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
+    """Looks at keyframes first, for which others wait, then at the newest image; where the network
+    is for keyframes alone, at the images that have become keyframes.
+    """
+
+    settings_type = SegfloorMasksNodeSettings
+
+    def set_up(self) -> None:
+        """Read the network and make the topics."""
+        network = Network(Path(self.settings.network).expanduser())
+        self._labeller = ImageLabeller(network)
+        self._every = network.settings.every
+        self._work = self.inputs.later(self._process)
+        self.inputs.subscribe(IMAGE, self._take_image, lambda: best_effort(IMAGES))
+        self.inputs.subscribe(KEYFRAME, self._take_keyframe)
+        self.outputs.publish('semantic_classes', String(data=network.settings.as_json()))
+
+    def reset_stage(self) -> None:
+        """Know no image."""
+        self._keyframes: deque[Image] = deque(maxlen=KEYFRAMES.depth)
+        self._images: deque[Image] = deque(maxlen=1 if self._every else IMAGES.depth)
+        self._recent: dict[int, Image] = {}
+        self._wanted: deque[int] = deque(maxlen=IMAGES.depth)
+        self._count = 0
+
+    def find_problems(self) -> None:
+        """Say what is wrong with what the network sees."""
+        for remark in self._labeller.remarks:
+            self.reporter.diagnose('network', remark)
+
+    def _take_image(self, message: Image) -> None:
+        if not self._every:
+            self._recent[to_ns(message.header.stamp)] = message
+            while len(self._recent) > IMAGES.depth:
+                del self._recent[min(self._recent)]
+            self._choose_wanted()
+        elif self._count % self._every == 0:
+            self._images.append(message)
+            self._work()
+        self._count += 1
+
+    def _take_keyframe(self, message: Image) -> None:
+        self._keyframes.append(message)
+        self._wanted.append(to_ns(message.header.stamp))
+        self._choose_wanted()
+        self._work()
+
+    def _choose_wanted(self) -> None:
+        """Look at the images of keyframes, whichever of both has come first."""
+        for stamp_ns in set(self._wanted) & self._recent.keys():
+            self._wanted.remove(stamp_ns)
+            self._images.append(self._recent.pop(stamp_ns))
+            self._work()
+
+    def _process(self) -> None:
+        """Look at one image that waits."""
+        waiting, look = (self._keyframes, self._look_at_keyframe)
+        if not waiting:
+            waiting, look = (self._images, self._look_at_image)
+        if not waiting:
+            return
+        message = waiting.popleft()
+        self._work()
+        stamp_ns = to_ns(message.header.stamp)
+        try:
+            look(stamp_ns, message)
+        except Exception as error:
+            self.reporter.report_fault(stamp_ns, error)
+
+    def _look_at_keyframe(self, stamp_ns: int, message: Image) -> None:
+        # It is rectified, hence another image than that of its stamp.
+        said = self._labeller.says(-stamp_ns, grey8_image(message, KEYFRAME))
+        mask = image_message(stamp_ns, message.header.frame_id, said)
+        self.outputs.publish(SEMANTIC_MASK, mask)
+        self.reporter.report(stamp_ns, Level.OK, 'keyframe')
+
+    def _look_at_image(self, stamp_ns: int, message: Image) -> None:
+        image, at = grey8_image(message, IMAGE), (stamp_ns, message.header.frame_id)
+        moving = self._labeller.moving(stamp_ns, image)
+        self.outputs.publish('dynamic_mask', image_message(*at, moving))
+        labels = self._labeller.labels(stamp_ns, image)
+        self.outputs.publish('semantic_labels', image_message(*at, labels))
+        self.reporter.report(stamp_ns, Level.OK, 'image')
+
+
+def main() -> None:
+    """Run the node."""
+    run_node(SegfloorMasksNode)
+
+
+if __name__ == '__main__':
+    main()

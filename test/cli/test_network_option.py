@@ -1,0 +1,91 @@
+"""`--network` of run and replay, for real: a network beside a small drive, and wrong ones."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+import pytest
+from command_line import segfloor, segfloor_process
+from small_network import constant_network, grey_network
+from stereo_drive import room_drive, write_kitti
+from stereo_room import MOUNT
+
+from segfloor_ros.floor.observation import FLOOR
+
+FRAMES = 16
+CLASSES = ('person', 'floor')
+WITH_MOUNT = [
+    part
+    for name, value in (
+        ('height_m', MOUNT.height_m), ('pitch_rad', MOUNT.pitch_rad), ('roll_rad', MOUNT.roll_rad)
+    )
+    for part in ('--set', f'stereo_slam.camera_{name}={value}')
+]  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory):
+    return write_kitti(tmp_path_factory.mktemp('recording') / 'drive', room_drive(FRAMES)[0])
+
+
+@pytest.mark.parametrize(
+    ('chosen', 'words'), [('person', '100 % of an image are of classes that move'), ('floor', '')]
+)
+def test_with_a_wrong_network_tracking_goes_on_and_it_is_said(tmp_path, drive, chosen, words):
+    roles = {'moves': ['person'], 'floor': ['floor']}
+    network = constant_network(tmp_path / 'wrong.onnx', chosen, CLASSES, **roles)
+    out = tmp_path / 'out'
+    done = segfloor_process('run', drive, '--network', network, '--out', out, *WITH_MOUNT)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['tracked_frames'] == FRAMES
+    assert summary['stages']['network']['count'] >= FRAMES
+    assert done.stderr.count('classes that move') == bool(words)
+    assert words in ''.join(summary['sensor_remarks'])
+    mask = cv2.imread(str(next((out / 'floor_masks').iterdir())), cv2.IMREAD_UNCHANGED)
+    assert 0.1 < (mask == FLOOR).mean() < 0.6
+
+
+def test_what_moves_leaves_features_and_floor_even_if_the_network_sees_keyframes_alone(
+    tmp_path, drive
+):
+    """What is dark is said to move: it stays out of the floor masks."""
+    network = grey_network(tmp_path / 'n.onnx', 160, 120, moves=['dark'], every=0, mean=[100.0])
+    out = tmp_path / 'out'
+    done = segfloor_process('run', drive, '--network', network, '--out', out, *WITH_MOUNT)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['stages']['network']['count'] == summary['keyframes'] < FRAMES
+    for file in (out / 'floor_masks').iterdir():
+        image = cv2.imread(str(drive / 'image_0' / file.name), cv2.IMREAD_UNCHANGED)
+        dark = cv2.blur(image, (9, 9)) < 90
+        floor = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == FLOOR
+        assert np.mean(floor[dark]) < 0.1 < np.mean(floor)
+
+
+def test_a_file_that_is_no_network_ends_run_and_replay_in_one_line(tmp_path, drive):
+    file = tmp_path / 'damaged.onnx'
+    file.write_bytes(b'nothing')
+    file.with_suffix('.yaml').write_text('{kind: semantic, input: [8, 8], classes: [a]}')
+    for command in ('run', 'replay')[: 1 + (find_spec('rclpy') is not None)]:
+        result = segfloor(command, drive, '--network', file, '--out', tmp_path / 'out')
+        assert result.returncode == 2
+        assert str(file) in ' '.join(result.stderr.split())
+    assert not (tmp_path / 'out').exists()
+
+
+def test_replay_runs_the_network_beside_the_five_nodes(tmp_path, drive):
+    pytest.importorskip('rclpy')
+    roles = {'moves': ['person'], 'floor': ['floor']}
+    network = constant_network(tmp_path / 'n.onnx', 'floor', CLASSES, **roles)
+    out = tmp_path / 'out'
+    done = segfloor_process(
+        'replay', drive, '--network', network, '--rate', '0', '--out', out, *WITH_MOUNT
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['tracked_frames'] == FRAMES
+    assert summary['map_updates'] == summary['keyframes'] >= 2
