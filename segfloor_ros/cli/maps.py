@@ -60,7 +60,8 @@ def _date(seconds: float) -> str:
     """Return a time of the recording's clock; recordings without dates begin near 0."""
     if seconds < datetime.timedelta(days=365).total_seconds():
         return f'at {seconds:.0f} s'
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime('%Y-%m-%d %H:%M UTC')
+    then = datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc)
+    return then.strftime('%Y-%m-%d %H:%M UTC')
 
 
 @app.command('export')

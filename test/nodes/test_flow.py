@@ -10,6 +10,7 @@ from stereo_drive import room_drive, write_kitti
 from segfloor_ros.configuration import resolve
 from segfloor_ros.messages.topics import (
     DIAGNOSTICS,
+    MASKS,
     NODES,
     ROBOT,
     TOPICS,
@@ -80,8 +81,8 @@ def test_slam_takes_rectified_images_by_parameter(make_graph) -> None:
 
 def test_every_publisher_of_a_topic_is_a_node_and_every_listener_too() -> None:
     for topic in TOPICS.values():
-        assert topic.publisher in (*NODES, ROBOT, '')
-        assert set(topic.subscribers) <= {*NODES, ROBOT}
+        assert topic.publisher in (*NODES, ROBOT, MASKS, '')
+        assert set(topic.subscribers) <= {*NODES, ROBOT, MASKS}
         assert not topic.name.startswith('/')
 
 

@@ -1,0 +1,209 @@
+"""The likeliest class of every point and cell of a map, from the labels of its keyframes.
+
+What a keyframe saw is kept in the frame of its base, as the grid keeps its evidence, and is counted
+anew where the keyframes lie now.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.files.whole import read_yaml
+from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR, FloorObservation
+from segfloor_ros.geometry import transform_points
+from segfloor_ros.grid.map_file import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    load_map,
+    pixels_of,
+    save_map,
+)
+from segfloor_ros.semantics.outputs import UNLABELLED
+from segfloor_ros.settings import suggestion
+from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
+
+STEP_PX = 4
+"""Every so many pixels of a keyframe count, in both directions: cells are larger."""
+
+HUE_STEP = 111.2
+"""Half degrees of OpenCV's hue from one class to the next: by the golden ratio, any number of hues
+lies apart."""
+
+LEGEND_ROW_PX, LEAST_SIDE_PX = 22, 600
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one keyframe saw. xy_m: (N, 2) float16 in its base; label: (N,) uint8; stands: (N,) bool,
+    whether it stands up; point_id, point_label: (M,) of points of the map.
+    """
+
+    xy_m: NDArray[np.float16]
+    label: NDArray[np.uint8]
+    stands: NDArray[np.bool_]
+    point_id: NDArray[np.int32]
+    point_label: NDArray[np.uint8]
+
+
+class LabelMap:
+    """Counts labels, keyframe by keyframe. robot_height_m: what hangs higher does not count."""
+
+    def __init__(self, camera: StereoCamera, classes: int, robot_height_m: float) -> None:
+        self._camera = camera
+        self._classes = classes
+        self._robot_height_m = robot_height_m
+        self._seen: dict[int, _Seen] = {}
+
+    def add(
+        self,
+        stamp_ns: int,
+        labels: NDArray[np.uint8],
+        floor: FloorObservation,
+        mount: Mount,
+        features: KeyframeFeatures,
+    ) -> None:
+        """Take in a keyframe: the labels (H, W) of its left image, and what was seen of its floor.
+        What is farther away than the scan reaches does not count.
+        """
+        rows, columns = np.mgrid[: labels.shape[0] : STEP_PX, : labels.shape[1] : STEP_PX]
+        uv = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        label, kind, disparity = (
+            a[uv[:, 1], uv[:, 0]] for a in (labels, floor.mask, floor.disparity_px)
+        )
+        rays = self._camera.back_project(uv.astype(np.float64), np.ones(len(uv)))
+        T = mount.T_base_left
+        with np.errstate(divide='ignore', invalid='ignore'):
+            down = -T[2, 3] / (rays @ T[2, :3])
+            depth_m = np.where(kind == FLOOR, down, self._camera.disparity_times_depth / disparity)
+            xyz = transform_points(T, rays * depth_m[:, None])
+            near = (depth_m > 0) & (np.hypot(xyz[:, 0], xyz[:, 1]) < floor.scan.range_max_m)
+        upright = (kind == NOT_FLOOR) & (disparity > 0) & (xyz[:, 2] < self._robot_height_m)
+        kept = near & ((kind == FLOOR) | upright) & (label < self._classes)
+        shows = features.point_id != NO_POINT
+        at = np.rint(features.uv_px[shows]).astype(np.intp)
+        limit = np.array(labels.shape[::-1]) - 1
+        u, v = np.clip(at, 0, limit).T
+        self._seen[stamp_ns] = _Seen(
+            xyz[kept, :2].astype(np.float16),
+            label[kept],
+            upright[kept],
+            features.point_id[shows],
+            labels[v, u],
+        )
+
+    def cells(self, grid: OccupancyGrid, path: KeyframePath) -> NDArray[np.uint8]:
+        """Return the likeliest class of each cell of a grid, (rows, columns): of what stands there
+        where it is occupied, of the floor where it is free, `UNLABELLED` elsewhere. path: where
+        the keyframes lie now.
+        """
+        counts = np.zeros((2, grid.cells.size, self._classes), np.int32)
+        for stamp_ns, T in zip(path.stamp_ns.tolist(), path.T_map_base, strict=True):
+            seen = self._seen.get(stamp_ns)
+            if seen is None:
+                continue
+            xy = seen.xy_m @ T[:2, :2].T + T[:2, 3]
+            column, row = np.floor((xy - grid.origin_xy_m) / grid.resolution_m).astype(np.intp).T
+            inside = (row >= 0) & (row < grid.cells.shape[0])
+            inside &= (column >= 0) & (column < grid.cells.shape[1])
+            cell = row[inside] * grid.cells.shape[1] + column[inside]
+            np.add.at(counts, (seen.stands[inside].astype(int), cell, seen.label[inside]), 1)
+        kinds = grid.cells.reshape(-1)
+        best = np.full(len(kinds), UNLABELLED, np.uint8)
+        for stands, is_of in enumerate((kinds == FREE, kinds == OCCUPIED)):
+            best = np.where(is_of, _likeliest(counts[stands]), best)
+        return best.reshape(grid.cells.shape)
+
+    def points(self, point_id: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """Return the likeliest class (N,) of points by id, ascending."""
+        counts = np.zeros((len(point_id), self._classes), np.int32)
+        for seen in self._seen.values():
+            row = np.searchsorted(point_id, seen.point_id)
+            row = np.minimum(row, len(point_id) - 1)
+            known = (point_id[row] == seen.point_id) & (seen.point_label < self._classes)
+            np.add.at(counts, (row[known], seen.point_label[known]), 1)
+        return _likeliest(counts)
+
+
+def _likeliest(counts: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """Return the class (N,) with the most of counts (N, C), `UNLABELLED` where there are none."""
+    return np.where(counts.any(axis=1), counts.argmax(axis=1), UNLABELLED).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What is known of a whole map. classes: names by number. cells: (rows, columns) of its grid,
+    None where there is no grid. points: (N,) of its cloud.
+    """
+
+    classes: list[str]
+    cells: NDArray[np.uint8] | None
+    points: NDArray[np.uint8]
+
+
+def save_labels(path: Path, grid: OccupancyGrid, labels: Labels) -> None:
+    """Write the labels of cells as a map for map_server, mode raw, with the names of the classes
+    in its YAML. Raises MapError.
+    """
+    assert labels.cells is not None
+    cells = np.where(labels.cells < len(labels.classes), labels.cells, UNKNOWN).astype(np.int8)
+    numbered = OccupancyGrid(cells, grid.resolution_m, grid.origin_xy_m)
+    save_map(numbered, path, 'raw', {'classes': labels.classes})
+
+
+def class_colours(count: int) -> NDArray[np.uint8]:
+    """Return the colour (count, 3) BGR of each class."""
+    hsv = np.zeros((1, count, 3), np.uint8)
+    hsv[0, :, 0] = (np.arange(count) * HUE_STEP) % 180
+    hsv[0, :, 1:] = 170, 230
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0]
+
+
+def draw_labels(grid: OccupancyGrid, labels: Labels) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) BGR of a map with the colour of each class, light where it is
+    free, and a legend below.
+    """
+    assert labels.cells is not None
+    colours = class_colours(len(labels.classes))
+    picture = cv2.cvtColor(np.ascontiguousarray(pixels_of(grid.cells)), cv2.COLOR_GRAY2BGR)
+    cells, kinds = labels.cells[::-1], grid.cells[::-1]
+    known = cells < len(labels.classes)
+    painted = colours[cells[known]].astype(np.uint16)
+    free = (kinds[known] == FREE)[:, None]
+    picture[known] = np.where(free, (painted + 255) // 2, painted)
+    finer = max(1, -(-LEAST_SIDE_PX // max(picture.shape[:2])))
+    picture = np.kron(picture, np.ones((finer, finer, 1), np.uint8))
+    shown = [i for i in range(len(labels.classes)) if (labels.cells == i).any()]
+    legend = np.full((LEGEND_ROW_PX * (len(shown) + 1), picture.shape[1], 3), 255, np.uint8)
+    for line, i in enumerate(shown):
+        top, side = line * LEGEND_ROW_PX + 5, LEGEND_ROW_PX - 8
+        cv2.rectangle(legend, (8, top), (8 + side, top + side), colours[i].tolist(), cv2.FILLED)
+        where = (16 + side, top + side - 1)
+        cv2.putText(legend, labels.classes[i], where, 0, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
+    return np.vstack([picture, legend])
+
+
+def filter_mask(path: Path, percent: dict[str, int]) -> OccupancyGrid:
+    """Return a mask for Nav2's costmap filters from the labels of a map (`save_labels`): cells of
+    classes by name get their percentage, others 0. Raises InputError for a file without classes,
+    SettingsError for a class it does not have.
+    """
+    grid = load_map(path)
+    names = read_yaml(path, 'a map with classes').get('classes')
+    if not isinstance(names, list):
+        raise InputError(f'{path}: names no classes; give map_labels.yaml of a run with --network')
+    cells = np.zeros(grid.cells.shape, np.int8)
+    for name, value in percent.items():
+        if name not in names:
+            near = suggestion(name, names)
+            raise SettingsError(f'{name} is no class of {path}{near}; it has {", ".join(names)}')
+        cells[grid.cells == names.index(name)] = value
+    return OccupancyGrid(cells, grid.resolution_m, grid.origin_xy_m)
