@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.files.results import MapFile
-from segfloor_ros.messages import arrays as clouds
+from segfloor_ros.messages import arrays
 from segfloor_ros.messages.arrays import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import FRESH_S, to_ns
@@ -89,7 +89,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
             # Also for those who listen later: without keyframes it stays as it is.
-            self._obstacles = clouds.points_of_label(*at, labelled, OBSTACLE)
+            self._obstacles = arrays.points_of_label(*at, labelled, OBSTACLE)
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
@@ -102,13 +102,13 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         self._stage.settings = self.settings
 
     def _label(self, stamp_ns: int, parts: Mapping[str, Any]) -> dict[str, Any]:
-        cloud = clouds.sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
-        features = clouds.features_arrays(parts[FEATURES], FEATURES)
+        cloud = arrays.sparse_cloud_arrays(parts[MAP_POINTS], MAP_POINTS)
+        features = arrays.features_arrays(parts[FEATURES], FEATURES)
         mask = grey8_image(parts[MASK], MASK)
         T_map_base = pose_array(parts[POSE].pose.pose)
         labelled = self._stage.update(cloud, features, mask, T_map_base)
         frame_id = parts[MAP_POINTS].header.frame_id
-        message = clouds.labelled_message(stamp_ns, frame_id, labelled)
+        message = arrays.labelled_message(stamp_ns, frame_id, labelled)
         self.outputs.publish('labelled_points', message)
         self._publish_by_label(stamp_ns, frame_id, labelled)
         self._part.note(stamp_ns, frame_id)
@@ -117,10 +117,10 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
         """Publish floor and obstacles, each while someone listens."""
         if self.outputs.listeners('floor_points'):
-            floor = clouds.points_of_label(stamp_ns, frame_id, labelled, FLOOR)
+            floor = arrays.points_of_label(stamp_ns, frame_id, labelled, FLOOR)
             self.outputs.publish('floor_points', floor)
         if self._obstacles_are_wanted():
-            self._obstacles = clouds.points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
+            self._obstacles = arrays.points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
             self.outputs.publish('obstacle_points', self._obstacles)
 
     def _obstacles_are_wanted(self) -> bool:

@@ -25,8 +25,7 @@ from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
-from segfloor_ros.messages import arrays as clouds
-from segfloor_ros.messages import poses
+from segfloor_ros.messages import arrays, poses
 from segfloor_ros.messages.arrays import (
     camera_info_message,
     image_message,
@@ -110,7 +109,7 @@ class SlamTopics:
             self.newest_ns = max(result.stamp_ns, self.newest_ns)
         if result.moving is not None:
             frame_id = self._own.map_frame
-            message = clouds.moving_points_message(result.stamp_ns, frame_id, result.moving)
+            message = arrays.moving_points_message(result.stamp_ns, frame_id, result.moving)
             self._out.publish('moving_points', message)
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe)
@@ -173,10 +172,10 @@ class SlamTopics:
         covariance = poses.never_certain(result.covariance_in_map)
         pose = poses.odometry_message(*at, own.base_frame, keyframe.T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
-        out.publish('keyframe/features', clouds.features_message(*at, keyframe.features))
+        out.publish('keyframe/features', arrays.features_message(*at, keyframe.features))
         out.publish('keyframe/path', self._path_messages.next(stamp_ns, keyframe.path))
         out.publish(MAP_START, map_start_message(*at, self.map_start_ns, self._is_loaded))
-        out.publish('map_points', clouds.sparse_cloud_message(*at, keyframe.cloud))
+        out.publish('map_points', arrays.sparse_cloud_message(*at, keyframe.cloud))
 
 
 class SlamResults:

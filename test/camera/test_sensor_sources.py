@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from camera_recordings import (
+    BASELINE_M,
     HEIGHT,
     MS,
     WIDTH,
     Message,
+    calibration,
     grey_pairs,
     opened,
     sensor_yaml,
@@ -20,11 +23,14 @@ from camera_recordings import (
     write_kitti,
     write_rosbag2,
 )
+from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.model import ImuSample, MeasurementLog, WheelPose
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.camera.sources.bag import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
 from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.geometry import se3_exp
 
 WHEELS = '# t x y z qx qy qz qw\n0.00 2 0 0 0 0 0 1\n0.05 2.1 0 0 0 0 0.6 0.8\n0.2 3 0 0 0 0 0 1\n'
 IMU = '#timestamp [ns],w x,w y,w z,a x,a y,a z\n' + ''.join(
@@ -110,6 +116,15 @@ def test_the_imu_of_euroc_is_turned_into_the_left_camera(tmp_path: Path) -> None
     np.testing.assert_allclose(sample.gyro_rad_s, [-2, 1, 3], atol=1e-6)
     np.testing.assert_allclose(sample.accel_m_s2, [0, -9.81, 0], atol=1e-5)
     np.testing.assert_allclose(sample.place_m, [0.1, 0.2, -0.3], atol=1e-6)
+    # The same where the body is neither of them.
+    T_other_body = se3_exp(np.array([0.4, -0.2, 0.3, 0.5, -1.2, 0.7]))
+    places = {'cam0': np.eye(4), 'cam1': np.eye(4), 'imu0': T_body_imu}
+    places['cam1'][0, 3] = BASELINE_M
+    for name, T in places.items():
+        (folder / 'mav0' / name / 'sensor.yaml').write_text(sensor_yaml(T_other_body @ T))
+    (of_body,) = measured(opened(folder))
+    for name in ('gyro_rad_s', 'accel_m_s2', 'place_m'):
+        np.testing.assert_allclose(getattr(of_body, name), getattr(sample, name), atol=1e-5)
     for camera in ('cam0', 'cam1', 'imu0'):  # and the same of a file of Kalibr
         (folder / 'mav0' / camera / 'sensor.yaml').unlink()
     eye = f'intrinsics: [50, 50, 32, 24], resolution: [{WIDTH}, {HEIGHT}], camera_model: pinhole'
@@ -239,6 +254,18 @@ def test_the_imu_of_a_bag_is_turned_by_tf(tmp_path: Path) -> None:
     np.testing.assert_allclose(sample.accel_m_s2, [-2, -9.81, 1], atol=1e-9)
     np.testing.assert_allclose(sample.gyro_rad_s, [-0.2, -0.3, 0.1], atol=1e-9)
     np.testing.assert_allclose(sample.place_m, [0.0, 0.1, 0.0], atol=1e-9)
+
+
+def test_the_imu_of_a_bag_is_turned_by_tf_and_then_by_the_rectification(tmp_path: Path) -> None:
+    eyes = calibration(distorted=True)
+    R = Rotation.from_euler('z', 90, degrees=True).as_matrix()  # x becomes y, y becomes -x
+    turned = StereoCalibration(*(dataclasses.replace(e, R=R) for e in (eyes.left, eyes.right)))
+    pictures = stereo_messages(grey_pairs(2), [100 * MS, 200 * MS], eyes=turned)
+    imu = imu_message(100 * MS, (1, 2, 9.81), 'imu_link')
+    (sample,) = measured(opened(write_rosbag2(tmp_path / 'drive', [tf_message(), imu, *pictures])))
+    np.testing.assert_allclose(sample.accel_m_s2, [9.81, -2, 1], atol=1e-9)
+    np.testing.assert_allclose(sample.gyro_rad_s, [0.3, -0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(sample.place_m, [-0.1, 0.0, 0.0], atol=1e-9)
 
 
 def test_an_imu_without_transform_is_used_where_gravity_says_it_is_the_camera_s(

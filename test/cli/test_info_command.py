@@ -98,9 +98,11 @@ def test_a_calibration_of_another_lens_is_said(tmp_path: Path, frames: list[Ster
 
 
 def test_sensors_and_pauses_are_found(tmp_path: Path, frames: list[StereoFrame]) -> None:
-    late = [replace(f, stamp_ns=f.stamp_ns + (3 * 10**9 if f.index >= 20 else 0)) for f in frames]
+    begin_ns, pause_ns = 7 * 10**9, 3 * 10**9
+    stamps = [begin_ns + f.stamp_ns + (pause_ns if f.index >= 20 else 0) for f in frames]
+    late = [replace(f, stamp_ns=stamp) for f, stamp in zip(frames, stamps, strict=True)]
     folder = write_kitti(tmp_path / 'drive', late)
-    rows = [f'{i * 10_000_000},0,0,0,0,-9.81,0' for i in range(900)]
+    rows = [f'{begin_ns + i * 10_000_000},0,0,0,0,-9.81,0' for i in range(900)]
     (folder / 'imu.csv').write_text('\n'.join(rows) + '\n')
     said = said_of(folder)
     pairs, imu = said['streams']

@@ -8,17 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import eye_calibration
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.model import ImuSample, Mount, StereoCamera
 from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
-from segfloor_ros.geometry import make_transform, se3_exp
+from segfloor_ros.geometry import R_ROS_OPTICAL, make_transform, se3_exp
 from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages import arrays as clouds
-from segfloor_ros.messages import arrays as floor
-from segfloor_ros.messages import arrays as images
-from segfloor_ros.messages import arrays as map_files
-from segfloor_ros.messages import poses
+from segfloor_ros.messages import arrays, poses
 from segfloor_ros.messages.arrays import (
     camera_info_message,
     map_start_message,
@@ -48,16 +44,16 @@ def test_stamps_keep_every_nanosecond() -> None:
 def test_a_grey_image_survives() -> None:
     for dtype in (np.uint8, np.uint16):
         image = RNG.integers(0, np.iinfo(dtype).max, (5, 7)).astype(dtype)
-        message = over_the_wire(images.image_message(STAMP_NS, 'eye', image))
+        message = over_the_wire(arrays.image_message(STAMP_NS, 'eye', image))
         assert (message.header.frame_id, to_ns(message.header.stamp)) == ('eye', STAMP_NS)
-        np.testing.assert_array_equal(images.grey_image(message, 'left'), image)
+        np.testing.assert_array_equal(arrays.grey_image(message, 'left'), image)
 
 
 def test_colour_and_padded_rows_become_grey() -> None:
-    message = images.image_message(0, '', np.zeros((2, 8), np.uint8))
+    message = arrays.image_message(0, '', np.zeros((2, 8), np.uint8))
     message.encoding, message.width, message.step = 'bgr8', 2, 8
     message.data[:6] = type(message.data)('B', [10, 10, 10, 200, 200, 200])
-    np.testing.assert_array_equal(images.grey_image(message, 'left'), [[10, 200], [0, 0]])
+    np.testing.assert_array_equal(arrays.grey_image(message, 'left'), [[10, 200], [0, 0]])
 
 
 @pytest.mark.parametrize(
@@ -65,33 +61,33 @@ def test_colour_and_padded_rows_become_grey() -> None:
     [{'encoding': '32FC1'}, {'width': 9}, {'step': 3}, {'height': 10_000, 'width': 10_000}],
 )
 def test_an_image_that_contradicts_itself_is_refused_by_name(change) -> None:
-    message = images.image_message(0, '', np.zeros((4, 8), np.uint8))
+    message = arrays.image_message(0, '', np.zeros((4, 8), np.uint8))
     for field, value in change.items():
         setattr(message, field, value)
     with pytest.raises(InputError, match='left/image_raw'):
-        images.grey_image(message, 'left/image_raw')
+        arrays.grey_image(message, 'left/image_raw')
 
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_a_png_survives_and_a_jpeg_nearly(dtype) -> None:
     y, x = np.mgrid[0:40, 0:60]
     image = (100 + 50 * np.sin(x / 9) + y).astype(dtype)
-    exact = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, None))
+    exact = over_the_wire(arrays.compressed_message(STAMP_NS, 'left', image, None))
     assert (to_ns(exact.header.stamp), exact.header.frame_id) == (STAMP_NS, 'left')
-    found = images.grey_image(exact, 'left/image_raw/compressed')
+    found = arrays.grey_image(exact, 'left/image_raw/compressed')
     np.testing.assert_array_equal(found, image)
     assert found.dtype == dtype
-    small = over_the_wire(images.compressed_message(STAMP_NS, 'left', image, 90))
+    small = over_the_wire(arrays.compressed_message(STAMP_NS, 'left', image, 90))
     assert small.format.endswith('mono8' if dtype == np.uint8 else 'mono16')
-    lossy = images.grey_image(small, 'left/image_raw/compressed')
+    lossy = arrays.grey_image(small, 'left/image_raw/compressed')
     assert np.abs(lossy.astype(int) - image.astype(int)).max() <= (8 if dtype == np.uint8 else 0)
 
 
 def test_a_damaged_file_is_refused_by_topic() -> None:
-    message = images.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
+    message = arrays.compressed_message(STAMP_NS, 'left', np.zeros((40, 60), np.uint8), 90)
     message.data = message.data[:-9]
     with pytest.raises(InputError, match='left/image_raw/compressed: the JPEG is truncated'):
-        images.grey_image(message, 'left/image_raw/compressed')
+        arrays.grey_image(message, 'left/image_raw/compressed')
 
 
 def test_calibrations_survive() -> None:
@@ -150,6 +146,23 @@ def test_a_pose_faces_where_ros_says() -> None:
     assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
     assert pose.orientation.z == pytest.approx(np.sqrt(0.5))
     assert pose.orientation.w == pytest.approx(np.sqrt(0.5))
+
+
+def test_of_the_two_quaternions_of_a_turn_the_one_with_a_positive_w_is_sent() -> None:
+    turns = Rotation.random(200, rng=np.random.default_rng(3))
+    T = np.tile(np.eye(4), (200, 1, 1))
+    T[:, :3, :3] = turns.as_matrix()
+    expected = turns.as_quat(canonical=True)
+    np.testing.assert_allclose(poses.pose_numbers(T)[:, 3:], expected, atol=1e-12)
+
+
+def test_what_an_imu_measured_is_turned_into_the_frame_of_the_message() -> None:
+    sample = ImuSample(STAMP_NS, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), np.zeros(3))
+    message = over_the_wire(poses.imu_message(sample, 'imu_link', R_ROS_OPTICAL))
+    turn, push = message.angular_velocity, message.linear_acceleration
+    # Optical x right, y down, z forward; x forward, y left, z up.
+    assert (turn.x, turn.y, turn.z) == (3.0, -1.0, -2.0)
+    assert (push.x, push.y, push.z) == (6.0, -4.0, -5.0)
 
 
 def test_the_velocity_is_in_the_moving_frame() -> None:
@@ -240,10 +253,10 @@ def test_clouds_survive() -> None:
     features = KeyframeFeatures(
         RNG.uniform(0, 640, (5, 2)).astype(np.float32), np.array([3, -1, 7, 9, 2], np.int32), xyz
     )
-    message = over_the_wire(clouds.features_message(STAMP_NS, 'map', features))
+    message = over_the_wire(arrays.features_message(STAMP_NS, 'map', features))
     assert [field.name for field in message.fields] == ['x', 'y', 'z', 'u', 'v', 'id']
     assert not message.is_dense
-    back = clouds.features_arrays(message, 'keyframe/features')
+    back = arrays.features_arrays(message, 'keyframe/features')
     np.testing.assert_array_equal(back.xyz_map, xyz)
     np.testing.assert_array_equal(back.uv_px, features.uv_px)
     np.testing.assert_array_equal(back.point_id, features.point_id)
@@ -256,13 +269,13 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
         np.array([FLOOR, OBSTACLE, UNKNOWN], np.uint8),
         np.array([0.25, 1.0, 0.0], np.float32),
     )
-    message = over_the_wire(clouds.labelled_message(0, 'map', labelled))
+    message = over_the_wire(arrays.labelled_message(0, 'map', labelled))
     assert {f.name for f in message.fields} == {'x', 'y', 'z', 'id', 'label', 'confidence'}
-    back = clouds.labelled_arrays(message, 'labelled_points')
+    back = arrays.labelled_arrays(message, 'labelled_points')
     for name in ('point_id', 'xyz_map', 'label', 'confidence'):
         np.testing.assert_array_equal(getattr(back, name), getattr(labelled, name))
-    obstacles = clouds.points_of_label(0, 'map', labelled, OBSTACLE)
-    only = clouds.sparse_cloud_arrays(obstacles, 'obstacle_points')
+    obstacles = arrays.points_of_label(0, 'map', labelled, OBSTACLE)
+    only = arrays.sparse_cloud_arrays(obstacles, 'obstacle_points')
     assert only.point_id.tolist() == [4]
     np.testing.assert_array_equal(only.xyz_map, [[3, 4, 5]])
 
@@ -271,7 +284,7 @@ def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
     """Big endian, doubles, other order, padded rows and two rows."""
     dtype = np.dtype([('id', '>i4'), ('z', '>f8'), ('y', '>f8'), ('x', '>f8')])
     points = np.array([(7, 3, 2, 1), (8, 6, 5, 4)], dtype)
-    message = clouds.sparse_cloud_message(
+    message = arrays.sparse_cloud_message(
         0, 'map', SparseCloud(np.zeros(0, np.int32), np.zeros((0, 3)))
     )
     offsets = {'id': 0, 'z': 4, 'y': 12, 'x': 20}
@@ -281,30 +294,30 @@ def test_a_foreign_cloud_is_read_by_its_field_names() -> None:
     message.height, message.width, message.row_step = 2, 1, 32
     padded = b''.join(p.tobytes() + b'junk' for p in points)
     message.data = type(message.data)('B', padded)
-    back = clouds.sparse_cloud_arrays(message, 'map_points')
+    back = arrays.sparse_cloud_arrays(message, 'map_points')
     assert back.point_id.tolist() == [7, 8]
     np.testing.assert_array_equal(back.xyz_map, [[1, 2, 3], [4, 5, 6]])
 
 
 def test_clouds_that_contradict_themselves_are_refused_by_name() -> None:
     cloud = SparseCloud(np.array([1], np.int32), np.zeros((1, 3), np.float32))
-    short = clouds.sparse_cloud_message(0, 'map', cloud)
+    short = arrays.sparse_cloud_message(0, 'map', cloud)
     short.width = 2
     with pytest.raises(InputError, match='map_points: 16 bytes'):
-        clouds.sparse_cloud_arrays(short, 'map_points')
-    without = clouds.sparse_cloud_message(0, 'map', cloud)
+        arrays.sparse_cloud_arrays(short, 'map_points')
+    without = arrays.sparse_cloud_message(0, 'map', cloud)
     without.fields = [field for field in without.fields if field.name != 'id']
     with pytest.raises(InputError, match='map_points: the cloud has no field id'):
-        clouds.sparse_cloud_arrays(without, 'map_points')
+        arrays.sparse_cloud_arrays(without, 'map_points')
 
 
 def test_the_floor_scan_survives() -> None:
     ranges = np.array([0.0, np.nan, 2.5], np.float32)
     for obstacles in (None, np.array([1.0, np.nan, np.nan], np.float32)):
         scan = FloorScan(-0.5, 0.25, ranges, obstacles, 8.25)
-        message = over_the_wire(floor.scan_message(STAMP_NS, 'base_link', scan))
+        message = over_the_wire(arrays.scan_message(STAMP_NS, 'base_link', scan))
         assert (message.angle_min, message.angle_max) == (-0.5, 0.0)
-        back = floor.scan_arrays(message, 'scan')
+        back = arrays.scan_arrays(message, 'scan')
         assert (back.angle_min_rad, back.angle_increment_rad) == (-0.5, 0.25)
         assert back.range_max_m == 8.25
         np.testing.assert_array_equal(back.ranges_m, ranges)
@@ -319,7 +332,7 @@ def test_the_disparity_image_gives_depth() -> None:
     counted = VDisparity(np.zeros((3, 128), np.intp), 0, 2)
     mask, scan = np.zeros((3, 4), np.uint8), FloorScan(0, 1, disparity[0])
     seen = FloorObservation(disparity, mask, np.zeros(3), scan, 64.0, counted)
-    message = over_the_wire(floor.disparity_message(0, 'eye', _camera(), seen))
+    message = over_the_wire(arrays.disparity_message(0, 'eye', _camera(), seen))
     pixels = np.frombuffer(message.image.data, np.float32).reshape(3, 4)
     np.testing.assert_array_equal(pixels, disparity)
     assert message.f * message.t / pixels[0, 1] == pytest.approx(2.0 * 0.1 / 2.0)
@@ -329,7 +342,7 @@ def test_the_disparity_image_gives_depth() -> None:
 def test_the_map_is_row_major_from_its_lower_left_cell() -> None:
     cells = np.array([[0, 100, -1], [-1, -1, 0]], np.int8)
     grid = OccupancyGrid(cells, 0.05, (-1.0, 2.0))
-    message = over_the_wire(map_files.grid_message(STAMP_NS, 'map', grid))
+    message = over_the_wire(arrays.grid_message(STAMP_NS, 'map', grid))
     assert (message.info.width, message.info.height) == (3, 2)
     assert list(message.data) == [0, 100, -1, -1, -1, 0]
     assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 2.0)

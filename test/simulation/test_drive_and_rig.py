@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from segfloor_ros.camera.model import Mount
 from segfloor_ros.errors import InputError
 from segfloor_ros.simulation.camera import (
     brightness,
@@ -152,3 +153,10 @@ def test_shaking_is_bounded_and_repeats():
     assert (motion.std(axis=0) > 0).all()
     np.testing.assert_array_equal(motion[100], shake(vibration, 5, 5.0))
     assert shake(Vibration(), 5, 1.0) == (0.0, 0.0, 0.0)
+    rig = CameraRig(height_m=0.3, pitch_deg=10.0, vibration=vibration)
+    scene = Scene('', Route(((0.0, 0.0), (4.0, 0.0))), camera=rig, seed=5)
+    T_world_left = RigMotion(scene, plan_drive(scene.path, 10.0), []).T_world_left(5.0)
+    roll, pitch, bounce_m = shake(vibration, 5, 5.0)
+    assert T_world_left[2, 3] == pytest.approx(0.3 + bounce_m)
+    mount = Mount(0.3 + bounce_m, np.radians(10) + pitch, roll, rig.forward_m)
+    np.testing.assert_allclose(T_world_left[:3, :3], mount.T_base_left[:3, :3], atol=1e-12)

@@ -38,6 +38,9 @@ def test_exact_wheels_tell_the_motion_of_the_base():
     end_s = readings.times_s[-1]
     true = np.linalg.inv(motion.T_world_base(0.0)) @ motion.T_world_base(end_s)
     np.testing.assert_allclose(told, true, atol=0.01)
+    # In a frame of their own, in which the drive begins neither at the origin nor ahead.
+    begin = readings.T_odom_base[0]
+    assert np.hypot(*begin[:2, 3]) > 1 and begin[0, 0] < 0.9
 
 
 def test_wheels_of_a_wrong_scale_tell_more_metres():

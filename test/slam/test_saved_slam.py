@@ -7,10 +7,10 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
-from segfloor_ros.geometry import invert
+from segfloor_ros.geometry import invert, se3_exp
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import OffsetEstimate
-from segfloor_ros.slam.saved_slam import load_slam, save_slam
+from segfloor_ros.slam.saved_slam import load_slam, moved, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -215,3 +215,22 @@ def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mappe
     odom = np.stack([r.T_odom_base for r in results if r.tracked])
     steps = np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1)
     assert steps.max() < 0.15
+
+
+def test_a_map_in_another_frame_looks_the_same_from_its_keyframes() -> None:
+    rng = np.random.default_rng(8)
+    views = se3_exp(rng.normal(size=(3, 6)))
+    direction = rng.normal(size=(5, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    before = {
+        'point_xyz_world': rng.normal(size=(5, 3)),
+        'point_viewing_direction': direction,
+        'keyframe_T_camera_world': views,
+    }
+    after = moved(before, se3_exp(np.array([1.0, -2.0, 0.5, 0.4, 1.2, -0.7])))
+    for old, new in zip(views, after['keyframe_T_camera_world'], strict=True):
+        for kind in ('point_xyz_world', 'point_viewing_direction'):
+            shift = kind == 'point_xyz_world'
+            there = before[kind] @ old[:3, :3].T + shift * old[:3, 3]
+            here = after[kind] @ new[:3, :3].T + shift * new[:3, 3]
+            np.testing.assert_allclose(here, there, atol=1e-9)
