@@ -221,6 +221,7 @@ class LockstepRun:
             mount,
             self._summary(wall_s, grid is not None),
             self._configuration,
+            stages.labels(grid, path),
         )
 
     @property

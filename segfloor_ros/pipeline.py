@@ -24,6 +24,7 @@ from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.semantics.frames import ImageLabeller
+from segfloor_ros.semantics.label_map import LabelMap, Labels
 from segfloor_ros.semantics.network import Network
 from segfloor_ros.slam.results import (
     FrameResult,
@@ -71,7 +72,10 @@ class KeyframeStages:
         self.map_updates = 0
         self._is_loaded = False
         self._times = times
-        self._labeller = labeller
+        self._labeller, self._label_map = labeller, None
+        if labeller is not None:
+            height_m = configuration.floor_segmentation.robot_height_m
+            self._label_map = LabelMap(camera, len(labeller.classes), height_m)
         self._floor = FloorSegmentation(camera, configuration.floor_segmentation)
         self._labelling = CloudLabelling(configuration.cloud_labelling)
         self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
@@ -85,6 +89,9 @@ class KeyframeStages:
             floor = self._floor.process(
                 keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving, said
             )
+        if self._labeller is not None and self._label_map is not None:
+            labels = self._labeller.labels(keyframe.stamp_ns, keyframe.left)
+            self._label_map.add(keyframe.stamp_ns, labels, floor, mount, keyframe.features)
         path, cloud = keyframe.path, keyframe.cloud
         self.update_map(
             MapInput(keyframe.stamp_ns, keyframe.features, path, cloud, floor.mask, floor.scan)
@@ -110,6 +117,16 @@ class KeyframeStages:
             return []
         of_floor = self._floor.network.remark
         return [*self._labeller.remarks, *([of_floor] if of_floor else [])]
+
+    def labels(self, grid: OccupancyGrid | None, path: KeyframePath) -> Labels | None:
+        """Return the labels of the map, with its keyframes where they lie now; None where no
+        network has looked at them.
+        """
+        if self._labeller is None or self._label_map is None or self.labelled is None:
+            return None
+        cells = None if grid is None else self._label_map.cells(grid, path)
+        points = self._label_map.points(self.labelled.point_id)
+        return Labels(self._labeller.classes, cells, points)
 
     def note_points(self, cloud: SparseCloud) -> None:
         """Take in the points of a keyframe whose floor is not segmented."""

@@ -33,15 +33,19 @@ from segfloor_ros.files.results import (
 )
 from segfloor_ros.files.whole import read_json
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
+from segfloor_ros.semantics.label_map import Labels, draw_labels, save_labels
+from segfloor_ros.semantics.outputs import UNLABELLED
 from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.trajectory import Trajectory, write_tum
 
 MAP, REPORT = 'map.yaml', 'report.html'
+LABEL_FILES = ('map_semantic.png', 'map_labels.yaml', 'map_labels.pgm', 'point_labels.csv')
 PICTURES = ('floor_masks', 'moving_masks', 'floor_debug')
 OUTPUT_NAMES = (
     *PICTURES,
     'map.pgm',
     MAP,
+    *LABEL_FILES,
     'trajectory.txt',
     'keyframes.txt',
     'camera_trajectory.txt',
@@ -110,7 +114,7 @@ class RunSummary:
 @dataclasses.dataclass(frozen=True)
 class RunResult:
     """What a run leaves behind. grid: None where only a path came of it. trajectory, keyframes:
-    `base_link` in `map`.
+    `base_link` in `map`. labels: of a network, where there was one.
     """
 
     grid: OccupancyGrid | None
@@ -120,6 +124,7 @@ class RunResult:
     mount: Mount
     summary: RunSummary
     configuration: Configuration
+    labels: Labels | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,13 +323,38 @@ def _writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
     settings = yaml.safe_dump(result.configuration.as_ros_parameters(), sort_keys=False)
     grid = result.grid
     of_map = {} if grid is None else {MAP: lambda path: save_map(grid, path)}
-    return of_map | {
-        'trajectory.txt': lambda path: write_tum(path, result.trajectory),
-        'keyframes.txt': lambda path: write_tum(path, result.keyframes),
-        'camera_trajectory.txt': lambda path: write_tum(path, camera),
-        'labelled_cloud.ply': lambda path: write_ply(path, result.labelled),
-        'summary.json': lambda path: path.write_text(summary + '\n'),
-        'settings.yaml': lambda path: path.write_text(settings),
+    return (
+        of_map
+        | _label_writers(result)
+        | {
+            'trajectory.txt': lambda path: write_tum(path, result.trajectory),
+            'keyframes.txt': lambda path: write_tum(path, result.keyframes),
+            'camera_trajectory.txt': lambda path: write_tum(path, camera),
+            'labelled_cloud.ply': lambda path: write_ply(path, result.labelled),
+            'summary.json': lambda path: path.write_text(summary + '\n'),
+            'settings.yaml': lambda path: path.write_text(settings),
+        }
+    )
+
+
+def _label_writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
+    """Return what writes the files of labels, where there are any."""
+    labels, grid, cloud = result.labels, result.grid, result.labelled
+    if labels is None:
+        return {}
+    names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
+    rows = [f'{i},{names[k]}' for i, k in zip(cloud.point_id, labels.points, strict=True)]
+    points = '\n'.join(['id,class', *rows]) + '\n'
+    of_points: dict[str, Callable[[Path], object]] = {
+        'point_labels.csv': lambda path: path.write_text(points)
+    }
+    if grid is None or labels.cells is None:
+        return of_points
+    return of_points | {
+        'map_labels.yaml': lambda path: save_labels(path, grid, labels),
+        'map_semantic.png': lambda path: path.write_bytes(
+            cv2.imencode('.png', draw_labels(grid, labels))[1].tobytes()
+        ),
     }
 
 

@@ -10,9 +10,15 @@ import cv2
 import typer
 
 from segfloor_ros.cli.terminal import Json, console, print_json, value_table
+from segfloor_ros.errors import SettingsError
 from segfloor_ros.files.results import write_file, write_map_file
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.map_files import changes, draw_changes, merge, open_map
+from segfloor_ros.semantics.label_map import filter_mask
+
+KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
+SPEED = 'type: 1, base: 100.0, multiplier: -1.0'
+"""Parameters of Nav2's server for each kind of mask."""
 
 app = typer.Typer(help='Look at saved maps, compare them, make one of two.')
 
@@ -116,3 +122,36 @@ def diff(
         return print_json(areas)
     rows = [(name.removesuffix('_m2'), f'{area:.2f} m²') for name, area in areas.items()]
     console.print(value_table('change', [*rows, ('picture', str(out))]))
+
+
+@app.command('filter')
+def filter_labels(
+    labels: Annotated[
+        Path, typer.Argument(metavar='LABELS.yaml', help='map_labels.yaml of a run with --network.')
+    ],
+    out: Annotated[Path, typer.Argument(metavar='MASK.yaml', help='Mask for map_server.')],
+    keepout: Annotated[
+        list[str] | None, typer.Option(help='Class that is kept out of; repeatable.')
+    ] = None,
+    speed: Annotated[
+        list[str] | None,
+        typer.Option(metavar='CLASS=PERCENT', help='Share of the highest speed; repeatable.'),
+    ] = None,
+) -> None:
+    """Write a mask for Nav2's keepout or speed filter from the classes of a map.
+
+    \b
+    segfloor map filter result/map_labels.yaml keepout.yaml --keepout grass
+    segfloor map filter result/map_labels.yaml speed.yaml --speed carpet=50
+    """
+    if bool(keepout) == bool(speed):
+        raise SettingsError('give classes by either --keepout or --speed')
+    # A speed filter of type 1 with base 100 and multiplier -1 takes off the percentage.
+    percent = dict.fromkeys(keepout or (), 100)
+    for assignment in speed or ():
+        name, _, share = assignment.partition('=')
+        if not share.isdecimal() or not 0 < int(share) <= 100:
+            raise SettingsError(f'--speed {assignment}: expected CLASS=PERCENT, 1 to 100')
+        percent[name] = 100 - int(share)
+    save_map(filter_mask(labels, percent), out, 'raw')
+    typer.echo(f'mask: {out}; costmap_filter_info_server: {KEEPOUT if keepout else SPEED}')

@@ -10,6 +10,7 @@ integers, so that the same observations give the same cells on every machine.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,22 +55,27 @@ CHUNK = 64
 """The stored part grows by whole blocks of this many cells."""
 
 
-def save_map(grid: OccupancyGrid, path: Path) -> None:
+def save_map(
+    grid: OccupancyGrid, path: Path, mode: str = 'trinary', facts: Mapping[str, Any] | None = None
+) -> None:
     """Write `path` (YAML) and the PGM of the same name beside it; both appear whole or not at all.
 
-    Free, occupied and unknown are kept. Raises MapError when the folder cannot be written.
+    Free, occupied and unknown are kept; with mode `raw`, the numbers of the cells. facts: further
+    entries of the YAML. Raises MapError when the folder cannot be written.
     """
     image_path = path.with_suffix('.pgm')
     description = {
         'image': image_path.name,
-        'mode': 'trinary',
+        'mode': mode,
         'resolution': float(grid.resolution_m),
         'origin': [float(grid.origin_xy_m[0]), float(grid.origin_xy_m[1]), 0.0],
         'negate': 0,
         'occupied_thresh': OCCUPIED_THRESH,
         'free_thresh': FREE_THRESH,
+        **(facts or {}),
     }
-    _replace_file(image_path, _pgm_bytes(pixels_of(grid.cells)))
+    pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else pixels_of(grid.cells)
+    _replace_file(image_path, _pgm_bytes(pixels))
     _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
 
 

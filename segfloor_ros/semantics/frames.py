@@ -37,6 +37,11 @@ class ImageLabeller:
         self._known: dict[int, NDArray[np.uint8]] = {}
 
     @property
+    def classes(self) -> list[str]:
+        """The names of the classes."""
+        return self.network.settings.classes
+
+    @property
     def is_late(self) -> bool:
         """Whether the network looks at keyframes alone, once they are keyframes."""
         return self.network.settings.every == 0

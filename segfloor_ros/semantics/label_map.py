@@ -43,8 +43,8 @@ LEGEND_ROW_PX, LEAST_SIDE_PX = 22, 600
 
 @dataclass(frozen=True)
 class _Seen:
-    """What one keyframe saw. xy_m: (N, 2) float16 in its base; label: (N,) uint8; stands: (N,) bool,
-    whether it stands up; point_id, point_label: (M,) of points of the map.
+    """What one keyframe saw. xy_m: (N, 2) float16 in its base; label: (N,) uint8; stands: (N,)
+    bool, whether it stands up; point_id, point_label: (M,) of points of the map.
     """
 
     xy_m: NDArray[np.float16]
@@ -204,6 +204,6 @@ def filter_mask(path: Path, percent: dict[str, int]) -> OccupancyGrid:
     for name, value in percent.items():
         if name not in names:
             near = suggestion(name, names)
-            raise SettingsError(f'{name} is no class of {path}{near}; it has {", ".join(names)}')
+            raise SettingsError(f'{name} is none of {", ".join(names)} in {path}{near}')
         cells[grid.cells == names.index(name)] = value
     return OccupancyGrid(cells, grid.resolution_m, grid.origin_xy_m)

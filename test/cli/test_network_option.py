@@ -14,6 +14,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 
 from segfloor_ros.floor.observation import FLOOR
+from segfloor_ros.grid.map_file import FREE, UNKNOWN, load_map
 
 FRAMES = 16
 CLASSES = ('person', 'floor')
@@ -47,6 +48,14 @@ def test_with_a_wrong_network_tracking_goes_on_and_it_is_said(tmp_path, drive, c
     assert words in ''.join(summary['sensor_remarks'])
     mask = cv2.imread(str(next((out / 'floor_masks').iterdir())), cv2.IMREAD_UNCHANGED)
     assert 0.1 < (mask == FLOOR).mean() < 0.6
+    labels, grid = load_map(out / 'map_labels.yaml'), load_map(out / 'map.yaml')
+    assert labels.cells.shape == grid.cells.shape
+    number = CLASSES.index(chosen)
+    known = labels.cells != UNKNOWN
+    assert known[grid.cells == FREE].mean() > 0.5 and (labels.cells[known] == number).all()
+    assert (out / 'map_semantic.png').is_file()
+    points = (out / 'point_labels.csv').read_text().splitlines()
+    assert points[0] == 'id,class' and {row.partition(',')[2] for row in points[1:]} == {chosen}
 
 
 def test_what_moves_leaves_features_and_floor_even_if_the_network_sees_keyframes_alone(
