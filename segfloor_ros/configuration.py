@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from segfloor_ros.camera.model import StereoCameraSettings
-from segfloor_ros.cloud.labelled_cloud import CloudLabellingSettings
+from segfloor_ros.cloud import CloudLabellingSettings
 from segfloor_ros.errors import SettingsError, about
 from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.floor.observation import FloorSegmentationSettings

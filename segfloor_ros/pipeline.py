@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
+from segfloor_ros.cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import Arrays, MapFile

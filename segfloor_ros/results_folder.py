@@ -22,7 +22,7 @@ import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints, write_ply
+from segfloor_ros.cloud import LabelledPoints, write_ply
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, SegfloorError
 from segfloor_ros.files.results import (

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.messages.arrays import (

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling
+from segfloor_ros.cloud import CloudLabelling
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
 from segfloor_ros.evaluation.map_score import MapScore, score_map

@@ -16,7 +16,7 @@ import typer
 from rich.table import Table
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark.stages import (
+from segfloor_ros.benchmark import (
     JSON_VERSION,
     MeasuredStages,
     Progress,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.benchmark.corridor import CAMERA, DRIVE, MOUNT, CorridorImages
+from segfloor_ros.benchmark import CAMERA, DRIVE, MOUNT, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.cli.terminal import Announce
 from segfloor_ros.configuration import Configuration

@@ -16,7 +16,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, CorridorImages
+from segfloor_ros.benchmark import CAMERA, MOUNT, CorridorImages
 from segfloor_ros.camera.bag_writer import convert
 from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints
+from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.map_score import compare, score_cells
 from segfloor_ros.evaluation.maps import MapTruth, cell_centres, from_frame, load_truth, states

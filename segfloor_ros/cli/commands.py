@@ -15,13 +15,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.benchmark.stages import (
-    BenchmarkPlan,
-    Workload,
-    as_document,
-    parse_sizes,
-    run_benchmark,
-)
+from segfloor_ros.benchmark import BenchmarkPlan, Workload, as_document, parse_sizes, run_benchmark
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table

@@ -30,7 +30,7 @@ from segfloor_ros.cli.replay_nodes import (
 )
 from segfloor_ros.cli.replay_recorder import POINTS, MaskListener, ReplayRecorder, ViewNode
 from segfloor_ros.cli.view import View
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling, LabelledPoints
+from segfloor_ros.cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, MapError, SegfloorError
 from segfloor_ros.files.results import MapFile

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.cli.terminal import console, progress_bar
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, SettingsError
 from segfloor_ros.files.images import read_mask

@@ -27,9 +27,9 @@ from segfloor_ros.camera.calibration.chessboard import (
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud.labelled_cloud import FLOOR as FLOOR_POINT
-from segfloor_ros.cloud.labelled_cloud import OBSTACLE, LabelledPoints, read_ply
-from segfloor_ros.cloud.labelled_cloud import UNKNOWN as UNKNOWN_POINT
+from segfloor_ros.cloud import FLOOR as FLOOR_POINT
+from segfloor_ros.cloud import OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.cloud import UNKNOWN as UNKNOWN_POINT
 from segfloor_ros.configuration import resolve
 from segfloor_ros.evaluation.maps import MapTruth, load_truth
 from segfloor_ros.files.images import check_same_size, read_grey, read_mask

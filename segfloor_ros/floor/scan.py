@@ -25,7 +25,7 @@ from segfloor_ros.floor.disparity.matching import (
     STEP,
     DisparityMatcher,
 )
-from segfloor_ros.floor.disparity.photometric import texture_grey
+from segfloor_ros.floor.mask.pixel_evidence import texture_grey
 from segfloor_ros.floor.observation import (
     RANGE_MAX_ERROR_M,
     SAME_SURFACE_SHARE,

@@ -25,15 +25,6 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.photometric import (
-    TEXTURE_WINDOW_PX,
-    compare,
-    compare_measured,
-    enough_texture,
-    noise_grey,
-    row_slope,
-    texture_grey,
-)
 from segfloor_ros.floor.disparity.profile import (
     BINS_PER_PX,
     FloorLine,
@@ -53,10 +44,17 @@ from segfloor_ros.floor.mask.filling import (
 )
 from segfloor_ros.floor.mask.network_floor import NetworkFloor
 from segfloor_ros.floor.mask.pixel_evidence import (
+    TEXTURE_WINDOW_PX,
     Comparison,
     Evidence,
     HeightTable,
+    compare,
+    compare_measured,
+    enough_texture,
     judge,
+    noise_grey,
+    row_slope,
+    texture_grey,
     unlike_floor,
 )
 from segfloor_ros.floor.observation import (

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.files.results import Arrays, joined, split
 from segfloor_ros.floor.observation import CELL_M, SAME_SURFACE_SHARE, FloorScan
 from segfloor_ros.geometry import Array, invert, transform_points

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints
+from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.files.results import Arrays, check_lengths
 from segfloor_ros.floor.observation import CELL_M, FloorScan

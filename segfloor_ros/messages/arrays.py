@@ -27,7 +27,7 @@ from stereo_msgs.msg import DisparityImage
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import depth_image, grey_image
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.results import FORMAT, MapFile, from_bytes, to_bytes
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, free_ranges

@@ -11,7 +11,7 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.files.results import MapFile
 from segfloor_ros.messages import arrays

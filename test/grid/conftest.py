@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints
+from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.cloud.labelled_cloud import FLOOR, LabelledPoints
+from segfloor_ros.cloud import FLOOR, LabelledPoints
 from segfloor_ros.floor.observation import RANGE_MAX_ERROR_M, FloorScan
 from segfloor_ros.grid.keyframe_evidence import (
     Fan,

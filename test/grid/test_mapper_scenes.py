@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Drive, World, cells_at, centres, no_points
 
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.grid.map_file import OccupancyGridSettings
 
 MakeDrive = Callable[..., Drive]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import ImuSample, Mount, StereoCamera
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.cloud import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.geometry import R_ROS_OPTICAL, make_transform, se3_exp

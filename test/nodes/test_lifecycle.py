@@ -11,7 +11,7 @@ from node_messages import FEATURES, MASK, POINTS, STAMP_NS, cloud_messages, grid
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.cloud.labelled_cloud import CloudLabelling, CloudLabellingSettings
+from segfloor_ros.cloud import CloudLabelling, CloudLabellingSettings
 from segfloor_ros.messages.arrays import labelled_arrays
 from segfloor_ros.messages.topics import NODES, published_by, subscribed_by, to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode

@@ -15,7 +15,7 @@ from ros_graph import fresh_graph, surroundings
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.cloud.labelled_cloud import UNKNOWN, LabelledPoints
+from segfloor_ros.cloud import UNKNOWN, LabelledPoints
 from segfloor_ros.files.results import MapFile
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGrid

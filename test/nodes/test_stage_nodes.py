@@ -28,7 +28,7 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud.labelled_cloud import FLOOR, CloudLabelling, CloudLabellingSettings
+from segfloor_ros.cloud import FLOOR, CloudLabelling, CloudLabellingSettings
 from segfloor_ros.floor.observation import FloorSegmentationSettings, free_ranges
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import invert

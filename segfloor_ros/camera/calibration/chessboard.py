@@ -18,7 +18,7 @@ from segfloor_ros.camera.calibration.files import ros_calibration
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
 from segfloor_ros.camera.rig.check import EVERY, InputFault, RigCheck
-from segfloor_ros.camera.rig.focal import ROWS_PX
+from segfloor_ros.camera.rig.estimates import ROWS_PX
 from segfloor_ros.camera.sources.image_folders import find_image_pairs
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import CalibrationError, InputError, os_errors

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import is_disparity
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.camera.rig.depth import DepthCheck
-from segfloor_ros.camera.rig.focal import (
+from segfloor_ros.camera.rig.estimates import (
     LEAST_NOISE_PX,
     MAX_HAMMING,
     MIN_MATCHES,
     ROWS_PX,
     SURE,
     WINDOW_PX,
+    DepthCheck,
     FocalCheck,
     Matches,
     follow,

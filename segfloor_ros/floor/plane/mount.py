@@ -23,7 +23,9 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.photometric import (
+from segfloor_ros.floor.disparity.profile import pixels_where
+from segfloor_ros.floor.disparity.view import STEP_PX, column_step, surface_above
+from segfloor_ros.floor.mask.pixel_evidence import (
     EDGE_SLOPE,
     TEXTURE_WINDOW_PX,
     enough_texture,
@@ -31,8 +33,6 @@ from segfloor_ros.floor.disparity.photometric import (
     row_slope,
     texture_grey,
 )
-from segfloor_ros.floor.disparity.profile import pixels_where
-from segfloor_ros.floor.disparity.view import STEP_PX, column_step, surface_above
 from segfloor_ros.floor.plane.plane import (
     LEVEL_SIGMA,
     SAMPLES,

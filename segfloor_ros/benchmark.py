@@ -1,9 +1,14 @@
-"""What the stages cost: time, memory and throughput on generated data of growing size.
+"""What the stages cost: `segfloor benchmark`, time, memory and throughput on generated data of
+growing size.
 
 Each workload is a process of its own, so that its memory is not filled from what others left.
 
 The stages one after the other on one thread, with a map at every keyframe: so the published
 figures were measured, and so no stage waits for another one.
+
+The data are of a straight corridor of any length: what it looks like to the labelling and grid
+stages, worked out by geometry, and its stereo images, by ray casting in NumPy: they need no
+graphics library and look the same everywhere.
 """
 
 from __future__ import annotations
@@ -11,24 +16,35 @@ from __future__ import annotations
 import dataclasses
 import platform
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, CorridorImages
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SegfloorError, SettingsError
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
+from segfloor_ros.geometry import Array, invert, make_transform, transform_points
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.pipeline import KeyframeStages, MapInput, make_slam
 from segfloor_ros.processes import how_it_ended, start_apart
-from segfloor_ros.slam.results import FrameResult, Keyframe
+from segfloor_ros.slam.results import (
+    FrameResult,
+    Keyframe,
+    KeyframeFeatures,
+    KeyframePath,
+    SparseCloud,
+)
 from segfloor_ros.timing import MemoryLog, ReferenceWorkload, StageTimes, spread_of
+
+CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
+MOUNT = Mount(height_m=0.3, pitch_rad=0.12)
 
 IMAGES = 'images'
 JSON_VERSION = 1
@@ -42,6 +58,204 @@ MAP = 'map'
 EVERY_FRAME = ('tracking', 'moving')
 
 BEFORE_UPDATE = 'mapping'
+
+
+@dataclass(frozen=True)
+class CorridorDrive:
+    """A corridor, what is seen of it, and the drive along it.
+
+    stride_m: between two keyframes. points_per_m: a hundred new points per keyframe, as in drives
+    through rendered halls. correction_every, correction_rad: every so many keyframes the whole map
+    turns by so much, as after the closing of a loop. spare_m: from the last frame to the end wall,
+    and from the wall behind to the first one. grey, contrast, noise_grey: of the images, mean and
+    standard deviations.
+    """
+
+    half_width_m: float = 1.5
+    ceiling_m: float = 2.4
+    sight_m: float = 6.0
+    spare_m: float = 5.0
+    points_per_m: int = 400
+    point_noise_m: float = 0.01
+    scan_step_rad: float = 0.01
+    scan_range_max_m: float = 8.0
+    stride_m: float = 0.25
+    step_m: float = 0.05
+    frame_period_ns: int = 100_000_000
+    correction_every: int = 100
+    correction_rad: float = 0.002
+    texels_per_m: int = 100
+    texels: int = 1024
+    grey: float = 128.0
+    contrast: float = 30.0
+    noise_grey: float = 1.5
+
+    @property
+    def keyframe_period_ns(self) -> int:
+        """Time between two keyframes."""
+        return round(self.stride_m / self.step_m) * self.frame_period_ns
+
+
+DRIVE = CorridorDrive()
+
+
+class Corridor:
+    """Keyframes of a drive along a corridor. The same seed gives the same keyframes."""
+
+    def __init__(self, keyframes: int, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.keyframes = keyframes
+        self._points = _points(keyframes * DRIVE.stride_m + DRIVE.sight_m, rng)
+        # As they lie in the map before and after a correction: what is handed out takes no memory.
+        self._xyz_map = [
+            transform_points(turn, self._points).astype(np.float32) for turn in _corrections()
+        ]
+        self._point_id = np.arange(len(self._points), dtype=np.int32)
+        self._mask = floor_mask()
+        self._scan_rng = rng
+
+    def drive(self) -> Iterator[MapInput]:
+        """Yield the keyframes in order; the cloud and the path grow with each."""
+        stamp_ns = np.arange(1, self.keyframes + 1, dtype=np.int64) * DRIVE.keyframe_period_ns
+        T_world_base = np.tile(np.eye(4), (self.keyframes, 1, 1))
+        T_world_base[:, 0, 3] = np.arange(self.keyframes) * DRIVE.stride_m
+        for index in range(self.keyframes):
+            turned = index // DRIVE.correction_every % 2
+            path = _corrections()[turned] @ T_world_base[: index + 1]
+            x_m = index * DRIVE.stride_m
+            known = int(np.searchsorted(self._points[:, 0], x_m + DRIVE.sight_m))
+            first = int(np.searchsorted(self._points[:, 0], x_m))
+            xyz_map = self._xyz_map[turned][:known]
+            yield MapInput(
+                int(stamp_ns[index]),
+                self._features(first, T_world_base[index], xyz_map),
+                KeyframePath(stamp_ns[: index + 1], path),
+                SparseCloud(self._point_id[:known], xyz_map),
+                self._mask,
+                self._scan(),
+            )
+
+    def _features(
+        self, first: int, T_world_base: Array, xyz_map: NDArray[np.float32]
+    ) -> KeyframeFeatures:
+        """Return the points from `first` on that lie in the image."""
+        T_left_world = invert(T_world_base @ MOUNT.T_base_left)
+        in_left = transform_points(T_left_world, self._points[first : len(xyz_map)])
+        ahead = np.flatnonzero(in_left[:, 2] > 0.2)
+        uv = CAMERA.project(in_left[ahead])[:, :2]
+        inside = ((uv >= 0) & (uv <= (CAMERA.width - 1, CAMERA.height - 1))).all(axis=1)
+        point_id = (first + ahead[inside]).astype(np.int32)
+        return KeyframeFeatures(uv[inside].astype(np.float32), point_id, xyz_map[point_id])
+
+    def _scan(self) -> FloorScan:
+        """Return how far the floor goes per bearing: to the walls, or as far as sight."""
+        half = np.arctan(0.5 * CAMERA.width / CAMERA.fx)
+        bearings = np.arange(-half, half, DRIVE.scan_step_rad)
+        wall_m = DRIVE.half_width_m / np.maximum(np.abs(np.sin(bearings)), 1e-6)
+        wall_m += self._scan_rng.normal(scale=DRIVE.point_noise_m, size=len(bearings))
+        in_sight = wall_m < DRIVE.sight_m
+        return FloorScan(
+            float(bearings[0]),
+            DRIVE.scan_step_rad,
+            np.minimum(wall_m, DRIVE.sight_m).astype(np.float32),
+            np.where(in_sight, wall_m, np.nan).astype(np.float32),
+            DRIVE.scan_range_max_m,
+        )
+
+
+def floor_mask() -> NDArray[np.uint8]:
+    """Return the floor mask (H, W) uint8 that every keyframe in the corridor has."""
+    v, u = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
+    rays = CAMERA.back_project(np.stack([u.ravel(), v.ravel()], axis=1), np.ones(u.size))
+    directions = rays @ MOUNT.T_base_left[:3, :3].T
+    down = np.maximum(-directions[:, 2], 1e-9)
+    forward_m, left_m = (directions[:, :2] * (MOUNT.height_m / down)[:, None]).T
+    mask = np.where(np.abs(left_m) < DRIVE.half_width_m, FLOOR, NOT_FLOOR).astype(np.uint8)
+    mask[(forward_m > DRIVE.sight_m) & (mask == FLOOR)] = NO_EVIDENCE
+    return mask.reshape(u.shape)
+
+
+def _points(length_m: float, rng: np.random.Generator) -> Array:
+    """Return map points (N, 3) on floor and walls, in the order in which they come into sight."""
+    count = round(length_m * DRIVE.points_per_m)
+    x = np.sort(rng.uniform(0.0, length_m, count))
+    on_floor = rng.random(count) < 0.5
+    side = np.where(rng.random(count) < 0.5, DRIVE.half_width_m, -DRIVE.half_width_m)
+    y = np.where(on_floor, rng.uniform(-DRIVE.half_width_m, DRIVE.half_width_m, count), side)
+    z = np.where(on_floor, 0.0, rng.uniform(0.05, 1.5, count))
+    noise = rng.normal(scale=DRIVE.point_noise_m, size=(count, 2))
+    return np.stack([x, y + noise[:, 0], z + noise[:, 1]], axis=1)
+
+
+def _corrections() -> Array:
+    """Return the two ways in which the map lies in turns, (2, 4, 4)."""
+    c, s = np.cos(DRIVE.correction_rad), np.sin(DRIVE.correction_rad)
+    turn = make_transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    return np.stack([np.eye(4), turn])
+
+
+class CorridorImages:
+    """Stereo frames of a drive straight ahead between two walls, floor, ceiling and end walls."""
+
+    def __init__(self, frames: int, seed: int) -> None:
+        self.frames = frames
+        self._rng = np.random.default_rng(seed)
+        self._texture = _texture(self._rng)
+        low = np.array([-DRIVE.spare_m, -DRIVE.half_width_m, 0.0], np.float32)
+        high = np.array(
+            [frames * DRIVE.step_m + DRIVE.spare_m, DRIVE.half_width_m, DRIVE.ceiling_m], np.float32
+        )
+        # Of the six faces, two across each axis.
+        self._shifts = self._rng.uniform(0, DRIVE.texels, (2 * len(low), 2))
+        # The base drives along x without turning, so the rays and the side they go to stay.
+        v, u = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
+        uv = np.stack([u.ravel(), v.ravel()], axis=1)
+        rays = CAMERA.back_project(uv, np.ones(len(uv))) @ MOUNT.T_base_left[:3, :3].T
+        self._rays = rays.T.astype(np.float32)
+        self._ends = np.where(self._rays > 0, high[:, None], low[:, None])
+
+    def drive(self) -> Iterator[StereoFrame]:
+        """Yield the frames in order."""
+        to_right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
+        for index in range(self.frames):
+            T_world_left = MOUNT.T_base_left.copy()
+            T_world_left[0, 3] += index * DRIVE.step_m
+            left = self._view(T_world_left[:3, 3])
+            right = self._view((T_world_left @ to_right)[:3, 3])
+            yield StereoFrame(index, (index + 1) * DRIVE.frame_period_ns, left, right)
+
+    def _view(self, origin: Array) -> NDArray[np.uint8]:
+        """Return the grey image (H, W) uint8 seen from a point."""
+        start = origin.astype(np.float32)[:, None]
+        with np.errstate(divide='ignore'):
+            to_faces = (self._ends - start) / self._rays
+        nearest = to_faces.min(axis=0)
+        x, y, z = start + self._rays * nearest
+        axis = to_faces.argmin(axis=0)
+        beyond = np.take_along_axis(self._rays, axis[None], axis=0)[0] > 0
+        shifts = (self._shifts / DRIVE.texels_per_m).astype(np.float32)[2 * axis + beyond]
+        # A face across x shows y and z, one across y shows x and z, one across z x and y.
+        first, second = np.where(axis == 0, y, x), np.where(axis == 2, y, z)
+        shape = (CAMERA.height, CAMERA.width)
+        image = cv2.remap(
+            self._texture,
+            ((first + shifts[:, 0]) * DRIVE.texels_per_m).reshape(shape),
+            ((second + shifts[:, 1]) * DRIVE.texels_per_m).reshape(shape),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        )
+        image += DRIVE.noise_grey * self._rng.standard_normal(shape, np.float32)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _texture(rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return grey values of fine and coarse blots, the same at opposite edges."""
+    layers = []
+    for deviation in (2.0, 8.0):
+        noise = np.pad(rng.normal(size=(DRIVE.texels, DRIVE.texels)), 64, mode='wrap')
+        layer = cv2.GaussianBlur(noise, (0, 0), deviation)[64:-64, 64:-64]
+        layers.append(layer / layer.std())
+    return (DRIVE.grey + DRIVE.contrast * (layers[0] + layers[1])).astype(np.float32)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segfloor_ros.cloud.labelled_cloud import LabelledPoints, read_ply, write_ply
+from segfloor_ros.cloud import LabelledPoints, read_ply, write_ply
 from segfloor_ros.errors import InputError
 
 POINTS = LabelledPoints(

@@ -10,11 +10,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from segfloor_ros.benchmark.corridor import CAMERA, MOUNT, Corridor, CorridorImages, floor_mask
-from segfloor_ros.benchmark.stages import (
+from segfloor_ros.benchmark import (
+    CAMERA,
+    MOUNT,
     BenchmarkPlan,
+    Corridor,
+    CorridorImages,
     MeasuredStages,
     UpdateTimes,
+    floor_mask,
     measure_map,
     run_apart,
 )

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from segfloor_ros.cloud.labelled_cloud import (
+from segfloor_ros.cloud import (
     FLOOR,
     OBSTACLE,
     UNKNOWN,

@@ -1,1 +1,0 @@
-"""What the stages cost here: `segfloor benchmark`, on generated data."""

@@ -1,1 +1,0 @@
-"""The labelled sparse cloud: which SLAM points are floor and which are obstacles."""
