@@ -1,5 +1,5 @@
-"""Stereo pairs, and what a robot measures besides, as a rosbag2 (mcap), by `rosbags`, without a ROS
-install.
+"""Stereo pairs, and what a robot measures besides, as a rosbag2 (mcap): by `rosbags`, without a ROS
+install, or by the writer that a ROS install has.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -99,6 +99,81 @@ def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
     return take
 
 
+class BagLibrary(Protocol):
+    """A library that writes a rosbag2 folder of one mcap file. types: message classes by name."""
+
+    types: Mapping[str, Any]
+
+    def knows(self, kind: str) -> bool:
+        """Whether messages of a type can be written."""
+
+    def sequence(self, values: NDArray[Any]) -> Any:
+        """Return an array (N,) as the message classes take it for a sequence."""
+
+    def serialize(self, message: Any, kind: str) -> bytes | memoryview:
+        """Return a message of a type in CDR."""
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message in CDR."""
+
+    def close(self, is_whole: bool) -> None:
+        """Complete the bag, or give it up."""
+
+
+OpenLibrary = Callable[[Path, bool], BagLibrary]
+"""Opens a folder that is not there yet; whether its chunks are compressed."""
+
+_ros_library: OpenLibrary | None = None
+
+
+def write_rosbag2_with(open_library: OpenLibrary | None) -> None:
+    """Have bags written by another library from now on; None: by rosbags again."""
+    global _ros_library
+    _ros_library = open_library
+
+
+class Rosbags:
+    """Writes by `rosbags`. Raises ImportError where that is not installed."""
+
+    def __init__(self, folder: Path, compressed: bool) -> None:
+        from rosbags import rosbag2
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self.types: Mapping[str, Any] = self._store.types
+        self._connections: dict[str, Any] = {}
+        self._writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        if compressed:
+            self._writer.set_compression(
+                rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
+            )
+        self._writer.open()
+
+    def knows(self, kind: str) -> bool:
+        """Whether it is a type of ROS 2 Jazzy."""
+        return kind in self.types
+
+    def sequence(self, values: NDArray[Any]) -> Any:
+        """Return the array itself."""
+        return values
+
+    def serialize(self, message: Any, kind: str) -> bytes | memoryview:
+        """Return a message of a type in CDR."""
+        return self._store.serialize_cdr(message, kind)
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message in CDR."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._store
+            )
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def close(self, is_whole: bool) -> None:
+        """Complete the bag, or give it up."""
+        (self._writer.close if is_whole else self._writer.abort)()
+
+
 class NewBag:
     """A new bag of serialised messages: one file where its name ends in `.mcap`, else a rosbag2
     folder. compressed: in zstd chunks. bytes: of the messages so far.
@@ -111,59 +186,48 @@ class NewBag:
         self._out = out
         self._compressed = compressed
         self._stack = ExitStack()
-        self._connections: dict[str, Any] = {}
+        self._topics: set[str] = set()
         self.bytes = 0
 
     def __enter__(self) -> NewBag:
         if os.path.lexists(self._out):
             raise InputError(f'{self._out}: exists already; remove it or choose another name')
-        try:
-            from rosbags import rosbag2
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise InputError(f'{self._out}: {MISSING_LIBRARY}') from None
         with os_errors(f'{self._out}: cannot be written'):
             self._out.parent.mkdir(parents=True, exist_ok=True)
             self._staging = self._stack.enter_context(scratch_folder(self._out.parent))
-        self.typestore = get_typestore(Stores.ROS2_JAZZY)
-        self._writer = rosbag2.Writer(
-            self._staging / self._out.stem, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
-        )
-        if self._compressed:
-            self._writer.set_compression(
-                rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
+        try:
+            self.library = (_ros_library or Rosbags)(
+                self._staging / self._out.stem, self._compressed
             )
-        self._writer.open()
+        except ImportError:
+            self._stack.close()
+            raise InputError(f'{self._out}: {MISSING_LIBRARY}') from None
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         try:
+            self.library.close(is_whole=kind is None)
             if kind is not None:
-                self._writer.abort()
                 return
-            self._writer.close()
             bag = self._staging / self._out.stem
             if self._out.suffix == '.mcap':
-                bag = bag / f'{self._out.stem}.mcap'
+                (bag,) = bag.glob('*.mcap')
             bag.rename(self._out)
         finally:
             self._stack.close()
 
     def knows(self, kind: str) -> bool:
-        """Whether messages of a type can be written: those of ROS 2 Jazzy."""
-        return kind in self.typestore.types
+        """Whether messages of a type can be written."""
+        return self.library.knows(kind)
 
     def has(self, topic: str) -> bool:
         """Whether a message of a topic was written."""
-        return topic in self._connections
+        return topic in self._topics
 
     def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
         """Append a message of a type, in CDR, recorded at stamp_ns."""
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self.typestore
-            )
-        self._writer.write(self._connections[topic], stamp_ns, data)
+        self._topics.add(topic)
+        self.library.write(topic, kind, stamp_ns, data)
         self.bytes += len(data)
 
     def is_disk_full(self, elapsed_s: float) -> bool:
@@ -191,7 +255,7 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         self.file.__enter__()
-        self.messages = BagMessages(self.file.typestore.types)
+        self.messages = BagMessages(self.file.library.types)
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -244,8 +308,7 @@ class BagWriter:
 
     def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
         """Append a message of a type to a topic, recorded at stamp_ns."""
-        data = self.file.typestore.serialize_cdr(message, kind)
-        self.file.write(topic, kind, stamp_ns, data)
+        self.file.write(topic, kind, stamp_ns, self.file.library.serialize(message, kind))
 
     def _image_topic(self, side: str) -> str:
         image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
@@ -265,7 +328,7 @@ class BagWriter:
             encoding=encoding,
             is_bigendian=0,
             step=width * pixels.itemsize,
-            data=pixels.ravel().view(np.uint8),
+            data=self.file.library.sequence(pixels.ravel().view(np.uint8)),
         )
 
     def _picture_message(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Any:
@@ -275,16 +338,19 @@ class BagWriter:
         _, data = cv2.imencode(suffix, np.ascontiguousarray(image), options)
         words = f'mono8; {self._coding.value} compressed mono8'
         header = self.messages.header(stamp_ns, frame_id)
-        return self.messages.types[COMPRESSED](header=header, format=words, data=data.ravel())
+        data = self.file.library.sequence(data.ravel())
+        return self.messages.types[COMPRESSED](header=header, format=words, data=data)
 
     def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
-        whole_image = self.messages.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
+        whole_image = self.messages.types['sensor_msgs/msg/RegionOfInterest'](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
         return self.messages.types[CAMERA_INFO](
             header=header,
             height=eye.height,
             width=eye.width,
             distortion_model=eye.distortion_model,
-            d=eye.D,
+            d=self.file.library.sequence(eye.D),
             k=eye.K.ravel(),
             r=eye.R.ravel(),
             p=eye.P.ravel(),
@@ -302,7 +368,7 @@ class BagMessages:
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
         """Return a std_msgs/Header."""
-        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
         stamp = self.types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
         return self.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
 
@@ -310,15 +376,18 @@ class BagMessages:
         """Return the pose (4, 4) of `base_link` as nav_msgs/Odometry."""
         types, no_covariance = self.types, np.zeros(36)
         pose = types['geometry_msgs/msg/Pose'](
-            types['geometry_msgs/msg/Point'](*(float(v) for v in T_frame_base[:3, 3])),
-            self._quaternion(quaternion_xyzw(T_frame_base[:3, :3])),
+            position=self._filled('Point', T_frame_base[:3, 3]),
+            orientation=self._filled('Quaternion', quaternion_xyzw(T_frame_base[:3, :3])),
         )
-        twist = types['geometry_msgs/msg/Twist'](*(self._vector(np.zeros(3)) for _ in range(2)))
+        still = self._filled('Vector3', np.zeros(3))
+        twist = types['geometry_msgs/msg/Twist'](linear=still, angular=still)
         return types[ODOMETRY](
             header=self.header(stamp_ns, frame_id),
             child_frame_id='base_link',
-            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose, no_covariance),
-            twist=types['geometry_msgs/msg/TwistWithCovariance'](twist, no_covariance),
+            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=no_covariance),
+            twist=types['geometry_msgs/msg/TwistWithCovariance'](
+                twist=twist, covariance=no_covariance
+            ),
         )
 
     def imu(self, sample: ImuSample, frame_id: str, R_frame_left: Array) -> Any:
@@ -326,24 +395,26 @@ class BagMessages:
         no_covariance = np.zeros(9)
         return self.types[IMU](
             header=self.header(sample.stamp_ns, frame_id),
-            orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
+            orientation=self._filled('Quaternion', np.array([0.0, 0.0, 0.0, 1.0])),
             orientation_covariance=np.array([NOT_MEASURED, *[0.0] * 8]),
-            angular_velocity=self._vector(R_frame_left @ sample.gyro_rad_s),
+            angular_velocity=self._filled('Vector3', R_frame_left @ sample.gyro_rad_s),
             angular_velocity_covariance=no_covariance,
-            linear_acceleration=self._vector(R_frame_left @ sample.accel_m_s2),
+            linear_acceleration=self._filled('Vector3', R_frame_left @ sample.accel_m_s2),
             linear_acceleration_covariance=no_covariance,
         )
 
     def transform(self, frame_id: str, child: str, T_frame_child: Array) -> Any:
         """Return a fixed transform (4, 4) as tf2_msgs/TFMessage."""
-        turn = self._quaternion(quaternion_xyzw(T_frame_child[:3, :3]))
-        types, shift = self.types, self._vector(T_frame_child[:3, 3])
-        transform = types['geometry_msgs/msg/Transform'](shift, turn)
-        stamped = types['geometry_msgs/msg/TransformStamped']
-        return types[TF]([stamped(self.header(0, frame_id), child, transform)])
+        transform = self.types['geometry_msgs/msg/Transform'](
+            translation=self._filled('Vector3', T_frame_child[:3, 3]),
+            rotation=self._filled('Quaternion', quaternion_xyzw(T_frame_child[:3, :3])),
+        )
+        stamped = self.types['geometry_msgs/msg/TransformStamped'](
+            header=self.header(0, frame_id), child_frame_id=child, transform=transform
+        )
+        return self.types[TF](transforms=[stamped])
 
-    def _vector(self, values: Array) -> Any:
-        return self.types['geometry_msgs/msg/Vector3'](*(float(v) for v in values))
-
-    def _quaternion(self, xyzw: Array) -> Any:
-        return self.types['geometry_msgs/msg/Quaternion'](*(float(v) for v in xyzw))
+    def _filled(self, kind: str, xyzw: Array) -> Any:
+        """Return a type of geometry_msgs with fields x, y, z and, of four values, w."""
+        fields = {name: float(value) for name, value in zip('xyzw', xyzw, strict=False)}
+        return self.types[f'geometry_msgs/msg/{kind}'](**fields)

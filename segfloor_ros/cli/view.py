@@ -161,11 +161,11 @@ class View:
 
     def paced(self, what: str, show: Callable[[], None]) -> None:
         """Show something, unless the last of its kind took too long for that."""
-        if time.perf_counter() >= self._next_s.get(what, 0.0):
-            start_s = time.thread_time()
+        start_s = time.perf_counter()
+        if start_s >= self._next_s.get(what, 0.0):
             show()
-            pause_s = (time.thread_time() - start_s) / SHARE
-            self._next_s[what] = time.perf_counter() + pause_s
+            end_s = time.perf_counter()
+            self._next_s[what] = end_s + (end_s - start_s) / SHARE
 
     def image(self, stamp_ns: int, left: NDArray[np.uint8]) -> None:
         """Show the rectified left image (H, W) of a frame."""

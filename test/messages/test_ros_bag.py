@@ -1,4 +1,4 @@
-"""Bags read by rosbag2_py against the same bags read by rosbags."""
+"""Bags read and written by rosbag2_py against the same bags by rosbags."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.camera.bag_writer import (
+    BagWriter,
+    ImageCoding,
+    NewBag,
+    convert,
+    write_rosbag2_with,
+)
+from segfloor_ros.camera.model import ImuSample, StereoCameraSettings, WheelPose
 from segfloor_ros.camera.sources import bag_file, open_source
 from segfloor_ros.camera.sources.bag_file import read_rosbag2_with
 from segfloor_ros.errors import InputError
-from segfloor_ros.messages.ros_bag import use_rosbag2_py
+from segfloor_ros.geometry import make_transform
+from segfloor_ros.messages.ros_bag import Rosbag2Writer, use_rosbag2_py
 
 DEMO = Path(bag_file.__file__).parents[2] / 'simulation' / 'demo' / 'drive.mcap'
 
@@ -25,6 +35,7 @@ def rosbag2_py(monkeypatch):
         monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / 'ros_stand_in'))
     yield
     read_rosbag2_with(None)
+    write_rosbag2_with(None)
     sys.modules.pop('rosbag2_py', None)
 
 
@@ -65,3 +76,50 @@ def test_without_rosbags_rosbag2_py_is_enough_and_without_both_there_is_one_line
     with pytest.raises(InputError, match='pip install rosbags') as error:
         pairs(DEMO, 1)
     assert '\n' not in str(error.value)
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    """Return the messages of a bag in CDR; what fills gaps in it is zero."""
+    with AnyReader([path]) as reader:
+        serialize = reader.typestore.serialize_cdr
+        return [
+            (c.topic, stamp, bytes(serialize(reader.deserialize(data, c.msgtype), c.msgtype)))
+            for c, stamp, data in reader.messages()
+        ]
+
+
+@pytest.mark.parametrize('coding', ImageCoding)
+def test_a_bag_is_written_the_same_by_both(rosbag2_py, tmp_path, coding) -> None:
+    settings = StereoCameraSettings(input=str(DEMO), frames=3)
+    convert(open_source(settings), tmp_path / 'expected.mcap', coding)
+    use_rosbag2_py()
+    assert convert(open_source(settings), tmp_path / 'found.mcap', coding) == 3
+    assert sys.modules['rosbag2_py'].SequentialWriter.opened == 1
+    assert messages(tmp_path / 'found.mcap') == messages(tmp_path / 'expected.mcap')
+    assert {path.name for path in tmp_path.iterdir()} == {'expected.mcap', 'found.mcap'}
+
+
+def test_wheels_imu_and_tf_are_written_the_same_by_both(rosbag2_py, tmp_path) -> None:
+    source, _ = pairs(DEMO, 1)
+    turn = make_transform(Rotation.from_euler('z', 0.3).as_matrix(), np.array([1.0, 2.0, 0.5]))
+    measured = [
+        WheelPose(1_000_000_007, turn),
+        ImuSample(1_000_000_009, np.array([0.1, 0.2, 0.3]), np.array([0.0, -9.8, 0.1]),
+                  np.array([0.02, 0.0, 0.01])),
+    ]  # fmt: skip
+    for name, library in (('expected', None), ('found', Rosbag2Writer)):
+        write_rosbag2_with(library)
+        with BagWriter(tmp_path / f'{name}.mcap', source.calibration) as bag:
+            for measurement in measured:
+                bag.write_measurement(measurement)
+    found = messages(tmp_path / 'found.mcap')
+    assert {topic for topic, *_ in found} == {'/wheel_odometry', '/imu', '/tf_static'}
+    assert found == messages(tmp_path / 'expected.mcap')
+
+
+def test_after_an_error_rosbag2_py_leaves_nothing(rosbag2_py, tmp_path) -> None:
+    use_rosbag2_py()
+    with pytest.raises(KeyboardInterrupt), NewBag(tmp_path / 'drive.mcap') as bag:
+        bag.write('/imu', 'sensor_msgs/msg/Imu', 1, b'\0\1\0\0' + 8 * b'\0')
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""As much of rosbag2_py as reads bags, by rosbags: pip has no rosbag2_py."""
+"""As much of rosbag2_py as reads and writes bags, by rosbags: pip has no rosbag2_py."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 class StorageOptions:
     uri: str
     storage_id: str = ''
+    storage_preset_profile: str = ''
 
 
 @dataclass
@@ -62,3 +63,43 @@ class SequentialReader:
         connection, stamp_ns, data = self._next
         self._next = next(self._messages, None)
         return connection.topic, bytes(data), stamp_ns
+
+
+@dataclass
+class TopicMetadata:
+    id: int
+    name: str
+    type: str
+    serialization_format: str
+
+
+class SequentialWriter:
+    opened = 0
+
+    def open(self, storage: StorageOptions, converter: ConverterOptions) -> None:
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+        assert storage.storage_id == 'mcap'
+        assert converter == ConverterOptions('cdr', 'cdr')
+        SequentialWriter.opened += 1
+        self._writer = Writer(Path(storage.uri), version=9, storage_plugin=StoragePlugin.MCAP)
+        if storage.storage_preset_profile:
+            assert storage.storage_preset_profile == 'zstd_fast'
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+
+    def create_topic(self, topic: TopicMetadata) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        assert topic.serialization_format == 'cdr'
+        self._connections[topic.name] = self._writer.add_connection(
+            topic.name, topic.type, typestore=get_typestore(Stores.ROS2_JAZZY)
+        )
+
+    def write(self, topic: str, data: bytes, stamp_ns: int) -> None:
+        assert isinstance(data, bytes)
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def __del__(self) -> None:
+        self._writer.close()

@@ -11,7 +11,7 @@ from stereo_drive import room_drive, write_kitti
 from segfloor_ros.errors import InputError
 from tools import figures
 from tools.moving_picture import moving_picture
-from tools.symptoms import scale_baseline
+from tools.symptoms import delay, scale_calibration
 
 
 def test_the_picture_shows_the_floor_that_was_found_and_a_map_that_grows(tmp_path) -> None:
@@ -80,10 +80,15 @@ def test_a_page_gets_the_figures_between_its_marks(tmp_path, monkeypatch) -> Non
     assert figures.written(once) == once
 
 
-def test_a_baseline_is_scaled_once(tmp_path) -> None:
-    calibration = tmp_path / 'calib.txt'
-    calibration.write_text('P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP1: 1 0 0 -40 0 1 0 0 0 0 1 0\n')
+def test_the_faults_of_the_symptoms_are_put_in_once(tmp_path) -> None:
+    calibration, poses = tmp_path / 'calib.txt', tmp_path / 'wheel_odometry.txt'
+    calibration.write_text('P0: 8 0 3 0 0 8 2 0 0 0 1 0\nP1: 8 0 3 -40 0 8 2 0 0 0 1 0\n')
+    poses.write_text('# t x y z qx qy qz qw\n0.5 1 2 3 0 0 0 1\n')
     for _ in range(2):
-        scale_baseline(calibration, 1.5)
+        scale_calibration(calibration, 1.5, 0.5)
         rows = [line.split() for line in calibration.read_text().splitlines()]
-        assert (float(rows[0][4]), float(rows[1][4])) == (0.0, -60.0)
+        for name, row, shift in zip(('P0:', 'P1:'), rows, (0, -30), strict=True):
+            assert row[0] == name
+            assert [float(word) for word in row[1:]] == [4, 0, 3, shift, 0, 4, 2, 0, 0, 0, 1, 0]
+        delay(poses, 0.25)
+        assert [float(word) for word in poses.read_text().split()] == [0.75, 1, 2, 3, 0, 0, 0, 1]
