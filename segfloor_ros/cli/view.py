@@ -298,7 +298,8 @@ class View:
         rows += [(stage, f'{times["p50_ms"]:.1f} ms, median') for stage, times in stages]
         self.about(folder.name, rows)
         self.state(first_ns, f'{summary["tracked_frames"]} of {summary["frames"]} frames tracked')
-        self._loops_ns = [round(1e9 * at_s) for at_s in summary.get('loop_times_s', [])]
+        for count, at_s in enumerate(summary.get('loop_times_s', []), 1):
+            self.loops(round(1e9 * at_s), count)
         self.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
         self.cloud(first_ns, read_ply(folder / 'labelled_cloud.ply'))
         if (folder / MAP).is_file():
