@@ -45,6 +45,9 @@ CHANNELS = {
 """Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
 
 
+SUBPIXEL = 16
+"""OpenCV's semi-global disparities are in 1/16 px, and their number is a multiple of as many."""
+
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
 _STEP_PX = 2

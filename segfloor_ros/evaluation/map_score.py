@@ -42,9 +42,8 @@ COLOURS = {
 }
 """Blue, green, red of each class in the picture."""
 
-WANTED_SIDE_PX = 1000
-
-LEGEND_ROW_PX = 26
+WANTED_SIDE_PX, LEGEND_ROW_PX = 1000, 26
+"""Of the picture, and of each line of its legend."""
 
 
 @dataclass(frozen=True)

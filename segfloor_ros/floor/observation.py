@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.settings import RobotSettings, setting
 
-FLOOR = 255
-NO_EVIDENCE = 127
-NOT_FLOOR = 0
-MOVING = 64
-"""In what a network says of the floor: neither floor nor in the way."""
+FLOOR, NO_EVIDENCE, MOVING, NOT_FLOOR = 255, 127, 64, 0
+"""Pixels of a mask. What moves is in what a network says alone: neither floor nor in the way."""
+
 RANGE_MAX_ERROR_M = 0.3
 SAME_SURFACE_SHARE = 0.06
 """Ranges, or disparities, that differ by more than this share are those of two surfaces."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
 
-from segfloor_ros.camera.images import shrunk
+from segfloor_ros.camera.images import SUBPIXEL, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     COARSE_BLOCK_PX,
@@ -22,7 +22,6 @@ from segfloor_ros.floor.disparity.matching import (
     NOISE_PX,
     RUN_UP_ROWS,
     SPECKLE_PX,
-    STEP,
     DisparityMatcher,
 )
 from segfloor_ros.floor.mask.pixel_evidence import texture_grey
@@ -273,7 +272,7 @@ class OverheadMatcher:
     ) -> None:
         self._camera, self._settings = camera, settings
         nearest_px = min(num_disparities, camera.disparity_times_depth / _SEEN_BEFORE_M)
-        searched = math.ceil(nearest_px / (_SCALE * STEP)) * STEP
+        searched = math.ceil(nearest_px / (_SCALE * SUBPIXEL)) * SUBPIXEL
         self._matcher = DisparityMatcher(searched, COARSE_BLOCK_PX, SPECKLE_PX // _SCALE**2)
 
     def positions(

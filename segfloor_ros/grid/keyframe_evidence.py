@@ -44,8 +44,8 @@ LENGTHS = {'fan_m': 'fan_count', 'thickness_m': 'thickness_count', 'positions_m'
 """The arrays of a keyframe, and what holds their lengths."""
 
 SUBPIXEL_BITS = 4
-_SLANT_STEPS = 3
-_MAX_SLANT = 4.0
+_SLANT_STEPS, _MAX_SLANT = 3, 4.0
+"""Bearings over which the slant of a face is measured, and the largest that counts."""
 
 
 @dataclass(frozen=True)

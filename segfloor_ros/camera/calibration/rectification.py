@@ -25,8 +25,8 @@ _BLOCK_PX = 8
 _QUIET_GREY = 3
 _SIGNIFICANT_GREY = 8
 """Larger steps are edges of things, wherever they are."""
-_MIN_RATIO = 1.5
-_MIN_PIXELS = 200
+_MIN_RATIO, _MIN_PIXELS = 1.5, 200
+"""A grid is where steps across it are so many times as large, over so many pixels."""
 _MAX_STEP_GREY = 16.0
 """Larger steps at the grid are left alone, too."""
 

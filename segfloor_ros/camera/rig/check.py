@@ -35,8 +35,7 @@ from segfloor_ros.camera.rig.estimates import (
 )
 from segfloor_ros.geometry import Array
 
-EVERY = 10
-RECENT = 5
+EVERY, RECENT = 10, 5
 """Every tenth frame is looked at, and five looks are judged together: what is seen in 50 frames."""
 
 SETTLED_FRAMES = EVERY * RECENT

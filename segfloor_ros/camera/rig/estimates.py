@@ -29,9 +29,7 @@ from segfloor_ros.geometry import Array, se3_exp, skew, transform_points
 WIDTH_PX = 320
 """Images are shrunk to about this width."""
 
-REACH_PX = 16
-SCALES = (0.92, 0.96, 1.0, 1.04, 1.08)
-LAGS = (-2.0, -1.0, 0.0, 1.0, 2.0)
+REACH_PX, SCALES, LAGS = 16, (0.92, 0.96, 1.0, 1.04, 1.08), (-2.0, -1.0, 0.0, 1.0, 2.0)
 """What is tried: shifts of shrunk pixels, sizes, and lags in frames."""
 
 BESIDE_PX = 2

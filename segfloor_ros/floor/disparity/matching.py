@@ -14,11 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import is_disparity, seen_from_right
+from segfloor_ros.camera.images import SUBPIXEL, is_disparity, seen_from_right
 from segfloor_ros.camera.model import Mount, StereoCamera
 
-SUBPIXEL = 16
-"""Steps per pixel of the matcher's fixed-point disparities."""
 NOISE_PX = 0.5
 """Error of a disparity, one sigma."""
 MEAN_NOISE = 0.35
@@ -36,10 +34,7 @@ _SMALL_STEP, _LARGE_STEP = 8, 32
 _UNIQUENESS_PERCENT = 5
 """How much better than the second the best match must be."""
 
-STEP = 16
-"""Numbers of disparities are multiples of this."""
-_SAME_GAIN = 0.08
-_SAME_MEAN_GREY = 8.0
+_SAME_GAIN, _SAME_MEAN_GREY = 0.08, 8.0
 """Within this the two cameras are exposed alike; what they see differs anyway."""
 COARSE_BLOCK_PX = 3
 COARSE_ABOVE_PX = 28.0
@@ -66,8 +61,9 @@ def disparity_range(camera: StereoCamera, mount: Mount | None, share: float = 1.
         u = (np.array([0.0, camera.width - 1.0]) - camera.cx) / camera.fx
         inverse_depth = -(up[0] * u + up[1] * v + up[2]) / mount.height_m
         wanted = float(inverse_depth.max()) * camera.disparity_times_depth * share
-    most = camera.width // 2 // STEP * STEP
-    return int(np.clip(math.ceil(wanted / STEP) * STEP, 2 * STEP, max(2 * STEP, most)))
+    most = camera.width // 2 // SUBPIXEL * SUBPIXEL
+    least = 2 * SUBPIXEL
+    return int(np.clip(math.ceil(wanted / SUBPIXEL) * SUBPIXEL, least, max(least, most)))
 
 
 def equal_exposure(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -166,11 +162,11 @@ class TwoScaleMatcher:
     """
 
     def __init__(self, num_disparities: int, coarse_above_px: float = COARSE_ABOVE_PX) -> None:
-        fine = math.ceil((coarse_above_px + _OVERLAP_PX) / STEP) * STEP
+        fine = math.ceil((coarse_above_px + _OVERLAP_PX) / SUBPIXEL) * SUBPIXEL
         self._coarse: DisparityMatcher | None = None
         self.num_disparities = num_disparities
-        if fine + STEP < num_disparities:
-            halved = -(-num_disparities // (2 * STEP)) * STEP
+        if fine + SUBPIXEL < num_disparities:
+            halved = -(-num_disparities // (2 * SUBPIXEL)) * SUBPIXEL
             self._coarse = DisparityMatcher(halved, COARSE_BLOCK_PX, SPECKLE_PX // 4)
             self.num_disparities = 2 * self._coarse.num_disparities
         else:

@@ -20,8 +20,7 @@ from segfloor_ros.geometry import Array
 SEGMENTS = 5
 _CONTROLS = SEGMENTS + 3
 BINS_PER_PX = 2
-PITCH_SIGMA_RAD = 0.006
-HEIGHT_SIGMA = 0.01
+PITCH_SIGMA_RAD, HEIGHT_SIGMA = 0.006, 0.01
 """How far pitch and height, as a share of it, may swing about the mount, one sigma."""
 _SCALE_PX = 0.6
 """Scale of the M-estimator."""

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.images import SUBPIXEL
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.matching import SAME_PX, SUBPIXEL
+from segfloor_ros.floor.disparity.matching import SAME_PX
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.observation import VDisparity
 
@@ -24,8 +25,8 @@ _WIDE_PX = 480
 
 STEP_PX = 2
 """Every so many pixels of the image, in rows and columns, are compared, and filled, alike."""
-_NEAR_M = 0.05
-_FAR_M = 1000.0
+_NEAR_M, _FAR_M = 0.05, 1000.0
+"""Depths are between these."""
 
 _OBSTACLE_M = 0.2
 """An upright surface of this height is taken out before the profile is fitted."""

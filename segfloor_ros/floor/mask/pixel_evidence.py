@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import measured_sigma_px
-from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SIGMAS, SUBPIXEL
+from segfloor_ros.camera.images import SUBPIXEL, measured_sigma_px
+from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SIGMAS
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.disparity.view import STEP_PX, FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
@@ -48,15 +48,13 @@ _SHRINK = 4
 _STEP_GREY = 1.0
 """Grey levels are whole: no surface is known better."""
 
-_WIDE_WINDOW = 15
-"""What too little texture leaves open in a small window a larger one often tells."""
 _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
 _LIKENESS_GREY = 3.0
 """How much left and right may differ on the floor, beyond their noise."""
-_WIDE_RATIO = 1.15
-_WIDE_MARGIN_GREY = 0.05
-_WIDE_SHARE = 0.65
+_WIDE_WINDOW, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = 15, 1.15, 0.05, 0.65
+"""What too little texture leaves open in a small window a larger one often tells: floor is denied
+there where it differs by this much more than what was matched, over so much of the window."""
 _MARGIN_PX = 4.0
 """So near to the right image's border interpolation is unsure."""
 _NOISE_SHARE = 2.0

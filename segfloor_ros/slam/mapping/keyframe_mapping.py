@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.images import SUBPIXEL
 from segfloor_ros.camera.model import StereoFrame, Up
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, BundleResult, adjust, gather
@@ -47,9 +48,6 @@ MAX_DISPARITY_SHARE = 0.5
 """Largest disparity, as a share of the image's width."""
 
 MIN_TEXTURE = 5
-STEP = 16
-"""OpenCV's disparities are in 1/16 px, and their number is a multiple of 16."""
-
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
 """Levels of the pyramid between two views of what may be one point, and points tried for each."""
 
@@ -248,7 +246,7 @@ def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Ar
     """
     factor = max(1, round(left.shape[1] / SMALL_WIDTH_PX))
     size = (left.shape[1] // factor, left.shape[0] // factor)
-    count = -(-round(MAX_DISPARITY_SHARE * size[0]) // STEP) * STEP
+    count = -(-round(MAX_DISPARITY_SHARE * size[0]) // SUBPIXEL) * SUBPIXEL
     matcher = cv2.StereoBM_create(count, SIDE_PX)
     matcher.setTextureThreshold(MIN_TEXTURE)
     matcher.setUniquenessRatio(0)
@@ -258,7 +256,7 @@ def guess_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], uv_px: Ar
     disparity = matcher.compute(*wide)[:, count:]
     column, row = ((uv_px.T + 0.5) / factor).astype(np.intp)
     at = disparity[np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)]
-    return np.where(at > 0, at * (factor / STEP), np.nan)
+    return np.where(at > 0, at * (factor / SUBPIXEL), np.nan)
 
 
 def fuse_duplicates(sparse_map: SparseMap, keyframe: KeyframeRecord) -> int:

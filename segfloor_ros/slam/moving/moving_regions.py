@@ -46,8 +46,7 @@ P1, P2 = 100, 400
 
 SPECKLE_PX = 40
 MAX_PARALLAX_RAD = float(np.radians(30.0))
-COMPARED_VIEWS = 5
-KEPT_VIEWS = 30
+COMPARED_VIEWS, KEPT_VIEWS = 5, 30
 SHIN_M, FOOT_M = 0.3, 0.2
 """Below what moves at less than the first height is a foot, up to the second in each direction."""
 

@@ -26,8 +26,7 @@ OVERSAMPLING = 4
 CELL_SIZE_PX = 16
 """Side of the image cells over which features are spread: about as many cells as features."""
 
-PYRAMID_LEVELS = 8
-PYRAMID_SCALE = 1.2
+PYRAMID_LEVELS, PYRAMID_SCALE = 8, 1.2
 """The pyramid of ORB as published: sizes up to 3.6 times as large are recognised."""
 
 MAX_HAMMING = 80

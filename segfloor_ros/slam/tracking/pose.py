@@ -35,8 +35,9 @@ from segfloor_ros.slam.rig import (
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.patch_alignment import LEAST_SHIFT, _shift_information
 
-ROUNDS = 3
-STEPS_PER_ROUND = 6
+ROUNDS, STEPS_PER_ROUND = 3, 6
+"""Of an estimate; outliers are looked for anew in each round."""
+
 CONVERGED = 1e-4
 """Relative decrease of the cost, expected or seen, that ends a round."""
 
