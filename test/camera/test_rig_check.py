@@ -38,7 +38,7 @@ def turning() -> list[StereoFrame]:
 def faults(frames: list[StereoFrame], camera: StereoCamera = CAMERA) -> dict[str, InputFault]:
     check = RigCheck(camera)
     for frame in frames:
-        check.see(frame)
+        check.watch(frame)
     return check.faults
 
 
@@ -191,3 +191,28 @@ def test_a_lag_is_said_of_five_looks_and_of_no_fewer(frames) -> None:
     lagging = late(frames, 1.0)
     assert 'not_simultaneous' not in faults(lagging[:40])
     assert set(faults(lagging[:41])) == {'not_simultaneous'}
+
+
+def to_and_fro(frames: list[StereoFrame], times: int) -> list[StereoFrame]:
+    """Drive a way forth and back, so many times."""
+    way = [*frames, *frames[::-1]] * times
+    return [replace(f, stamp_ns=round(1e9 * FRAME_S * i)) for i, f in enumerate(way)]
+
+
+def test_a_camera_that_is_knocked_on_its_way_is_noticed_by_a_few_looks(frames) -> None:
+    check = RigCheck(CAMERA)
+    for frame in to_and_fro(frames, 2):
+        check.watch(frame)
+    assert check.frames < 3 * SETTLED_FRAMES
+    assert check.faults == {}
+    knocked = [replace(f, right=np.roll(f.right, 3, axis=0)) for f in frames]
+    for frame in to_and_fro(knocked, 3):
+        check.watch(frame)
+    assert 'rows_apart' in check.faults
+
+
+def test_a_lag_shows_within_fifty_frames_of_motion_however_long_the_camera_stood(frames) -> None:
+    standing = [frames[0]] * 3 * SETTLED_FRAMES
+    drive = [*standing, *late(frames, 1.0)]
+    drive = [replace(f, stamp_ns=round(1e9 * FRAME_S * i)) for i, f in enumerate(drive)]
+    assert set(faults(drive)) == {'not_simultaneous'}

@@ -156,8 +156,21 @@ class RigCheck:
         self._before: tuple[NDArray[np.uint8], int] | None = None
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
         self._frame_s = 0.0
+        self._moving_looks = self._watched = 0
         self._depth = DepthCheck()
         self._focal = FocalCheck(camera)
+
+    def watch(self, frame: StereoFrame) -> None:
+        """Take in a frame of a drive: each one until nothing was found in motion, then one burst in
+        fifty frames.
+        """
+        self._watched += 1
+        is_settled = self._moving_looks >= RECENT and not self.faults
+        since_burst = self._watched % SETTLED_FRAMES
+        if is_settled and since_burst == 0:
+            self.jump()
+        if not is_settled or since_burst < BURST:
+            self.see(frame)
 
     def see(self, frame: StereoFrame) -> None:
         """Take in a frame that shows something."""
@@ -225,7 +238,10 @@ class RigCheck:
             before, stamp_ns = self._before
             self._frame_s = 1e-9 * (frame.stamp_ns - stamp_ns)
             before_px, found = follow(frame.left, before, left_px, left_px, levels=3)
-            seen[found, 4:6] = (left_px - before_px)[found] / self._frame_s
+            moved_px = (left_px - before_px)[found]
+            seen[found, 4:6] = moved_px / self._frame_s
+            is_moving = found.any() and np.median(np.hypot(*moved_px.T)) > ROWS_PX
+            self._moving_looks += int(is_moving)
         return seen
 
     def _match(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Matches:

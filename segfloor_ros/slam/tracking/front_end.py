@@ -138,10 +138,11 @@ class FrontEnd:
 
     def track(self, frame: StereoFrame, images: Images) -> Track | None:
         """Find the pose of a frame: from the one before, else by its features."""
-        predictions = self._predict_poses(frame, images)
-        track = self.follower.follow(images, self.local.point_ids, predictions[0])
+        self._rotation.see(images.left)
+        prediction = self.motion.predict(frame.stamp_ns)
+        track = self.follower.follow(images, self.local.point_ids, prediction)
         if track is None:
-            track = self._search(frame, images, predictions)
+            track = self._search(frame, images)
         if track is None or not self.is_believable(track, images, frame.stamp_ns):
             self.follower.reset()
             return None
@@ -207,17 +208,17 @@ class FrontEnd:
         elif not fault or self.motion.state is not TrackingState.TRACKING:
             self.motion.lose(frame.stamp_ns)
 
-    def _predict_poses(self, frame: StereoFrame, images: Images) -> list[Array]:
+    def _predict_poses(self, frame: StereoFrame) -> list[Array]:
         """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
-        self._rotation.see(images.left)
         turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
         steady = self.motion.steady(frame.stamp_ns)
         measured = self.motion.measured_pose(frame.stamp_ns)
         return [steady, turned] if measured is None else [measured, steady, turned]
 
-    def _search(self, frame: StereoFrame, images: Images, predictions: list[Array]) -> Track | None:
+    def _search(self, frame: StereoFrame, images: Images) -> Track | None:
         """Find the pose by the features of the frame, without its predecessor."""
         features = self.extractor.extract(frame.left, images.excluded)
+        predictions = self._predict_poses(frame)
         track = self.tracker.track(images, features, self.local.point_ids, predictions)
         if self.motion.state is TrackingState.TRACKING:
             return self._carry_on(images, features, frame.stamp_ns, track)

@@ -88,60 +88,86 @@ def align_patches(
     normal equations come from the template, once. A fit is sound when it stays near its start, has
     settled, and explains the patch better than a plain grey level would.
     """
-    x, y, weight = _raster()
-    pixels = 1.0 / weight.max()
-    target = template.reshape(len(template), SIDE_PX**2)
-    J = _steepest_descent(template, x, y, weight, 1 if along_row else 2)
-    weighted = J * weight
-    H = (weighted @ np.swapaxes(J, 1, 2)).astype(np.float64)
+    fit = _Fit(template, image, 1 if along_row else 2)
     A = zoom[:, None, None] * np.eye(2)
     offset = np.zeros((len(template), 2))
-    prior = np.where(np.arange(J.shape[1]) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
+    prior = np.where(np.arange(3 * fit.axes) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
     max_step = np.where(prior > 0, AFFINE_SIGMA, MAX_SHIFT_STEP_PX)
     step = np.zeros((len(template), 2, 3))
-    deviation = np.zeros((len(template), J.shape[1] // 3, 3))
+    deviation = np.zeros((len(template), fit.axes, 3))
     for iteration in range(STEPS):
-        warped = _warp(A, x, y) + (start_uv_px + offset)[:, :, None].astype(np.float32)
-        residual = _match_brightness(_remap(image, warped[:, 0], warped[:, 1]), target, weight)
-        residual -= target
-        noise = residual**2 @ weight
-        level = np.maximum(noise, GREY_NOISE**2).astype(np.float64) / pixels
+        noise, rhs = fit.misfit(np.dstack([A, start_uv_px + offset]).astype(np.float32))
+        level = np.maximum(noise, GREY_NOISE**2) * fit.weight.max()
         if iteration == 0:
             prior_level = level[:, None]
-            inverse = np.linalg.inv(H + prior_level[..., None] * np.diag(prior + 1e-9))
-        rhs = (weighted @ residual[..., None])[..., 0].astype(np.float64)
-        deviation[:, :, 1:] = (A / zoom[:, None, None] - np.eye(2))[:, : J.shape[1] // 3]
+            inverse = np.linalg.inv(fit.H + prior_level[..., None] * np.diag(prior + 1e-9))
+        deviation[:, :, 1:] = (A / zoom[:, None, None] - np.eye(2))[:, : fit.axes]
         rhs += prior_level * prior * deviation.reshape(rhs.shape)
         found = np.clip((inverse @ rhs[..., None])[..., 0], -max_step, max_step)
-        step[:, : J.shape[1] // 3] = found.reshape(len(found), J.shape[1] // 3, 3)
+        step[:, : fit.axes] = found.reshape(len(found), fit.axes, 3)
         A = A @ _inverse_2x2(np.eye(2) + step[:, :, 1:])
         offset -= (A @ step[:, :, :1])[..., 0]
     variance = np.einsum('naa->na', inverse)[:, ::3] * level[:, None]
     sigma = np.zeros((len(template), 2))
-    sigma[:, : variance.shape[1]] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
+    sigma[:, : fit.axes] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
     sound = (
         (np.abs(offset) < ALIGNED_PX).all(axis=1)
         & (np.abs(step[:, :, 0]) < MIN_SIGMA_DISPARITY).all(axis=1)
-        & (noise < MAJORITY * _variance(target, weight))
+        & (noise < MAJORITY * fit.contrast)
     )
     return Alignment(start_uv_px + offset, sigma, sound)
 
 
-def _steepest_descent(
-    template: Patches, x: Patches, y: Patches, weight: Patches, axes: int
-) -> Patches:
-    """Return the change of grey level (N, 3 axes, P) per unit of offset and of the two slopes
-    of each axis, freed of what a change of brightness could explain.
+class _Fit:
+    """Sums of grey levels over patches (N, SIDE_PX, SIDE_PX), of which the image (H, W) and its
+    brightness alone are new in each step: no array holds the derivatives of each pixel by each
+    unknown. An unknown is the shift of a pixel along an axis, constant, or by its x or y.
+
+    weight: (P,) Gaussian, of sum 1. contrast: (N,) variance of each patch. H: (N, 3 axes, 3 axes)
+    normal matrices, freed of what a change of brightness could explain.
     """
-    slope_v, slope_u = np.gradient(template, axis=(1, 2))
-    basis = np.stack([np.ones_like(x), x, y])
-    slopes = np.stack([slope_u, slope_v][:axes], axis=1).reshape(len(template), axes, 1, SIDE_PX**2)
-    J = (slopes * basis).reshape(len(template), 3 * axes, SIDE_PX**2)
-    return J - (J @ weight)[..., None]
 
+    def __init__(self, template: Patches, image: NDArray[np.float32], axes: int) -> None:
+        self.axes, self._image, count = axes, image, len(template)
+        steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
+        y, x = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing='ij'))
+        window = np.exp(-0.5 * (x**2 + y**2) / (0.6 * HALF_PATCH_PX) ** 2)
+        self.weight = window / window.sum()
+        self._xy1, basis = np.stack([x, y, np.ones_like(x)]), np.stack([np.ones_like(x), x, y])
+        self._basis = np.ascontiguousarray((self.weight * basis).T)
+        self._mean = (template.reshape(count, -1) @ self.weight)[:, None]
+        slope_v, slope_u = np.gradient(template, axis=(1, 2))
+        parts = [template - self._mean[..., None], slope_u, slope_v][: 1 + axes]
+        self._parts = np.stack(parts, axis=1).reshape(count, 1 + axes, -1)
+        self._products = self._parts[:, :1] * self._parts
+        of_target = self._sums(self._products)
+        self.contrast, self._of_target = of_target[:, 0, 0], of_target[:, 1:].reshape(count, -1)
+        slopes = self._parts[:, 1:]
+        self._of_slopes = self._sums(slopes).reshape(count, -1)
+        squares = (self.weight * basis[:, None] * basis).reshape(9, -1).T
+        pairs = (slopes[:, :, None] * slopes[:, None]).reshape(-1, len(self.weight)) @ squares
+        H = pairs.reshape(count, axes, axes, 3, 3).swapaxes(2, 3).reshape(count, 3 * axes, -1)
+        self.H = H - self._of_slopes[:, :, None] * self._of_slopes[:, None]
 
-def _warp(A: Array, x: Patches, y: Patches) -> Patches:
-    return A.astype(np.float32) @ np.stack([x, y])
+    def misfit(self, warp: Patches) -> tuple[Array, Array]:
+        """Return the mean squared difference (N,) of the patches from the image where a warp (N, 2,
+        3) = (shear, place) has them, at the gain and offset that fit best, and its slope (N, 3
+        axes) by the unknowns, halved.
+        """
+        seen = _remap(self._image, warp[:, 0] @ self._xy1, warp[:, 1] @ self._xy1)
+        seen -= self._mean
+        sums = self._sums(np.multiply(seen[:, None], self._parts, out=self._products))
+        mean = np.asarray(seen @ self.weight, np.float64)
+        variance = np.maximum(np.square(seen, out=seen) @ self.weight - mean**2, 1e-3)
+        shared = sums[:, 0, 0]
+        gain = shared / variance
+        slope = sums[:, 1:].reshape(len(gain), -1) - mean[:, None] * self._of_slopes
+        return self.contrast - gain * shared, gain[:, None] * slope - self._of_target
+
+    def _sums(self, values: Patches) -> Array:
+        """Return weighted sums (N, A, 3) of values (N, A, P): plain, by x and by y."""
+        sums = values.reshape(-1, len(self.weight)) @ self._basis
+        return sums.reshape(len(values), -1, 3).astype(np.float64)
 
 
 def _inverse_2x2(A: Array) -> Array:
@@ -190,25 +216,6 @@ def sample_patches(
     u = np.broadcast_to(uv[:, 0, None, None] + du, shape).reshape(len(uv), -1)
     v = np.broadcast_to(uv[:, 1, None, None] + dv[:, None], shape).reshape(len(uv), -1)
     return _remap(image, u, v).reshape(shape)
-
-
-def _raster() -> tuple[Patches, Patches, Patches]:
-    """Return x, y (P,) of a patch's pixels from its centre, and Gaussian weights (P,) of sum 1."""
-    steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
-    y, x = np.meshgrid(steps, steps, indexing='ij')
-    window = np.exp(-0.5 * (x**2 + y**2) / (0.6 * HALF_PATCH_PX) ** 2)
-    return x.ravel(), y.ravel(), (window / window.sum()).ravel()
-
-
-def _match_brightness(value: Patches, target: Patches, weight: Patches) -> Patches:
-    """Return patches (N, P) with the gain and offset that bring them nearest to their targets."""
-    centred = value - (value @ weight)[:, None]
-    gain = (centred * target) @ weight / np.maximum(centred**2 @ weight, 1e-3)
-    return gain[:, None] * centred + (target @ weight)[:, None]
-
-
-def _variance(patches: Patches, weight: Patches) -> Patches:
-    return (patches - (patches @ weight)[:, None]) ** 2 @ weight
 
 
 def _remap(image: NDArray[np.float32], u: Patches, v: Patches) -> Patches:
