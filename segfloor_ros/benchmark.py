@@ -18,6 +18,7 @@ import platform
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros import __version__
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import SegfloorError, SettingsError
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
@@ -41,7 +43,7 @@ from segfloor_ros.slam.results import (
     KeyframePath,
     SparseCloud,
 )
-from segfloor_ros.timing import MemoryLog, ReferenceWorkload, StageTimes, spread_of
+from segfloor_ros.timing import MemoryLog, Profile, ReferenceWorkload, StageTimes, spread_of
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 MOUNT = Mount(height_m=0.3, pitch_rad=0.12)
@@ -309,6 +311,29 @@ def measure_images(
     return stages.workload(IMAGES)
 
 
+def profile_recording(
+    source: StereoSource, plan: BenchmarkPlan, configuration: Configuration, on_progress: Progress
+) -> list[Step]:
+    """Put the first frames of a recording through all stages, by its images alone, and return what
+    each step took, outermost first.
+    """
+    cv2.setNumThreads(plan.threads)
+    profile, stages = Profile(), MeasuredStages(source.camera, configuration)
+    for frame in islice(source.frames(), plan.frames):
+        with profile.recording():
+            stages.process(frame)
+        on_progress(stages.frames)
+    whole_s = sum(seconds for path, (_, seconds) in profile.steps.items() if len(path) == 1)
+    came = {path: order for order, path in enumerate(profile.steps)}
+    return [
+        Step(path, calls, round(1e3 * seconds / calls, 3), round(seconds / whole_s, 4))
+        for path, (calls, seconds) in sorted(
+            profile.steps.items(),
+            key=lambda step: [came[step[0][:length]] for length in range(1, len(step[0]) + 1)],
+        )
+    ]
+
+
 def measure_map(
     plan: BenchmarkPlan, keyframes: int, configuration: Configuration, on_progress: Progress
 ) -> Workload:
@@ -449,6 +474,18 @@ class MeasuredStages:
         self.points = points
         self.times.end_update()
         self._memory.sample()
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step of a stage took. path: its name, those of what it is a step of before. ms: the
+    time computed by each of the calls. share: of the time of all stages.
+    """
+
+    path: tuple[str, ...]
+    calls: int
+    ms: float
+    share: float
 
 
 @dataclass(frozen=True)

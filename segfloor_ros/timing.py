@@ -11,8 +11,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +23,62 @@ from segfloor_ros.geometry import Array
 MAX_SAMPLES = 200
 
 _PROC = Path('/proc')
+
+Timed = TypeVar('Timed', bound=Callable[..., Any])
+
+
+class Profile:
+    """What the calling thread computes in each step, and in the steps within it, while `recording`.
+
+    steps: of each path of names, outermost first, the calls and their seconds. Stages are steps,
+    and so are functions that are `timed`.
+    """
+
+    _current: ClassVar[Profile | None] = None
+
+    def __init__(self) -> None:
+        self.steps: dict[tuple[str, ...], tuple[int, float]] = {}
+        self._path: tuple[str, ...] = ()
+
+    @contextmanager
+    def recording(self) -> Iterator[None]:
+        """Record what is done inside the `with` block, on this thread alone."""
+        Profile._current = self
+        try:
+            yield
+        finally:
+            Profile._current = None
+
+    @staticmethod
+    @contextmanager
+    def step(name: str) -> Iterator[None]:
+        """Add the `with` block to the profile that is being recorded, if there is one."""
+        profile = Profile._current
+        if profile is None:
+            yield
+            return
+        before = profile._path
+        path = profile._path = (*before, name)
+        profile.steps.setdefault(path, (0, 0.0))  # so that a step comes before those within it
+        start_s = time.thread_time()
+        try:
+            yield
+        finally:
+            calls, seconds = profile.steps[path]
+            profile.steps[path] = calls + 1, seconds + time.thread_time() - start_s
+            profile._path = before
+
+
+def timed(function: Timed) -> Timed:
+    """Make a function a step of the profile, by its name."""
+    name = function.__name__.strip('_').replace('_', ' ')
+
+    @wraps(function)
+    def with_time(*arguments: Any, **named: Any) -> Any:
+        with Profile.step(name):
+            return function(*arguments, **named)
+
+    return with_time  # type: ignore[return-value]
 
 
 class StageTimes:
@@ -38,7 +95,8 @@ class StageTimes:
         """Add the time spent inside the `with` block under `name`."""
         start = self._clock()
         try:
-            yield
+            with Profile.step(name):
+                yield
         finally:
             self.add(name, self._clock() - start)
 

@@ -22,7 +22,7 @@ from segfloor_ros.benchmark import (
     measure_map,
     run_apart,
 )
-from segfloor_ros.cli.commands import benchmark
+from segfloor_ros.cli.commands import DRIVE, benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.evaluation.maps import sample_states, states
@@ -271,6 +271,24 @@ def test_benchmark_prints_tables():
     output = run('--sizes', '3,5', '--frames', '3')
     for words in ('3 keyframes', '5 keyframes', 'floor_segmentation', 'reference', 'MB/update'):
         assert words in output
+
+
+def test_steps_of_a_recording_are_within_their_stages():
+    document = json.loads(run(DRIVE, '--frames', '8', '--json'))
+    share = {tuple(step['path']): step['share'] for step in document['steps']}
+    stages = {path: whole for path, whole in share.items() if len(path) == 1}
+    assert {('tracking',), ('mapping',), ('floor_segmentation',)} <= stages.keys()
+    assert sum(stages.values()) == pytest.approx(1.0, abs=0.01)
+    for path, whole in share.items():
+        within = [s for p, s in share.items() if p[:-1] == path]
+        assert sum(within) <= whole + 0.01, path
+    paths = list(share)
+    assert all(p[:-1] in ((), *paths[:i]) for i, p in enumerate(paths))
+    calls = {tuple(step['path']): step['calls'] for step in document['steps']}
+    assert calls['tracking',] == 8
+    assert calls['tracking', 'by flow'] == 7
+    assert calls['mapping', 'observe', 'extract'] == calls['mapping',]
+    assert 'align pixels' in run(DRIVE, '--frames', '3')
 
 
 @pytest.mark.parametrize('sizes', ['10,many', '', '10,0'])

@@ -15,7 +15,15 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.benchmark import BenchmarkPlan, Workload, as_document, parse_sizes, run_benchmark
+from segfloor_ros.benchmark import (
+    BenchmarkPlan,
+    Step,
+    Workload,
+    as_document,
+    parse_sizes,
+    profile_recording,
+    run_benchmark,
+)
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
@@ -342,11 +350,16 @@ def simulate(
 
 
 def benchmark(
+    recording: Annotated[
+        str | None,
+        typer.Argument(help='Print the share of each step of a frame and of a keyframe of this.'),
+    ] = None,
     sizes: Annotated[
         str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
     ] = ','.join(map(str, DEFAULT.sizes)),
     frames: Annotated[
-        int, typer.Option(callback=within(2), help='Generated image pairs for all stages.')
+        int,
+        typer.Option(callback=within(2), help='Image pairs for all stages, generated or recorded.'),
     ] = DEFAULT.frames,
     seed: Annotated[
         int, typer.Option(callback=within(0), help='Of the generated data.')
@@ -373,13 +386,22 @@ def benchmark(
 
     \b
     segfloor benchmark --json > figures.json
+    segfloor benchmark drive.mcap
     segfloor benchmark --nodes drive.mcap
     """
     if nodes is not None:
         configuration = terminal.configuration(params, assignments, nodes)
         return print_node_figures(configuration, rate, as_json=as_json)
-    configuration = resolve(params, assignments or ())
     plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
+    if recording is not None:
+        configuration = terminal.configuration(params, assignments, recording)
+        source = open_source(configuration.stereo_camera)
+        with terminal.progress_bar('measuring', frames) as progress:
+            steps = profile_recording(source, plan, configuration, progress)
+        if as_json:
+            return print_json({'steps': [dataclasses.asdict(step) for step in steps]})
+        return console.print(step_table(steps))
+    configuration = resolve(params, assignments or ())
     with terminal.announcing() as announce:
         workloads = run_benchmark(plan, configuration, announce)
     if as_json:
@@ -405,6 +427,19 @@ def print_node_figures(
     if as_json:
         return print_json(dict(rows))
     console.print(value_table('figure', rows))
+
+
+def step_table(steps: list[Step]) -> Table:
+    """Return the share of each step as a table."""
+    table = figure_table('step', 'calls', 'ms / call', 'share %')
+    for step in steps:
+        name = Text('  ' * (len(step.path) - 1) + step.path[-1], '' if step.path[1:] else 'bold')
+        table.add_row(name, str(step.calls), f'{step.ms:.2f}', f'{100 * step.share:.1f}')
+    table.caption = (
+        'tracking: of each frame; moving: of each search for what moves; the others: of each '
+        'keyframe; steps are part of the step above; computed on one thread'
+    )
+    return table
 
 
 def stage_table(workloads: list[Workload]) -> Table:

@@ -34,6 +34,7 @@ from segfloor_ros.camera.rig.estimates import (
     follow,
 )
 from segfloor_ros.geometry import Array
+from segfloor_ros.timing import timed
 
 EVERY, RECENT = 10, 5
 """Every tenth frame is looked at, and five looks are judged together: what is seen in 50 frames."""
@@ -160,6 +161,7 @@ class RigCheck:
         self._depth = DepthCheck()
         self._focal = FocalCheck(camera)
 
+    @timed
     def watch(self, frame: StereoFrame) -> None:
         """Take in a frame of a drive: each one until nothing was found in motion, then one burst in
         fifty frames.

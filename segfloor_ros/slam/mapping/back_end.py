@@ -34,6 +34,7 @@ from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.timing import timed
 
 
 class Submap(Enum):
@@ -214,6 +215,7 @@ class BackEnd:
             partial(self.mapper.solve, adjustment), partial(self.mapper.apply, adjustment)
         )
 
+    @timed
     def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
         """Begin to close a loop where a keyframe sees a place again; returns whether it does."""
         matches = self.loops.detect(keyframe, images)

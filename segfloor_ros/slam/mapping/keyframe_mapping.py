@@ -36,6 +36,7 @@ from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
 from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX, Images
 from segfloor_ros.slam.tracking.map_tracking import predict_points
 from segfloor_ros.slam.tracking.patch_alignment import ALIGNED_PX, SIDE_PX, measure_disparity
+from segfloor_ros.timing import timed
 
 MIN_DISPARITY_PX = 1.0
 """Less is known too badly, as a share of it, for a new point."""
@@ -85,6 +86,7 @@ class LocalMapper:
         self._rig = sparse_map.rig
         self._camera = sparse_map.rig.camera
 
+    @timed
     def measure_stereo(
         self, frame: StereoFrame, images: Images, observed: ObservedFeatures
     ) -> None:
@@ -103,6 +105,7 @@ class LocalMapper:
         found = np.isfinite(guess)
         measure_disparity(images, observations, missing[found], guess[found], SAME_PX)
 
+    @timed
     def insert(self, keyframe: KeyframeRecord, patches: NDArray[np.uint8]) -> None:
         """Add a keyframe and new points from its stereo features; points that turn out to be known
         are fused with the older ones.
@@ -133,6 +136,7 @@ class LocalMapper:
         points = self._camera.back_project(uvd[rows, :2], depth)
         return rows, transform_points(keyframe.T_world_camera, points)
 
+    @timed
     def plan_adjustment(
         self, keyframe: KeyframeRecord, up_world: Up | None = None
     ) -> Adjustment | None:
@@ -168,10 +172,12 @@ class LocalMapper:
         )
         return Adjustment(keyframe.index, problem, free, ids, edge_keyframe, edge_row, *carried)
 
+    @timed
     def solve(self, adjustment: Adjustment) -> BundleResult:
         """Adjust the copy; safe on another thread, since it shares nothing with the map."""
         return adjust(self._camera, adjustment.problem)
 
+    @timed
     def apply(self, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
         points. One that loses what the newest keyframe saw has followed something that moves, or a

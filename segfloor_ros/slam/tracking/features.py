@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.tracking.images import Region, is_inside
+from segfloor_ros.timing import timed
 
 OVERSAMPLING = 4
 """Corners detected per feature kept; the surplus is what the cells choose from."""
@@ -73,6 +74,7 @@ class FeatureExtractor:
             fastThreshold=settings.fast_threshold,
         )
 
+    @timed
     def extract(self, image: NDArray[np.uint8], excluded: Region | None = None) -> Features:
         """Return the features of a grey image (H, W) outside of what is excluded."""
         corners = self._orb.detect(image, None)

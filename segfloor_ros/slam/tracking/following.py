@@ -31,6 +31,7 @@ from segfloor_ros.slam.tracking.map_tracking import (
 )
 from segfloor_ros.slam.tracking.patch_alignment import measure_disparity
 from segfloor_ros.slam.tracking.pose import Agreement, Consensus
+from segfloor_ros.timing import timed
 
 MAX_FOLLOWED = 250
 
@@ -93,6 +94,7 @@ class Follower:
         estimate = found.estimate
         return Track(estimate, ids[estimate.inliers], measured.take(estimate.inliers), seen.ids)
 
+    @timed
     def _by_flow(self, images: Images, T_predicted: Array) -> Agreement | None:
         """Find the pose to about a pixel from where the last frame's points went."""
         if self._small is None or len(self._ids) < ENOUGH:
@@ -115,6 +117,7 @@ class Follower:
         agreement = self._consensus.refine(T_predicted, ids[found], observations)
         return agreement if agreement.is_believable(len(ids)) else None
 
+    @timed
     def _select(
         self, local_ids: NDArray[np.int32], T_camera_world: Array, excluded: Region | None
     ) -> Prediction:

@@ -46,6 +46,7 @@ from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
 from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
+from segfloor_ros.timing import timed
 
 FEW_POINTS = 50
 """Wheels measure the pose better than fewer points, spread over the image, that do not slide along
@@ -119,6 +120,7 @@ class FrontEnd:
         self.local.drop_dead()
         self.follower.drop_dead()
 
+    @timed
     def fault(self, frame: StereoFrame) -> str:
         """Return why a pair of images cannot be tracked, or ''."""
         points = self._map.xyz_world[self.follower.seen_ids]
@@ -279,6 +281,7 @@ class FrontEnd:
         self.follower.drop_inside(region)
         return replace(images, excluded=union(images.excluded, region))
 
+    @timed
     def observe(
         self, frame: StereoFrame, images: Images, track: Track | None
     ) -> ObservedFeatures | None:

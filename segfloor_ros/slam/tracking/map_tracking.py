@@ -41,6 +41,7 @@ from segfloor_ros.slam.tracking.patch_alignment import (
     measure_disparity,
 )
 from segfloor_ros.slam.tracking.pose import KNOWN_NOISE, Consensus, PoseEstimate, solve_pnp
+from segfloor_ros.timing import timed
 
 SIGMA_PIXEL = 0.6
 """Standard deviation of a corner's position at the finest pyramid level, px; grows with the
@@ -98,6 +99,7 @@ class Tracker:
         pose = estimate.T_camera_world
         return self.track_at(images, features, local_ids, pose)
 
+    @timed
     def track_at(
         self,
         images: Pixels,
@@ -261,6 +263,7 @@ class LocalMap:
         self._map = sparse_map
         self._depth_m = MIN_DEPTH_M
 
+    @timed
     def move_to(self, ids: NDArray[np.int32], T_camera_world: Array) -> None:
         """Take the points around a camera that sees points `ids` (N,)."""
         self.point_ids = self.points_around(ids, T_camera_world)
@@ -280,6 +283,7 @@ class LocalMap:
         """Forget points that are not part of the map any more."""
         self.point_ids = self.point_ids[self._map.alive[self.point_ids]]
 
+    @timed
     def wants_keyframe(self, track: Track, frames_since: int, mapper_idle: bool) -> bool:
         """Whether a frame shows enough that is new. frames_since: since the last keyframe."""
         order, _ = self._map.covisible(track.point_ids)
@@ -307,6 +311,7 @@ class LocalMap:
         return self._depth_m
 
 
+@timed
 def align_pixels(
     left: NDArray[np.float32],
     observations: Observations,

@@ -25,6 +25,7 @@ from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import MAJORITY
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.tracking.images import SIDE_PX, Images
+from segfloor_ros.timing import timed
 
 HALF_PATCH_PX = SIDE_PX // 2
 STEPS = 4
@@ -234,6 +235,7 @@ def _remap(image: NDArray[np.float32], u: Patches, v: Patches) -> Patches:
     return values
 
 
+@timed
 def measure_disparity(
     images: Images,
     observations: Observations,

@@ -34,6 +34,7 @@ from segfloor_ros.slam.rig import (
 )
 from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.tracking.patch_alignment import LEAST_SHIFT, _shift_information
+from segfloor_ros.timing import timed
 
 ROUNDS, STEPS_PER_ROUND = 3, 6
 """Of an estimate; outliers are looked for anew in each round."""
@@ -300,6 +301,7 @@ class Consensus:
         self._map = sparse_map
         self._camera = sparse_map.rig.camera
 
+    @timed
     def refine(
         self,
         T_start: Array,
