@@ -46,8 +46,9 @@ SAME_INLIERS = 0.01
 """Share of the points that changes sides below which another round would change nothing."""
 
 MAX_NOISE_FACTOR = 4.0
-RANSAC_ITERATIONS = 1000
-"""Enough for a quarter of right matches, five at a time; it ends early when more are right."""
+RANSAC_ITERATIONS = 600
+"""Where a quarter of the matches are right, nine times in ten four right ones are drawn in so many;
+it ends early when more are right."""
 
 FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
 """Of a pose before any point is seen, in metres and radians: where no point determines it."""
@@ -86,8 +87,9 @@ def solve_pnp(
 ) -> tuple[Array, NDArray[np.bool_]] | None:
     """Find T_camera_world from points (N, 3) and pixels (N, 2) by PnP in RANSAC, or None.
 
-    Fischler and Bolles, Random sample consensus (1981), on OpenCV's EPnP; its generator is
-    seeded, so that the same input gives the same pose. Also returns the inliers (N,).
+    Fischler and Bolles, Random sample consensus (1981), on OpenCV's AP3P (Ke and Roumeliotis,
+    CVPR 2017), which draws four points; its generator is seeded, so that the same input gives the
+    same pose. Also returns the inliers (N,).
     """
     if len(points_world) < 6:
         return None
@@ -99,7 +101,7 @@ def solve_pnp(
         iterationsCount=RANSAC_ITERATIONS,
         reprojectionError=SAME_PX,
         confidence=0.999,
-        flags=cv2.SOLVEPNP_EPNP,
+        flags=cv2.SOLVEPNP_AP3P,
     )
     if not found or rows is None:
         return None
