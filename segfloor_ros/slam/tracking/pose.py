@@ -125,19 +125,23 @@ def refine_pose(
     and a poor calibration make errors larger than the sigmas of single measurements; the median
     residual shows by how much, and the bound on outliers follows it.
     """
+    seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool)
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
-        pose = _minimise(camera, pose, points_world[inliers], observations.take(inliers))
-        chi2 = squared_distances(camera, pose, points_world, observations)
-        excess = chi2 / observations.chi2_median
-        factor = float(np.sqrt(np.clip(np.median(excess), 1.0, max_noise_factor**2)))
-        before, inliers = inliers, chi2 <= factor**2 * observations.chi2_limit
+        pose = _minimise(pose, seen.take(inliers))
+        points, _, chi2 = seen.at(pose)
+        chi2[points[2] <= MIN_DEPTH_M] = np.inf
+        factor = float(np.sqrt(np.clip(np.median(chi2 / seen.median), 1.0, max_noise_factor**2)))
+        before, inliers = inliers, chi2 <= factor**2 * seen.limit
         if inliers.sum() < 4 or (inliers != before).mean() < SAME_INLIERS:
             break
-    scaled = observations.take(inliers).with_noise_factor(factor)
-    covariance = _covariance(camera, pose, points_world[inliers], scaled)
-    return PoseEstimate(pose, inliers, covariance, factor)
+    if inliers.sum() < 4:
+        return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
+    # Huber's weight of an inlier is 1.
+    root = np.sqrt(seen.information[:, inliers]) / factor
+    J = seen.weighted_jacobian(points[:, inliers], root)
+    return PoseEstimate(pose, inliers, np.linalg.pinv(J @ J.T, hermitian=True), factor)
 
 
 def squared_distances(
@@ -153,62 +157,81 @@ def squared_distances(
     return np.where(front, chi2, np.inf)
 
 
-def _minimise(
-    camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
-) -> Array:
-    information, limit = observations.information, observations.chi2_limit
+@dataclass(frozen=True)
+class _Seen:
+    """Points and their observations, one long row (N,) for each coordinate: points_world, uvd_px
+    and information (3, N), 0 where nothing is measured; limit, median: (N,) of chi2.
+    """
+
+    camera: StereoCamera
+    points_world: Array
+    uvd_px: Array
+    information: Array
+    limit: Array
+    median: Array
+
+    @staticmethod
+    def of(camera: StereoCamera, points_world: Array, observations: Observations) -> _Seen:
+        """Return them, for points (N, 3)."""
+        return _Seen(
+            camera,
+            np.ascontiguousarray(points_world.T),
+            np.nan_to_num(observations.uvd_px.T.copy()),
+            np.ascontiguousarray(observations.information.T),
+            observations.chi2_limit,
+            observations.chi2_median,
+        )
+
+    def take(self, rows: NDArray[np.bool_]) -> _Seen:
+        """Return the chosen rows."""
+        columns = self.points_world, self.uvd_px, self.information, self.limit, self.median
+        return _Seen(self.camera, *(column[..., rows] for column in columns))
+
+    def at(self, T_camera_world: Array) -> tuple[Array, Array, Array]:
+        """Return the points and residuals (3, N) at a pose, and the squares of these (N,); points
+        that are behind the camera are just before it.
+        """
+        camera = self.camera
+        points = T_camera_world[:3, :3] @ self.points_world + T_camera_world[:3, 3:]
+        np.maximum(points[2], MIN_DEPTH_M, out=points[2])
+        inverse_z = 1.0 / points[2]
+        residual = np.empty_like(points)
+        residual[0] = camera.fx * points[0] * inverse_z + camera.cx
+        residual[1] = camera.fy * points[1] * inverse_z + camera.cy
+        residual[2] = camera.disparity_times_depth * inverse_z
+        residual -= self.uvd_px
+        return points, residual, (residual**2 * self.information).sum(axis=0)
+
+    def weighted_jacobian(self, points: Array, root: Array) -> Array:
+        """Return the derivatives (6, 3 N) of what is seen of points (3, N) of the camera by the
+        twist of its pose, times the roots (3, N) of their weights.
+        """
+        return with_moment(points, weighted_jacobian(self.camera, points.T, root)).reshape(6, -1)
+
+
+def _minimise(pose: Array, seen: _Seen) -> Array:
     damping = 1e-4
-
-    def evaluate(candidate: Array) -> tuple[Array, Array, Array, float]:
-        points = transform_points(candidate, points_world)
-        points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
-        residual = residuals(camera, points, observations)
-        chi2 = squared_norms(residual, information)
-        return points, residual, chi2, huber_cost(chi2, limit)
-
-    points, residual, chi2, cost = evaluate(pose)
+    points, residual, chi2 = seen.at(pose)
+    cost = huber_cost(chi2, seen.limit)
     for _ in range(STEPS_PER_ROUND):
-        H, g = _normal_equations(camera, points, residual, information, chi2, limit)
+        root = np.sqrt(seen.information * huber_weights(chi2, seen.limit))
+        J = seen.weighted_jacobian(points, root)
+        H, g = J @ J.T, J @ (residual * root).ravel()
         step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), -g)
         candidate = se3_exp(step) @ pose
         if -g @ step < CONVERGED * cost:
             return candidate
-        trial = evaluate(candidate)
-        if trial[3] <= cost:
-            converged = cost - trial[3] < CONVERGED * cost
-            pose, (points, residual, chi2, cost) = candidate, trial
+        trial = seen.at(candidate)
+        trial_cost = huber_cost(trial[2], seen.limit)
+        if trial_cost <= cost:
+            converged = cost - trial_cost < CONVERGED * cost
+            pose, (points, residual, chi2), cost = candidate, trial, trial_cost
             damping *= 0.2
             if converged:
                 break
         else:
             damping *= 10.0
     return pose
-
-
-def _normal_equations(
-    camera: StereoCamera,
-    points: Array,
-    residual: Array,
-    information: Array,
-    chi2: Array,
-    limit: Array,
-) -> tuple[Array, Array]:
-    root = np.sqrt(information * huber_weights(chi2, limit)[:, None]).T
-    J = with_moment(points.T, weighted_jacobian(camera, points, root)).reshape(6, -1)
-    return J @ J.T, J @ (residual.T * root).ravel()
-
-
-def _covariance(
-    camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
-) -> Array:
-    points = transform_points(pose, points_world)
-    if len(points) < 4:
-        return np.eye(6) * UNKNOWN_COVARIANCE
-    residual = residuals(camera, points, observations)
-    information = observations.information
-    chi2 = squared_norms(residual, information)
-    H, _ = _normal_equations(camera, points, residual, information, chi2, observations.chi2_limit)
-    return np.linalg.pinv(H, hermitian=True)
 
 
 class PoseInformation:
