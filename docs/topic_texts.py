@@ -52,6 +52,7 @@ ABOUT = {
     'semantic_labels': (
         'mono8 on a left image as received: the class of each pixel by number, 255 for none.'
     ),
+    'semantic_map': 'With each `map`, the number of the likeliest class of each cell, -1 for none.',
     'semantic_classes': 'JSON: the names of the classes by number, and what they stand for.',
     'frame_done': 'The header of every frame that SLAM has done with: tracked, skipped or refused.',
     'camera_mount': 'Left optical frame in base_link: given, from tf, or measured from the floor.',

@@ -385,8 +385,8 @@ class SimulatedRobotNodeSettings(NodeSettings):
 
 
 @dataclass(frozen=True)
-class SegfloorMasksNodeSettings(NodeSettings):
-    """Which network looks at the images."""
+class SegfloorMasksNodeSettings(RobotSettings, NodeSettings):
+    """Which network looks at the images, and what concerns the robot."""
 
     network: str = setting(
         '', 'Segmentation network, FILE.onnx with FILE.yaml beside it, which says how it is used.'

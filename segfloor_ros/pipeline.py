@@ -91,7 +91,15 @@ class KeyframeStages:
             )
         if self._labeller is not None and self._label_map is not None:
             labels = self._labeller.labels(keyframe.stamp_ns, keyframe.left)
-            self._label_map.add(keyframe.stamp_ns, labels, floor, mount, keyframe.features)
+            self._label_map.add(
+                keyframe.stamp_ns,
+                labels,
+                floor.mask,
+                floor.disparity_px,
+                mount,
+                keyframe.features,
+                floor.scan.range_max_m,
+            )
         path, cloud = keyframe.path, keyframe.cloud
         self.update_map(
             MapInput(keyframe.stamp_ns, keyframe.features, path, cloud, floor.mask, floor.scan)

@@ -180,7 +180,6 @@ class FloorSegmentation:
             below_said = None if said is None else said[columns]
             if below_said is not None:
                 evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
-                self.network.note(below_said, evidence.mask)
         with measure('filling'):
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
@@ -305,6 +304,8 @@ class FloorSegmentation:
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
             odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
+        if said is not None:
+            self.network.note(said, mask)
         if said is not None and self.network.is_trusted:
             undenied = compared.consistent & ~compared.denied
             mask = with_floor(mask, (said == FLOOR) & undenied)

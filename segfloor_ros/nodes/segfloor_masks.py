@@ -4,20 +4,106 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import OccupancyGrid
+from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
+from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.configuration import SegfloorMasksNodeSettings
-from segfloor_ros.messages.arrays import grey8_image, image_message
+from segfloor_ros.messages.arrays import (
+    depth_image,
+    features_arrays,
+    grey8_image,
+    grid_message,
+    grid_of,
+    image_message,
+    scan_arrays,
+)
 from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, SEMANTIC_MASK, best_effort, to_ns
+from segfloor_ros.messages.poses import path_arrays, transform_array
+from segfloor_ros.messages.topics import (
+    IMAGES,
+    KEYFRAME_PARTS,
+    KEYFRAMES,
+    SEMANTIC_MASK,
+    best_effort,
+    to_ns,
+)
 from segfloor_ros.nodes.shared.running import run_node
-from segfloor_ros.nodes.shared.stage_node import StageNode
+from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 from segfloor_ros.semantics.frames import ImageLabeller
+from segfloor_ros.semantics.label_map import LabelMap, numbered
 from segfloor_ros.semantics.network import Network
+from segfloor_ros.slam.results import KeyframePath
 
-IMAGE, KEYFRAME = 'left/image_raw', 'keyframe/left/image_rect'
+IMAGE, KEYFRAME, INFO = 'left/image_raw', *KEYFRAME_PARTS[:2]
+DISPARITY, MASK, SCAN = 'keyframe/disparity', 'keyframe/floor_mask', 'keyframe/floor_scan'
+FEATURES, PATH = 'keyframe/features', 'keyframe/path'
+SEEN = (DISPARITY, MASK, SCAN, FEATURES, PATH)
+
+
+class LabelLayer:
+    """Publishes the likeliest class of every cell with each map."""
+
+    def __init__(self, node: AnyStageNode, classes: int) -> None:
+        self._node = node
+        self._classes = classes
+        self._mount: Mount | None = None
+        self.reset()
+        node.inputs.subscribe('camera_mount', self._take_mount)
+        node.inputs.join((INFO, *SEEN), self._take_keyframe)
+        node.inputs.subscribe('map', self._publish)
+
+    def reset(self) -> None:
+        """Know no keyframe."""
+        self._path: KeyframePath | None = None
+        self._labels: LabelMap | None = None
+        self._waiting: dict[int, NDArray[np.uint8]] = {}
+
+    def expect(self, stamp_ns: int, labels: NDArray[np.uint8]) -> None:
+        """Keep the labels of a keyframe until its floor is known."""
+        self._waiting[stamp_ns] = labels
+        if len(self._waiting) > KEYFRAMES.depth:
+            del self._waiting[min(self._waiting)]
+
+    def _take_mount(self, message: TransformStamped) -> None:
+        self._mount = Mount.from_transform(transform_array(message))
+
+    def _take_keyframe(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        labels = self._waiting.pop(stamp_ns, None)
+        if self._mount is None or labels is None:
+            return
+        disparity = depth_image(parts[DISPARITY].image, DISPARITY).astype(np.float32)
+        scan = scan_arrays(parts[SCAN], SCAN)
+        if self._labels is None:
+            (fx, _, cx, _), (_, fy, cy, _), _ = parts[INFO].p.reshape(3, 4).tolist()
+            height, width = disparity.shape
+            camera = StereoCamera(width, height, fx, fy, cx, cy, float(parts[DISPARITY].t))
+            height_m = self._node.settings.robot_height_m
+            self._labels = LabelMap(camera, self._classes, height_m)
+        self._labels.add(
+            stamp_ns,
+            labels,
+            grey8_image(parts[MASK], MASK),
+            disparity,
+            self._mount,
+            features_arrays(parts[FEATURES], FEATURES),
+            scan.range_max_m,
+        )
+        self._path = path_arrays(parts[PATH])
+
+    def _publish(self, message: OccupancyGrid) -> None:
+        if self._labels is None or self._path is None:
+            return
+        grid = grid_of(message)
+        layer = numbered(grid, self._labels.cells(grid, self._path))
+        at = to_ns(message.header.stamp), message.header.frame_id
+        self._node.outputs.publish('semantic_map', grid_message(*at, layer))
 
 
 class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
@@ -35,6 +121,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
         self._work = self.inputs.later(self._process)
         self.inputs.subscribe(IMAGE, self._take_image, lambda: best_effort(IMAGES))
         self.inputs.subscribe(KEYFRAME, self._take_keyframe)
+        self._layer = LabelLayer(self, len(network.settings.classes))
         self.outputs.publish('semantic_classes', String(data=network.settings.as_json()))
 
     def reset_stage(self) -> None:
@@ -44,6 +131,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
         self._recent: dict[int, Image] = {}
         self._wanted: deque[int] = deque(maxlen=IMAGES.depth)
         self._count = 0
+        self._layer.reset()
 
     def find_problems(self) -> None:
         """Say what is wrong with what the network sees."""
@@ -91,7 +179,9 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
 
     def _look_at_keyframe(self, stamp_ns: int, message: Image) -> None:
         # It is rectified, hence another image than that of its stamp.
-        said = self._labeller.says(-stamp_ns, grey8_image(message, KEYFRAME))
+        image = grey8_image(message, KEYFRAME)
+        said = self._labeller.says(-stamp_ns, image)
+        self._layer.expect(stamp_ns, self._labeller.labels(-stamp_ns, image))
         mask = image_message(stamp_ns, message.header.frame_id, said)
         self.outputs.publish(SEMANTIC_MASK, mask)
         self.reporter.report(stamp_ns, Level.OK, 'keyframe')

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.errors import InputError, SettingsError
 from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR, FloorObservation
+from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR
 from segfloor_ros.geometry import transform_points
 from segfloor_ros.grid.map_file import (
     FREE,
@@ -67,25 +67,25 @@ class LabelMap:
         self,
         stamp_ns: int,
         labels: NDArray[np.uint8],
-        floor: FloorObservation,
+        mask: NDArray[np.uint8],
+        disparity_px: NDArray[np.float32],
         mount: Mount,
         features: KeyframeFeatures,
+        reach_m: float,
     ) -> None:
-        """Take in a keyframe: the labels (H, W) of its left image, and what was seen of its floor.
-        What is farther away than the scan reaches does not count.
+        """Take in a keyframe: labels, floor mask and disparity (H, W) of its left image. What is
+        farther away than reach_m does not count.
         """
         rows, columns = np.mgrid[: labels.shape[0] : STEP_PX, : labels.shape[1] : STEP_PX]
         uv = np.stack([columns.ravel(), rows.ravel()], axis=1)
-        label, kind, disparity = (
-            a[uv[:, 1], uv[:, 0]] for a in (labels, floor.mask, floor.disparity_px)
-        )
+        label, kind, disparity = (a[uv[:, 1], uv[:, 0]] for a in (labels, mask, disparity_px))
         rays = self._camera.back_project(uv.astype(np.float64), np.ones(len(uv)))
         T = mount.T_base_left
         with np.errstate(divide='ignore', invalid='ignore'):
             down = -T[2, 3] / (rays @ T[2, :3])
             depth_m = np.where(kind == FLOOR, down, self._camera.disparity_times_depth / disparity)
             xyz = transform_points(T, rays * depth_m[:, None])
-            near = (depth_m > 0) & (np.hypot(xyz[:, 0], xyz[:, 1]) < floor.scan.range_max_m)
+            near = (depth_m > 0) & (np.hypot(xyz[:, 0], xyz[:, 1]) < reach_m)
         upright = (kind == NOT_FLOOR) & (disparity > 0) & (xyz[:, 2] < self._robot_height_m)
         kept = near & ((kind == FLOOR) | upright) & (label < self._classes)
         shows = features.point_id != NO_POINT
@@ -149,14 +149,20 @@ class Labels:
     points: NDArray[np.uint8]
 
 
+def numbered(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
+    """Return a grid with the numbers of classes (rows, columns) in place of its cells, unknown
+    where there is none; a map has room for the first 101.
+    """
+    numbers = np.where(cells <= OCCUPIED, cells, UNKNOWN).astype(np.int8)
+    return OccupancyGrid(numbers, grid.resolution_m, grid.origin_xy_m)
+
+
 def save_labels(path: Path, grid: OccupancyGrid, labels: Labels) -> None:
     """Write the labels of cells as a map for map_server, mode raw, with the names of the classes
     in its YAML. Raises MapError.
     """
     assert labels.cells is not None
-    cells = np.where(labels.cells < len(labels.classes), labels.cells, UNKNOWN).astype(np.int8)
-    numbered = OccupancyGrid(cells, grid.resolution_m, grid.origin_xy_m)
-    save_map(numbered, path, 'raw', {'classes': labels.classes})
+    save_map(numbered(grid, labels.cells), path, 'raw', {'classes': labels.classes})
 
 
 def class_colours(count: int) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -12,17 +13,24 @@ from small_network import constant_network, grey_network
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.floor.observation import FLOOR, MOVING
+from segfloor_ros.floor.observation import FLOOR, MOVING, FloorObservation, FloorScan
+from segfloor_ros.grid.map_file import FREE, UNKNOWN, OccupancyGrid
 from segfloor_ros.messages.arrays import (
     camera_info_message,
+    disparity_message,
+    features_message,
     grey8_image,
+    grid_message,
+    grid_of,
     image_message,
     rectified_calibration,
+    scan_message,
 )
+from segfloor_ros.messages.poses import PathMessages, transform_message
 from segfloor_ros.messages.topics import to_ns
 from segfloor_ros.nodes.segfloor_masks import SegfloorMasksNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
 from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -119,3 +127,49 @@ def test_a_mask_that_comes_after_its_keyframe_takes_its_points_back(make_graph):
             graph.until(lambda: frame.stamp_ns in node.masks.images, 'the mask')  # noqa: B023
     graph.until(lambda: (keyframe.point_id[on_board] == NO_POINT).all(), 'points taken back')
     assert (keyframe.point_id != NO_POINT).sum() > 50
+
+
+def test_each_map_comes_with_the_classes_of_its_cells(make_graph, tmp_path):
+    """A plain floor of one class, and a mount, a path and a map to lay it on."""
+    shape = (CAMERA.height, CAMERA.width)
+    file = constant_network(tmp_path / 'n.onnx', 'floor', ['wall', 'floor'], floor=['floor'])
+    graph = make_graph('-p', f'network:={file}')
+    layers, masks = graph.collect('semantic_map'), graph.collect('keyframe/semantic_mask')
+    graph.add(SegfloorMasksNode())
+    stamp_ns, at = 7, (7, 'left')
+    mask = np.full(shape, 127, np.uint8)
+    mask[shape[0] * 3 // 4 :] = FLOOR
+    scan = FloorScan(0.0, 0.1, np.zeros(3, np.float32), range_max_m=8.0)
+    nothing = np.zeros(shape, np.float32)
+    floor = FloorObservation(nothing, mask, np.zeros(shape[0]), scan, 64.0, None)
+    features = KeyframeFeatures(
+        np.zeros((1, 2), np.float32), np.array([NO_POINT], np.int32), np.zeros((1, 3))
+    )
+    T = transform_message(stamp_ns, 'base_link', 'left', MOUNT.T_base_left)
+    picture = image_message(*at, np.full(shape, 90, np.uint8))
+    inputs = publish(graph, {'camera_mount': T, 'keyframe/left/image_rect': picture})
+    graph.until(lambda: masks, 'what the network says of the keyframe')
+    keyframe = {
+        'keyframe/left/camera_info': camera_info_message(*at, CALIBRATION.left),
+        'keyframe/disparity': disparity_message(*at, CAMERA, floor),
+        'keyframe/floor_mask': image_message(*at, mask),
+        'keyframe/floor_scan': scan_message(stamp_ns, 'base_link', scan),
+        'keyframe/features': features_message(*at, features),
+        'keyframe/path': PathMessages('map').next(
+            stamp_ns, KeyframePath(np.array([stamp_ns]), np.eye(4)[None])
+        ),
+    }
+    inputs = publish(graph, keyframe, inputs)
+    cells = np.full((30, 60), FREE, np.int8)
+    cells[:, :30] = UNKNOWN
+    grid = OccupancyGrid(cells, 0.1, (-3.0, -1.5))
+    end_s = time.monotonic() + 20
+    while not layers and time.monotonic() < end_s:
+        inputs = publish(graph, {'map': grid_message(stamp_ns, 'map', grid)}, inputs)
+        graph.comes(lambda: layers, 0.5)
+    layer = grid_of(layers[-1])
+    assert layers[-1].header.frame_id == 'map' and layer.cells.shape == (30, 60)
+    assert set(np.unique(layer.cells)) == {UNKNOWN, 1}
+    assert (layer.cells[:, :30] == UNKNOWN).all()
+    ahead = np.nonzero(layer.cells[15] == 1)[0] * 0.1 - 3.0
+    assert 0.2 < ahead.min() < 1.0

@@ -8,7 +8,7 @@ from command_line import segfloor
 from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorObservation, FloorScan
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE
 from segfloor_ros.floor.observation import NOT_FLOOR as STANDING
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 from segfloor_ros.semantics.label_map import LabelMap, Labels, draw_labels, filter_mask, save_labels
@@ -25,10 +25,8 @@ def features(uv=(), ids=()):
 
 
 def seen(mask, depth_m=np.inf):
-    """What is seen of the floor with a mask, where everything is as far away."""
-    disparity = np.full(SHAPE, CAMERA.disparity_times_depth / depth_m, np.float32)
-    scan = FloorScan(0.0, 0.1, np.zeros(0, np.float32), range_max_m=8.0)
-    return FloorObservation(disparity, mask, np.zeros(SHAPE[0]), scan, 64.0, None)
+    """A floor mask, and the disparity where everything is as far away."""
+    return mask, np.full(SHAPE, CAMERA.disparity_times_depth / depth_m, np.float32)
 
 
 def floor_below(row=300):
@@ -58,7 +56,7 @@ def test_floor_has_its_class_where_it_lies_and_follows_its_keyframe():
     labels = np.full(SHAPE, 0, np.uint8)
     labels[:, SHAPE[1] // 2 :] = 1  # on the right
     stage = LabelMap(CAMERA, len(CLASSES), 1.0)
-    stage.add(0, labels, seen(floor_below()), MOUNT, features())
+    stage.add(0, labels, *seen(floor_below()), MOUNT, features(), 8.0)
     cells = stage.cells(grid(FREE), path((0, 0)))
     assert {*np.unique(cells)} == {0, 1, UNLABELLED}
     left, right = where(cells, 0), where(cells, 1)
@@ -75,12 +73,12 @@ def test_what_stands_is_where_its_disparity_puts_it_and_not_above_the_robot():
     mask = np.full(SHAPE, STANDING, np.uint8)
     stage = LabelMap(CAMERA, len(CLASSES), 1.0)
     labels = np.full(SHAPE, 2, np.uint8)
-    stage.add(0, labels, seen(mask, 2.0), MOUNT, features())
+    stage.add(0, labels, *seen(mask, 2.0), MOUNT, features(), 8.0)
     cells = stage.cells(grid(OCCUPIED), path((0, 0)))
     ahead = np.nonzero(cells[30] == 2)[0] * 0.1 - 3.0
     assert ahead.min() > 1.6 and ahead.max() < 2.2
     low = LabelMap(CAMERA, len(CLASSES), -9.0)
-    low.add(0, labels, seen(mask, 2.0), MOUNT, features())
+    low.add(0, labels, *seen(mask, 2.0), MOUNT, features(), 8.0)
     assert (low.cells(grid(OCCUPIED), path((0, 0))) == UNLABELLED).all()
 
 
@@ -91,11 +89,12 @@ def test_the_likeliest_class_of_a_point_counts_and_a_keyframe_told_anew_replaces
     for stamp, number in enumerate((1, 2, 2)):
         labels = np.full(SHAPE, number, np.uint8)
         labels[:, :100] = UNLABELLED if stamp else 0
-        stage.add(stamp, labels, nothing, MOUNT, features(uv, [4, 7, NO_POINT]))
+        stage.add(stamp, labels, *nothing, MOUNT, features(uv, [4, 7, NO_POINT]), 8.0)
     ids = np.array([2, 4, 7], np.int32)
     assert stage.points(ids).tolist() == [UNLABELLED, 0, 2]
     for stamp in (1, 2):
-        stage.add(stamp, np.full(SHAPE, 1, np.uint8), nothing, MOUNT, features(uv, [4, 7, -1]))
+        labels = np.full(SHAPE, 1, np.uint8)
+        stage.add(stamp, labels, *nothing, MOUNT, features(uv, [4, 7, -1]), 8.0)
     assert stage.points(ids).tolist() == [UNLABELLED, 1, 1]
 
 

@@ -40,7 +40,7 @@ class NetworkFloor:
         return f'of what the network calls floor {100 * share:.0f} % is: it is not used as floor'
 
     def note(self, said: NDArray[np.uint8], measured: NDArray[np.uint8]) -> None:
-        """Compare what is said (R, W) of a keyframe with the mask (R, W) of what is measured."""
+        """Compare what is said (R, W) of a keyframe with its mask (R, W) without the network."""
         decided = measured[(said == FLOOR) & (measured != NO_EVIDENCE)]
         if len(decided):
             self._agreed += float((decided == FLOOR).mean())
