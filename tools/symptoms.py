@@ -16,7 +16,7 @@ import typer
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from segfloor_ros.cloud.labelled_cloud import FLOOR, OBSTACLE, read_ply
+from segfloor_ros.cloud import FLOOR, OBSTACLE, read_ply
 
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import announcing, console
