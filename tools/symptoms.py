@@ -16,10 +16,10 @@ import typer
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from segfloor_ros.cloud import FLOOR, OBSTACLE, read_ply
 
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import announcing, console
+from segfloor_ros.cloud import FLOOR, OBSTACLE, read_ply
 from segfloor_ros.evaluation.map_score import compare, draw_overlay
 from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.files.results import write_file
