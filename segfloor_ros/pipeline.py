@@ -23,9 +23,8 @@ from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.semantics.frames import ImageLabeller
 from segfloor_ros.semantics.label_map import LabelMap, Labels
-from segfloor_ros.semantics.network import Network
+from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.slam.results import (
     FrameResult,
     Keyframe,

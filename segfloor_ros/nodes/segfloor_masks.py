@@ -36,9 +36,8 @@ from segfloor_ros.messages.topics import (
 )
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
-from segfloor_ros.semantics.frames import ImageLabeller
 from segfloor_ros.semantics.label_map import LabelMap, numbered
-from segfloor_ros.semantics.network import Network
+from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.slam.results import KeyframePath
 
 IMAGE, KEYFRAME, INFO = 'left/image_raw', *KEYFRAME_PARTS[:2]

@@ -1,12 +1,16 @@
-"""A segmentation network in an ONNX file, with a YAML file beside it that says how to use it."""
+"""A segmentation network in an ONNX file, with a YAML file beside it that says how to use it; and
+beside a drive, where it looks at each image once, on a thread of its own.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
+import threading
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,15 +19,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import silent_libraries
 from segfloor_ros.files.whole import read_bytes, read_yaml
 from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.semantics.outputs import KINDS, UNLABELLED, Segments
 from segfloor_ros.settings import suggestion
+from segfloor_ros.slam.moving.scene_flow import MAX_MOVING_SHARE
+from segfloor_ros.slam.tracking.images import union
+from segfloor_ros.timing import StageTimes
 
 Run = Callable[[NDArray[np.float32]], list[NDArray[Any]]]
 """Gets the input (1, C, h, w) and returns the outputs in the order of the file."""
+
+logger = logging.getLogger(__name__)
+
+KEPT = 32
+"""Images whose labels are kept: as many frames as lie between an image and its keyframe's turn."""
 
 
 @dataclass(frozen=True)
@@ -217,3 +230,69 @@ def _first_line(error: BaseException) -> str:
     """Return what an error of a library says, short."""
     lines = str(error).replace('OpenCV', '').splitlines() or [type(error).__name__]
     return lines[0].rpartition('error: ')[2].strip()[:80]
+
+
+class ImageLabeller:
+    """Labels the images of a drive; may be asked by several threads.
+
+    remarks: what is wrong with what the network sees, in words.
+    """
+
+    def __init__(self, network: Network, times: StageTimes | None = None) -> None:
+        self.network = network
+        self.remarks: list[str] = []
+        self._times = times or StageTimes()
+        self._lock = threading.Lock()
+        self._known: dict[int, NDArray[np.uint8]] = {}
+
+    @property
+    def classes(self) -> list[str]:
+        """The names of the classes."""
+        return self.network.settings.classes
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the network looks at keyframes alone, once they are keyframes."""
+        return self.network.settings.every == 0
+
+    def labels(self, stamp_ns: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the labels (H, W) of the image of a stamp. Raises InputError."""
+        with self._lock:
+            if stamp_ns not in self._known:
+                with self._times.measure('network'):
+                    self._known[stamp_ns] = self.network.infer(image).labels
+                if len(self._known) > KEPT:
+                    del self._known[next(iter(self._known))]
+            return self._known[stamp_ns]
+
+    def says(self, stamp_ns: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return what the network says of the floor in an image (H, W), as `Network.says`. Where
+        nearly all of the image moves, it is wrong, or nothing can be seen beside it: nothing does.
+        """
+        said = self.network.says(self.labels(stamp_ns, image))
+        share = float((said == MOVING).mean())
+        if share > MAX_MOVING_SHARE:
+            self._remark(
+                f'{self.network.name}: {100 * share:.0f} % of an image are of classes that move; '
+                f'masks of more than {100 * MAX_MOVING_SHARE:.0f} % are not used'
+            )
+            said = np.where(said == MOVING, np.uint8(NO_EVIDENCE), said)
+        return said
+
+    def moving(self, stamp_ns: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the mask (H, W) of what may move in an image, 255."""
+        return np.where(self.says(stamp_ns, image) == MOVING, np.uint8(255), np.uint8(0))
+
+    def with_masks(self, frames: Iterator[StereoFrame]) -> Iterator[StereoFrame]:
+        """Yield the frames with masks: that of the last one that the network has looked at."""
+        every = self.network.settings.every
+        mask: NDArray[np.uint8] | None = None
+        for number, frame in enumerate(frames):
+            if every and number % every == 0:
+                mask = self.moving(frame.stamp_ns, frame.left)
+            yield dataclasses.replace(frame, excluded=union(frame.excluded, mask))
+
+    def _remark(self, words: str) -> None:
+        if not self.remarks:
+            self.remarks.append(words)
+            logger.warning('%s', words)

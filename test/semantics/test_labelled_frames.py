@@ -9,8 +9,7 @@ from small_network import constant_network, grey_network
 
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE
-from segfloor_ros.semantics.frames import ImageLabeller
-from segfloor_ros.semantics.network import Network
+from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.timing import StageTimes
 
 
