@@ -245,7 +245,7 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the pose (4, 4) at a share of the way from one pose to another: the position on the
     straight line, the rotation on the shortest turn.
     """
-    from scipy.spatial.transform import Rotation  # see geometry.py
+    from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_matrix(T_a[:3, :3].T @ T_b[:3, :3]).as_rotvec()
     rotation = T_a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()

@@ -107,7 +107,7 @@ class Mount:
     def T_base_left(self) -> Array:
         """The pose (4, 4) of the left optical frame in the base frame; not to be written to."""
         angles = [self.yaw_rad, self.pitch_rad, self.roll_rad]
-        from scipy.spatial.transform import Rotation  # see geometry.py
+        from scipy.spatial.transform import Rotation  # as in geometry.py
 
         R_base_camera = Rotation.from_euler('ZYX', angles).as_matrix()
         translation = np.array([self.forward_m, self.left_m, self.height_m])

@@ -63,6 +63,11 @@ def test_floor_has_its_class_where_it_lies_and_follows_its_keyframe():
     assert left[0] > 0.3 and left[1] > 0.1 and right[1] < -0.1
     moved = stage.cells(grid(FREE), path((1.0, -0.5)))
     np.testing.assert_allclose(where(moved, 0) - left, [1.0, -0.5], atol=0.05)
+    # A quarter turn to the left: what was ahead is to the left, what was to the left is behind.
+    turned = path((1.0, -0.5))
+    turned.T_map_base[0, :2, :2] = [[0, -1], [1, 0]]
+    here = where(stage.cells(grid(FREE, 120), turned), 0) - (1.0, -0.5)
+    np.testing.assert_allclose(here, [-left[1], left[0]], atol=0.1)
     assert (stage.cells(grid(FREE), path()) == UNLABELLED).all()
     # What is seen as floor is no class of what stands there.
     assert (stage.cells(grid(OCCUPIED), path((0, 0))) == UNLABELLED).all()

@@ -272,7 +272,7 @@ def read_wheel_odometry(path: Path) -> list[WheelPose]:
             f'{path}, pose {bad[0] + 1}: the quaternion has length {norms[bad[0]]:.3g}, not 1; '
             f'expected {TUM_COLUMNS}'
         )
-    from scipy.spatial.transform import Rotation  # see geometry.py
+    from scipy.spatial.transform import Rotation  # as in geometry.py
 
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(table[:, 3:7]).as_matrix()
