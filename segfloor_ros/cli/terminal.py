@@ -184,9 +184,6 @@ def within(
 Input = Annotated[
     str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')
 ]
-Start = Annotated[int | None, typer.Option('--start', help='First frame that is read.')]
-Frames = Annotated[int | None, typer.Option('--frames', help='How many frames are read.')]
-Every = Annotated[int | None, typer.Option('--every', help='Read every n-th frame only.')]
 Out = Annotated[Path, typer.Option('--out', help='Folder for the results.')]
 Params = Annotated[
     Path | None,
@@ -202,47 +199,12 @@ Set = Annotated[
     list[str] | None,
     typer.Option('--set', help='One parameter, e.g. occupancy_grid.resolution_m=0.02; repeatable.'),
 ]
-Masks = Annotated[
-    Path | None,
-    typer.Option(
-        '--masks',
-        help='Folder of masks of what moves: %06d.png by frame index, of the left image as '
-        'recorded, 255 = moving.',
-    ),
-]
-NetworkFile = Annotated[
-    Path | None,
-    typer.Option(
-        '--network',
-        metavar='FILE.onnx',
-        help='Segmentation network: tells what moves and what is floor; a YAML file of the same '
-        'name says how.',
-    ),
-]
 Ignore = Annotated[
     str | None,
     typer.Option('--ignore', help='Sensors to leave out, with commas: wheel_odometry, imu.'),
 ]
 Depth = Annotated[
     bool, typer.Option('--depth', help='Take depth images in place of the right ones.')
-]
-SaveMask = Annotated[
-    SaveMasks, typer.Option('--save-masks', help='Floor masks to save; all of them by run only.')
-]
-SaveMap = Annotated[
-    Path | None,
-    typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
-]
-LoadMap = Annotated[Path | None, typer.Option('--load-map', help='Saved map to go on mapping in.')]
-Localize = Annotated[
-    bool,
-    typer.Option('--localize', help='Poses in the map of --load-map only; nothing is added to it.'),
-]
-Report = Annotated[
-    bool, typer.Option('--report', help='Write report.html: everything about the run on one page.')
-]
-NoMap = Annotated[
-    bool, typer.Option('--no-map', help='The path alone: no floor is looked for, no map made.')
 ]
 View = Annotated[
     str | None,
@@ -260,9 +222,9 @@ class InputOptions:
     """A recording, or a part of it, with the parameters it is read with."""
 
     input: Input
-    start: Start = None
-    frames: Frames = None
-    every: Every = None
+    start: Annotated[int | None, typer.Option('--start', help='First frame that is read.')] = None
+    frames: Annotated[int | None, typer.Option('--frames', help='How many frames are read.')] = None
+    every: Annotated[int | None, typer.Option('--every', help='Read every n-th frame only.')] = None
     params: Params = None
     assignments: Set = None
 
@@ -281,14 +243,47 @@ class DriveOptions(InputOptions):
     out: Out
     ignore: Ignore = None
     depth: Depth = False
-    masks: Masks = None
-    network: NetworkFile = None
-    save_masks: SaveMask = SaveMasks.keyframes
-    save_map: SaveMap = None
-    load_map: LoadMap = None
-    localize: Localize = False
-    no_map: NoMap = False
-    report: Report = False
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            '--masks',
+            help='Folder of masks of what moves: %06d.png by frame index, of the left image as '
+            'recorded, 255 = moving.',
+        ),
+    ] = None
+    network: Annotated[
+        Path | None,
+        typer.Option(
+            '--network',
+            metavar='FILE.onnx',
+            help='Segmentation network: tells what moves and what is floor; a YAML file of the '
+            'same name says how.',
+        ),
+    ] = None
+    save_masks: Annotated[
+        SaveMasks,
+        typer.Option('--save-masks', help='Floor masks to save; all of them by run only.'),
+    ] = SaveMasks.keyframes
+    save_map: Annotated[
+        Path | None,
+        typer.Option('--save-map', help='File to save the whole map to, to go on with later.'),
+    ] = None
+    load_map: Annotated[
+        Path | None, typer.Option('--load-map', help='Saved map to go on mapping in.')
+    ] = None
+    localize: Annotated[
+        bool,
+        typer.Option(
+            '--localize', help='Poses in the map of --load-map only; nothing is added to it.'
+        ),
+    ] = False
+    no_map: Annotated[
+        bool, typer.Option('--no-map', help='The path alone: no floor is looked for, no map made.')
+    ] = False
+    report: Annotated[
+        bool,
+        typer.Option('--report', help='Write report.html: everything about the run on one page.'),
+    ] = False
     view: View = None
 
     @property
