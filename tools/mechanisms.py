@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.mask.filling import fill_to_contact
+from segfloor_ros.floor.mask.filling import fill_regions, fill_to_contact
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
@@ -60,6 +60,21 @@ def _with_any_contact(
     view: Any, mask: Any, alike: Any, disparity: Any, compared: Any, textured: Any
 ) -> Any:
     return fill_to_contact(view, mask, alike, disparity, compared, np.ones_like(textured))
+
+
+def _filled_whatever_stands(
+    view: Any,
+    mask: Any,
+    image: Any,
+    disparity: Any,
+    compared: Any,
+    textured: Any,
+    standing: Any,
+    barred: Any,
+) -> Any:
+    return fill_regions(
+        view, mask, image, disparity, compared, textured, _nowhere(standing), barred
+    )
 
 
 SLAM: dict[str, Mechanism] = {
@@ -133,6 +148,12 @@ FLOOR: dict[str, Mechanism] = {
     ),
     'what stands beside the left border': Mechanism(
         {'floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
+    ),
+    'floor beside the profile': Mechanism(
+        {'floor.segmentation.lies_on_floor': lambda view, disparity, _: _nowhere(disparity)}
+    ),
+    'what stands is not filled': Mechanism(
+        {'floor.segmentation.fill_regions': _filled_whatever_stands}
     ),
     'trimming to edges': Mechanism({'floor.segmentation.trim_to_edges': _first}),
     'what hangs at the height of the robot': Mechanism(

@@ -19,8 +19,10 @@ from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
     COARSE_ABOVE_PX,
+    MEAN_NOISE,
     NOISE_PX,
     RUN_UP_ROWS,
+    SIGMAS,
     TwoScaleMatcher,
     disparity_range,
     stereo_view,
@@ -47,11 +49,14 @@ from segfloor_ros.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,
     Evidence,
+    Heights,
     HeightTable,
     compare,
     compare_measured,
     enough_texture,
     judge,
+    lies_on_floor,
+    mean_height,
     noise_grey,
     row_slope,
     texture_grey,
@@ -167,14 +172,16 @@ class FloorSegmentation:
             counted = filtered_v_disparity(view, below, texture > 2 * enough, most, BINS_PER_PX)
             profile = fit_profile(counted, view.line, self._camera)
         with measure('comparison'):
+            heights = self._heights(view, profile, below, measured is not None)
+            on_floor = lies_on_floor(view, below, heights)
             if measured is None:
-                compared = compare(view, profile, left_rows, right_rows, below, noise)
+                compared = compare(view, profile, left_rows, right_rows, below, on_floor, noise)
             else:
-                compared = compare_measured(view, profile, below, NOISE_PX)
+                compared = compare_measured(view, profile, below, on_floor, NOISE_PX)
         with measure('evidence'):
-            left_view, is_measured = left[columns], measured is not None
-            evidence = self._evidence(
-                view, profile, below, left_view, texture, enough, compared, is_measured
+            left_view = left[columns]
+            evidence = _evidence(
+                view, below, left_view, texture, enough, compared, heights, self._settings
             )
             clear_hidden(evidence.mask, moving, columns)
             below_said = None if said is None else said[columns]
@@ -196,29 +203,13 @@ class FloorSegmentation:
             scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy)
         return self._observation(view, profile, disparity, mask, scan, counted)
 
-    def _evidence(
-        self,
-        view: FloorView,
-        profile: FloorProfile,
-        below: NDArray[np.float32],
-        left: NDArray[np.uint8],
-        texture: NDArray[np.float32],
-        enough: float,
-        compared: Comparison,
-        measured: bool,
-    ) -> Evidence:
-        """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
-        open where they do not look like floor and are not measured to lie on it.
-        """
-        settings = self._settings
+    def _heights(
+        self, view: FloorView, profile: FloorProfile, below: NDArray[np.float32], measured: bool
+    ) -> Heights:
         constant = self._camera.disparity_times_depth if measured else None
         most = self._matcher.num_disparities
-        table = HeightTable.of(view.line, profile, most, settings, constant)
-        mask, above, off = judge(view, profile, below, texture > enough, compared, table, settings)
-        seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
-        odd = unlike_floor(left, seen == FLOOR)
-        seen[(seen == FLOOR) & odd & off] = NO_EVIDENCE
-        return Evidence(seen, above & (texture >= _LEAST_SHARE * enough), off, odd)
+        table = HeightTable.of(view.line, profile, most, self._settings, constant)
+        return Heights.of(view, table, below)
 
     def _observation(
         self,
@@ -300,7 +291,9 @@ class FloorSegmentation:
         left = np.ascontiguousarray(left_rows[:, :: view.step])
         for _ in range(2):
             barred = beside | odd
-            mask = fill_regions(view, mask, left_rows, disparity, compared, textured, barred)
+            mask = fill_regions(
+                view, mask, left_rows, disparity, compared, textured, evidence.standing, barred
+            )
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
             odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
@@ -337,6 +330,28 @@ class FloorSegmentation:
         hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
         upright_xy = np.hstack([upright_xy, hanging_xy])
         return self._scanner.scan(floor, shared, upright_xy, feet_xy, 1 / (2 * view.step))
+
+
+def _evidence(
+    view: FloorView,
+    below: NDArray[np.float32],
+    left: NDArray[np.uint8],
+    texture: NDArray[np.float32],
+    enough: float,
+    compared: Comparison,
+    heights: Heights,
+    settings: FloorSegmentationSettings,
+) -> Evidence:
+    """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
+    open where they do not look like floor and are not measured to lie on it.
+    """
+    mask = judge(view, below, texture > enough, compared, heights, settings)
+    seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
+    odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
+    off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
+    seen[(seen == FLOOR) & odd & off] = NO_EVIDENCE
+    above = (heights.height > 0) & (texture >= _LEAST_SHARE * enough)
+    return Evidence(seen, above, off, standing, odd)
 
 
 def _feet(

@@ -212,6 +212,17 @@ def test_a_ramp_is_floor_when_nothing_else_is_in_sight(floor_kind):
     assert recall > 0.8
 
 
+@pytest.mark.parametrize('fall', [0.02, 0.04])
+def test_a_road_that_falls_to_both_sides_is_floor(fall):
+    """Its profile is that of the middle: at 0.5 m to the side it lies 1 or 2 cm lower."""
+    sides = [Patch((-1.0, 0, 0), (9.0, 0, 0), (0, 2.0 * y, -2.0 * fall), True) for y in (1, -1)]
+    scene = Scene([*sides, wall()])
+    observation, floor, depth = segment(scene)
+    aside_m = np.abs(points_of(scene, depth)[..., 1])
+    near = floor & (depth > 0.5) & (depth < 2.0) & (aside_m < 0.5)
+    assert (observation.mask == FLOOR)[near].mean() > 0.94
+
+
 @pytest.mark.parametrize('drop_m', [0.10, 0.15])
 def test_the_floor_below_a_kerb_is_not_floor(drop_m):
     lower = dataclasses.replace(floor_patch(near_m=1.5, height_m=-drop_m), is_floor=False)

@@ -62,16 +62,17 @@ def fill_regions(
     disparity: NDArray[np.float32],
     compared: Comparison,
     textured: NDArray[np.bool_],
+    standing: NDArray[np.bool_],
     barred: NDArray[np.bool_],
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    image: whole image rows (R, image width). barred: (R, W), where no region goes on. A region is
-    bounded by edges of the image stronger than most of the floor's own; floor by evidence must be
-    in a share of its columns. In it a pixel becomes floor below floor, the next evidence up its
-    column; or between floor on its left and right; or, if it is not blank, nearer than any of its
-    floor.
+    image: whole image rows (R, image width). standing: (R, W), what is measured above the floor.
+    barred: (R, W), where no region goes on. A region is bounded by edges of the image stronger than
+    most of the floor's own; floor by evidence must be in a share of its columns. In it a pixel
+    becomes floor below floor, the next evidence up its column; or between floor on its left and
+    right; or, if it is not blank and not measured above the floor, nearer than any of its floor.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
@@ -92,7 +93,7 @@ def fill_regions(
     )
     rows = np.arange(small.shape[0], dtype=np.float32)[:, None]
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
-    nearer = (rows >= highest) & (not_blank > 0)
+    nearer = (rows >= highest) & (not_blank > 0) & ~standing[part]
     fill = inside & (nearer | _next_to_floor(small))
     fill &= ~barred[part]
     mask = with_floor(mask, _enlarged(fill, mask))

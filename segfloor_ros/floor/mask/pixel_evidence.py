@@ -15,6 +15,7 @@ something.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -22,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import SUBPIXEL, measured_sigma_px
-from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SIGMAS
+from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SAME_PX, SIGMAS
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
 from segfloor_ros.floor.disparity.view import STEP_PX, FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 
 _MIN_DISPARITY_PX = 2.5
 """Farther floor is not judged."""
-_SURE_SHARE = 1.5
+_SURE_SHARE = np.float32(1.5)
 """Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
@@ -131,63 +132,106 @@ class HeightTable:
 
 @dataclass(frozen=True)
 class Evidence:
-    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off: what is
-    matched off it, in the mean of its neighbours, farther than noise explains; odd: what does not
-    look like floor.
+    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off,
+    standing: what is matched off it in the mean of its neighbours, farther than their noise
+    explains, and above it, farther than that of a single one; odd: what does not look like floor.
     """
 
     mask: NDArray[np.uint8]
     above: NDArray[np.bool_]
     off: NDArray[np.bool_]
+    standing: NDArray[np.bool_]
     odd: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Heights:
+    """What disparities say of how high pixels lie, (R, W). table, index: their disparity step in
+    it. height: float32 in metres. above, off: bool, higher than floor can be, or lower, too.
+    """
+
+    table: HeightTable
+    index: NDArray[np.int32]
+    height: NDArray[np.float32]
+    above: NDArray[np.bool_]
+    off: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: FloorView, table: HeightTable, disparity: NDArray[np.float32]) -> Heights:
+        """Return the heights of the pixels of a view, of known disparities (R, W)."""
+        # What is nearer than the table goes is no lower than what is as near as that.
+        last = np.float32(len(table.row) - 1)
+        index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
+        height = table.offset.take(index) - table.scale.take(index) * view.derolled
+        above = height > table.up.take(index)
+        return cls(table, index, height, above, above | (height < -table.down.take(index)))
 
 
 def judge(
     view: FloorView,
-    profile: FloorProfile,
     disparity: NDArray[np.float32],
     textured: NDArray[np.bool_],
     compared: Comparison,
-    table: HeightTable,
+    heights: Heights,
     settings: FloorSegmentationSettings,
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return what the pixels (R, W) of the view say by themselves: mask, above, off of `Evidence`.
+) -> NDArray[np.uint8]:
+    """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
 
     textured: where a disparity means something; compared: what the images say of the floor. A
     disparity makes floor only where the images agree, and denies it only where they do.
     """
-    # What is nearer than the table goes is no lower than what is as near as that.
-    last = np.float32(len(table.row) - 1)
-    index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
-    height = table.offset.take(index) - table.scale.take(index) * view.derolled
-    up = table.up.take(index)
-    above = height > up
-    off = above | (height < -table.down.take(index))
+    table, above, off = heights.table, heights.above, heights.off
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
     near = disparity >= np.float32(_MIN_DISPARITY_PX)
     # On a sill the images contradict the floor, and show that it is a sill.
-    sill = compared.against & (np.abs(height) <= np.float32(settings.step_height_m))
-    sill &= up < np.float32(_SURE_SHARE * settings.step_height_m)
+    step_m, up = np.float32(settings.step_height_m), table.up.take(heights.index)
+    sill = compared.against & (np.abs(heights.height) <= step_m) & (up < _SURE_SHARE * step_m)
     floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
     mask[floor] = FLOOR
     mask[off & sure] = NOT_FLOOR
-    low = above & sure & (height < up + np.float32(_CONTACT_HEIGHT_M))
-    mask[_below_contact(view, table.row, index, low)] = NOT_FLOOR
+    low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
+    mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
-    return mask, height > 0, _off_floor(height / table.noise.take(index))
+    return mask
 
 
-def _off_floor(sigmas: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell where heights (R, W), in sigmas, are off the floor in the mean of their neighbours."""
+def mean_height(heights: Heights) -> NDArray[np.float32]:
+    """Return the height above the floor of each pixel (R, W) in the mean of its neighbours, in
+    sigmas of one of them; NaN where that is not known.
+    """
+    return _mean_of_neighbours(heights.height / heights.table.noise.take(heights.index))
+
+
+def lies_on_floor(
+    view: FloorView, disparity: NDArray[np.float32], heights: Heights
+) -> NDArray[np.bool_]:
+    """Tell which pixels (R, W) have a disparity of a floor, and rise down the image as one does in
+    the mean of their neighbours: the foot of what stands is no higher than a floor, but steeper.
+
+    They are compared with so far above and below that floor differs by more than noise.
+    """
+    half = min(math.ceil(SAME_PX / view.line.slope), len(disparity) // 2)
+    rise = np.full_like(disparity, np.nan)
+    above, below = disparity[: -2 * half], disparity[2 * half :]
+    expected = np.float32(2 * half * view.line.slope)
+    rise[half:-half] = np.where((above > 0) & (below > 0), below - above - expected, np.nan)
+    noise_px = math.sqrt(2) * NOISE_PX
+    mean = _mean_of_neighbours(rise / np.float32(noise_px))
+    return (disparity > 0) & ~heights.off & (np.abs(mean) < SIGMAS * MEAN_NOISE)
+
+
+def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean of what is known around each pixel (R, W), NaN where that is too little. One
+    that is far off counts for no more than a few.
+    """
     window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
     known = np.isfinite(sigmas)
     share = cv2.blur(known.astype(np.float32), window)
-    # One that is far off speaks for no more than a few.
     bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
-    mean = cv2.blur(bounded, window)
-    return (np.abs(mean) > np.float32(SIGMAS * MEAN_NOISE) * share) & (share > _LEAST_KNOWN)
+    mean = cv2.blur(bounded, window) / np.maximum(share, np.float32(_LEAST_KNOWN))
+    return np.where(share > _LEAST_KNOWN, mean, np.float32(np.nan))
 
 
 def _below_contact(
@@ -261,12 +305,14 @@ def compare(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
     disparity: NDArray[np.float32],
+    on_floor: NDArray[np.bool_],
     noise_grey: float,
 ) -> Comparison:
     """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
 
-    left, right: whole image rows (R, image width). Where the right image does not reach,
-    nothing speaks against the floor nor for it.
+    left, right: whole image rows (R, image width). on_floor: (R, W), where the disparities are
+    those of a floor, though not of the profile: it bends only along the way. Where the right image
+    does not reach, nothing speaks against the floor nor for it.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     sampled = left[::STEP_PX, ::STEP_PX]
@@ -280,7 +326,8 @@ def compare(
         seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return _local_difference(sampled, seen)
 
-    floor, matched = difference(floor_px), difference(matched_px)
+    matched = difference(matched_px)
+    floor = difference(np.where(on_floor[part], matched_px, floor_px))
     margin = _AGAINST_GREY + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
     unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
@@ -297,13 +344,18 @@ def compare(
 
 
 def compare_measured(
-    view: FloorView, profile: FloorProfile, disparity: NDArray[np.float32], noise_px: float
+    view: FloorView,
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    on_floor: NDArray[np.bool_],
+    noise_px: float,
 ) -> Comparison:
     """Compare the floor with disparities (R, W) that a depth camera measured, 0 for none: there is
-    no right image to look at. noise_px: of the disparities, one sigma.
+    no right image to look at. on_floor: as of `compare`. noise_px: of the disparities, one sigma.
     """
     floor_px = profile.at_pixels(view.derolled)
     against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(SIGMAS * noise_px))
+    against &= ~on_floor
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
 

@@ -50,3 +50,15 @@ def test_a_blank_board_of_the_shade_of_the_floor_is_not_filled(floor_kind):
     mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
     # No more than three rows at its foot.
     assert ((mask == FLOOR) & ~floor).sum() < 3 * CAMERA.fx * width_m / ahead_m
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+@pytest.mark.parametrize('contrast', [2.0, 3.0])
+def test_a_near_board_of_hardly_any_texture_is_not_filled(floor_kind, contrast):
+    """What it shows is too little to deny the floor; its disparities say that it stands."""
+    grey, shared = floor_kind.get('grey', 120.0), {'seed': 7, 'contrast': contrast}
+    board = Patch((0.7, -1.5, 0.0), (0, 1.6, 0), (0, 0, 1.5), False, grey=grey, **shared)
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), board])
+    left, right, floor, depth = scene.render()
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.02
