@@ -202,6 +202,7 @@ class LockstepRun:
             for result in self._attempt(self._frames, self._pipeline.finish_tracking) or []:
                 self._note(result)
             grid = self._pipeline.finish()
+            self._say_faults()
         finally:
             self._pipeline.close()
         wall_s = time.perf_counter() - start
@@ -302,10 +303,14 @@ class LockstepRun:
         return frames if labeller is None else prefetched(labeller.with_masks(frames))
 
     def _say_faults(self) -> None:
-        for fault in self._pipeline.slam.rig_check.faults.values():
-            if fault.fault not in self._faults_said:
-                self._faults_said.add(fault.fault)
-                logger.warning('%s: %s', self._configuration.stereo_camera.input, fault.line())
+        faults = self._pipeline.slam.rig_check.faults
+        lines = {name: fault.line() for name, fault in faults.items()}
+        fixture = self._pipeline.keyframe_stages.floor.fixture
+        if fixture.problem is not None:
+            lines['fixture'] = fixture.problem
+        for name in sorted(lines.keys() - self._faults_said):
+            self._faults_said.add(name)
+            logger.warning('%s: %s', self._configuration.stereo_camera.input, lines[name])
 
     def _attempt(self, index: int, step: Callable[[], T]) -> T | None:
         """Return what a step returns, None where it fails at what a frame shows: that one is lost,
@@ -388,10 +393,7 @@ class LockstepRun:
             loop_times_s=self._loop_times_s,
             map_updates=pipeline.keyframe_stages.map_updates,
             sensors=self._sensors_used(),
-            sensor_remarks=[
-                *slam.sensors.remarks.values(),
-                *pipeline.keyframe_stages.network_remarks,
-            ],
+            sensor_remarks=[*slam.sensors.remarks.values(), *pipeline.keyframe_stages.remarks],
             input_faults=slam.rig_check.as_dicts(),
             failed_frames=self._failed_frames,
             failed_keyframes=pipeline.failed_keyframes,

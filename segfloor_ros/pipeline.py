@@ -75,7 +75,7 @@ class KeyframeStages:
         if labeller is not None:
             height_m = configuration.floor_segmentation.robot_height_m
             self._label_map = LabelMap(camera, len(labeller.classes), height_m)
-        self._floor = FloorSegmentation(camera, configuration.floor_segmentation)
+        self.floor = FloorSegmentation(camera, configuration.floor_segmentation)
         self._labelling = CloudLabelling(configuration.cloud_labelling)
         self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
 
@@ -85,7 +85,7 @@ class KeyframeStages:
         if self._labeller is not None:
             said = self._labeller.says(keyframe.stamp_ns, keyframe.left)
         with self._times.measure('floor_segmentation'):
-            floor = self._floor.process(
+            floor = self.floor.process(
                 keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving, said
             )
         if self._labeller is not None and self._label_map is not None:
@@ -118,12 +118,11 @@ class KeyframeStages:
         self.map_updates += 1
 
     @property
-    def network_remarks(self) -> list[str]:
-        """What is wrong with what the network sees, in words."""
-        if self._labeller is None:
-            return []
-        of_floor = self._floor.network.remark
-        return [*self._labeller.remarks, *([of_floor] if of_floor else [])]
+    def remarks(self) -> list[str]:
+        """What is wrong with what the network sees, and with the mount, in words."""
+        of_network = self._labeller.remarks if self._labeller is not None else []
+        of_floor = self.floor.network.remark, self.floor.fixture.problem
+        return [*of_network, *filter(None, of_floor)]
 
     def labels(self, grid: OccupancyGrid | None, path: KeyframePath) -> Labels | None:
         """Return the labels of the map, with its keyframes where they lie now; None where no

@@ -72,7 +72,7 @@ from segfloor_ros.floor.observation import (
     FloorSegmentationSettings,
     VDisparity,
 )
-from segfloor_ros.floor.plane.plane import expectations, plane_of_frame
+from segfloor_ros.floor.plane.plane import Fixture, expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.tracking.images import union
@@ -116,6 +116,7 @@ class FloorSegmentation:
         self._settings = settings
         self.network = NetworkFloor()
         self._mount: Mount | None = None
+        self.fixture = Fixture()
         self._matcher: TwoScaleMatcher
         self._overhead: OverheadMatcher
         self._scanner: FloorScanner
@@ -165,7 +166,11 @@ class FloorSegmentation:
                 disparity[said == NOT_FLOOR] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
-            fit = plane_of_frame(self._camera, first_row, below, texture, enough, expected)
+            is_fixed = self.fixture.problem is None
+            fit = plane_of_frame(
+                self._camera, first_row, below, texture, enough, expected, is_fixed
+            )
+            self.fixture.note(fit)
         view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
         with measure('profile'):
             most = self._matcher.num_disparities
@@ -191,6 +196,8 @@ class FloorSegmentation:
             mask = self._fill(
                 view, profile, below, evidence, left_rows, textured, compared, below_said
             )
+            if not (is_fixed or fit.is_seen):
+                mask[mask == FLOOR] = NO_EVIDENCE
             clear_hidden(mask, moving, columns)
         with measure(DISPARITY_ABOVE):
             hanging_xy = self._overhead.positions(

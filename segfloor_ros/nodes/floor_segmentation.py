@@ -148,6 +148,8 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
         said = grey8_image(parts[SEMANTIC_MASK], SEMANTIC_MASK) if SEMANTIC_MASK in parts else None
         floor = stage.process(left, right, self.mount, T_map_base, moving, said)
+        if stage.fixture.problem is not None:
+            self.reporter.diagnose('fixture', stage.fixture.problem, lasts_s=float('inf'))
         out, at = self.outputs, (stamp_ns, frame_id)
         out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
         scan = scan_message(stamp_ns, self._base_frame, floor.scan)

@@ -44,6 +44,9 @@ START_NS, LOST_NS = 1_000_000_000, 1_500_000_000
 """For how long the camera is looked for in the map: of a new drive in the map that was loaded, and
 of one that got lost or was broken off. After that it maps on its own."""
 
+LOOK_NS = 500_000_000
+"""While the mount is not known the floor is looked at so often where no keyframe comes."""
+
 HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
 ORB-SLAM2, 2017, does the same)."""
@@ -97,6 +100,7 @@ class StereoSlam:
         self._held = HeldResults()
         self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
+        self._looked_ns = 0
         self._patience_ns = LOST_NS
         self._began_unsure: tuple[Array, Array] | None = None
         self._late: list[tuple[KeyframeRecord, Region]] = []
@@ -173,6 +177,8 @@ class StereoSlam:
         if is_wanted:
             with self._times.measure('mapping'):
                 keyframe = self._add_keyframe(frame, images, track, searched)
+        if track is not None or keyframe is not None:
+            self._look_for_mount(frame, keyframe is not None)
         result = self._result(frame, track, fault, keyframe)
         if searched is not None:
             result = replace(result, moving=searched.points)
@@ -335,11 +341,19 @@ class StereoSlam:
             self._began_unsure = None
             self._held.change(in_merged_map(self.map, self.front_end.motion.T_world_odom))
         self.front_end.continue_from(images, keyframe)
-        if self.mount is None and self._mount_meter is not None:
-            up = self.sensors.gravity.up_world
-            self._mount_meter.add(frame.left, frame.right, keyframe.T_world_camera, up)
-            self.rig.mount = self._mount_meter.mount
         return take_snapshot(self.map, keyframe, frame, images.excluded)
+
+    def _look_for_mount(self, frame: StereoFrame, is_new_view: bool) -> None:
+        """Look for the floor at a keyframe; at other frames now and then: a camera that stands may
+        see it better than in its first image, or know by now where up is.
+        """
+        is_due = is_new_view or frame.stamp_ns - self._looked_ns >= LOOK_NS
+        if self.mount is None and self._mount_meter is not None and is_due:
+            self._looked_ns = frame.stamp_ns
+            T_world_camera = invert(self.front_end.motion.T_camera_world)
+            up = self.sensors.gravity.up_world
+            self._mount_meter.add(frame.left, frame.right, T_world_camera, up, is_new_view)
+            self.rig.mount = self._mount_meter.mount
 
     def _take_adjustment(self, wait: bool) -> None:
         """Bring a finished adjustment into the map."""
@@ -427,13 +441,15 @@ class MountMeter(Protocol):
         right: NDArray[np.uint8],
         T_world_left: Array,
         up_world: Up | None,
+        is_new_view: bool,
     ) -> None:
-        """Take in one keyframe: rectified images (H, W), camera pose (4, 4) in the first one's
-        frame, and where an accelerometer has up in that frame.
+        """Take in one frame: rectified images (H, W), camera pose (4, 4) in the first one's frame,
+        and where an accelerometer has up in that frame. is_new_view: whether it is a keyframe;
+        others show what the last one does, and take its place.
         """
 
     def reset(self) -> None:
-        """Forget all keyframes: where the next ones are relative to them is not known."""
+        """Forget all frames: where the next ones are relative to them is not known."""
 
     @property
     def mount(self) -> Mount | None:

@@ -30,7 +30,7 @@ from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorS
 
 _MIN_DISPARITY_PX = 2.5
 """Farther floor is not judged."""
-_SURE_SHARE = np.float32(1.5)
+_SURE_SHARE = 1.5
 """Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""

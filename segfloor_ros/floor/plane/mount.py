@@ -35,7 +35,9 @@ from segfloor_ros.floor.mask.pixel_evidence import (
 )
 from segfloor_ros.floor.plane.plane import (
     LEVEL_SIGMA,
+    LOOKS,
     SAMPLES,
+    SWAY,
     PlaneFit,
     Samples,
     angles_height_of,
@@ -58,20 +60,12 @@ _PROPOSALS, _KEPT = 200, 60
 _COMPARED = 6000
 """So many samples of all frames together are compared with a plane: neighbours err together."""
 _LEAST_SAMPLES = 20
-_LEAST_SUPPORT, _MAX_VIOLATIONS = 0.08, 0.05
-"""A floor is so much of what is seen where it is visible, and so little is seen below it."""
 _SIGMA = np.array([math.radians(0.4), math.radians(1.0), 0.015])
 """How well pitch, roll and height, as a share of it, must be known."""
-_LOOKS = 4
-"""By so many frames it is seen how much a plane varies."""
 _SURE = 3.0
 """Sigmas within which nearly all lies: guesses, or what is seen but once, are no surer."""
 _FLOOR_SLOPE = math.radians(1.5)
 """Floors on which robots start are level, more or less."""
-_SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
-"""How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
-as standard deviations: robots sway, and where they are is known so well.
-"""
 _HEIGHT_TOLERANCE = 0.05
 _TILT_TOLERANCE_DEG = 1.0
 MAX_KEYFRAMES = 20
@@ -140,14 +134,18 @@ class MountEstimator:
         right: NDArray[np.uint8],
         T_world_left: Array,
         up_world: Up | None = None,
+        is_new_view: bool = True,
     ) -> None:
         """Use one more rectified grey pair (H, W) uint8.
 
         T_world_left: pose (4, 4) of the camera in a frame whose origin is the first camera's.
-        up_world: where an accelerometer has up in that frame.
+        up_world: where an accelerometer has up in that frame. is_new_view: else it shows what the
+        last one does, and takes its place: their errors are the same.
         """
         if self.mount is not None:
             return
+        if not is_new_view:
+            del self._poses[-1:]
         self._poses.append(T_world_left)
         right, measured = stereo_view(left, right)
         disparity = self._viewer.disparity(left, right) if measured is None else measured
@@ -155,9 +153,10 @@ class MountEstimator:
         needed = enough if measured is None else None
         surfaces = self._viewer.surfaces(left, disparity, needed, T_world_left)
         prior = level_prior(up_world)
-        if not self._settles(self._surfaces, self._surfaces.add(surfaces, prior, [])):
+        fit = self._surfaces.add(surfaces, prior, [], is_new_view)
+        if not self._settles(self._surfaces, fit):
             bases = self._viewer.bases(left, disparity, enough, T_world_left)
-            fit = self._bases.add(bases, prior, self._surfaces.frames)
+            fit = self._bases.add(bases, prior, self._surfaces.frames, is_new_view)
             self._settles(self._bases, fit)
 
     def _settles(self, search: PlaneSearch, fit: PlaneFit | None) -> bool:
@@ -178,7 +177,7 @@ class MountEstimator:
         heights_m = height_m + poses[:, :3, 3] @ normal
         seen = angles_height_of((normal @ poses[:, :3, :3]) / heights_m[:, None])
         spread = seen.std(axis=0) / (1.0, 1.0, height_m)
-        return bool(heights_m.min() > 0 and (spread < _SWAY).all())
+        return bool(heights_m.min() > 0 and (spread < SWAY).all())
 
 
 def level_prior(up: Up | None) -> tuple[Array, Array]:
@@ -200,19 +199,29 @@ class PlaneSearch:
         self._known = known
         self._rng = np.random.default_rng(0)
         self._guesses = np.zeros((0, 3))
+        self._looks = 0
         self.frames: list[Samples] = []
         self.fits: list[PlaneFit] = []
+        self._before = self.frames, self.fits
 
     def add(
-        self, samples: Samples, prior: tuple[Array, Array], contrary: list[Samples]
+        self,
+        samples: Samples,
+        prior: tuple[Array, Array],
+        contrary: list[Samples],
+        is_new_view: bool = True,
     ) -> PlaneFit | None:
         """Take in the samples of a frame and return the plane, None where none is plausible.
 
         prior: pitch, roll and height (3,) that are expected, and their standard deviations.
         contrary: further samples, which can but speak against a plane, by lying below it.
+        is_new_view: else the samples take the place of those of the last view.
         """
+        if is_new_view:
+            self._before = self.frames, self.fits
         if len(samples.weight) < _LEAST_SAMPLES or samples.weight.sum() < 1:
             return None
+        self.frames, self.fits = self._before
         frames = self.frames = [*self.frames, samples][-_MAX_FRAMES:]
         mean, sigma = prior
         positions = np.array([frame.position_m for frame in frames])
@@ -236,25 +245,26 @@ class PlaneSearch:
             fit = replace(fit, violations=below)
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
         self._guesses = self._guesses[plausible(self._guesses)]
-        self.fits.append(fit)
+        self.fits = [*self.fits, fit]
+        self._looks += 1
         return fit
 
     def is_known(self) -> bool:
         """Tell whether the last plane is known: by its own covariance and by how much it varies
-        from frame to frame, as what is wrong in all frames of a scene is in no covariance. One look
+        from frame to frame, as what is wrong in all frames of a scene is in no covariance. One view
         is enough where that of a single one is much smaller. In the end a plane that is off by some
         per cent is better than none.
         """
         fit, count = self.fits[-1], len(self.fits)
+        is_late = self._looks >= MAX_KEYFRAMES
         sigma = fit.sigma / (1.0, 1.0, fit.angles_height[2])
         if count > 1 or (_SURE * sigma > _SIGMA).any():
-            recent = np.array([one.angles_height for one in self.fits[-_LOOKS:]])
+            recent = np.array([one.angles_height for one in self.fits[-LOOKS:]])
             sigma = np.hypot(sigma, recent.std(axis=0) / (1.0, 1.0, fit.angles_height[2]))
-            if count < _LOOKS:
+            if count < LOOKS and not is_late:
                 return False
-        limit = _SIGMA * (2 if count >= MAX_KEYFRAMES else 1)
-        seen = fit.support > _LEAST_SUPPORT and fit.violations < _MAX_VIOLATIONS
-        return seen and bool((sigma < limit).all())
+        limit = _SIGMA * (2 if is_late else 1)
+        return fit.is_seen and bool((sigma < limit).all())
 
 
 def _thinned(frames: list[Samples]) -> list[Samples]:
@@ -340,7 +350,7 @@ class MountViewer:
         if enough is not None:
             slope, block = texture_grey(left, 1), (BLOCK_PX, BLOCK_PX)
             texture = cv2.blur(slope, block)[rows, columns]
-            weight = texture_weight(texture, 1.25 * enough)
+            weight = texture_weight(texture, MORE_TEXTURE * enough)
             # A disparity is that of the texture in its block, and belongs where that is.
             slope *= np.arange(len(left), dtype=np.float32)[:, None]
             shown_at = cv2.blur(slope, block)[rows, columns] / np.maximum(texture, 1e-6)

@@ -104,6 +104,16 @@ class Samples:
         return self.weight * np.where(is_rise(self.rise, slope), 1.0, _FLAT_WEIGHT)
 
 
+LOOKS = 4
+"""By so many frames it is seen how much a plane varies."""
+SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
+"""How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
+as standard deviations: robots sway, and where they are is known so well.
+"""
+_LEAST_SUPPORT, _MAX_VIOLATIONS = 0.08, 0.05
+"""A floor is so much of what is seen where it is visible, and so little is seen below it."""
+
+
 @dataclass(frozen=True)
 class PlaneFit:
     """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the first camera;
@@ -115,6 +125,35 @@ class PlaneFit:
     sigma: Array
     support: float
     violations: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether enough is seen on it, and little enough below it, for a floor."""
+        return self.support > _LEAST_SUPPORT and self.violations < _MAX_VIOLATIONS
+
+
+class Fixture:
+    """Whether the camera is fixed to its base: then the planes of all frames lie equally far below
+    it. problem: in words, once they do not. A hand does not hold a camera like that.
+    """
+
+    def __init__(self) -> None:
+        self.problem: str | None = None
+        self._heights_m: list[float] = []
+
+    def note(self, fit: PlaneFit) -> None:
+        """Take in the plane of a frame."""
+        if not fit.is_seen:
+            return
+        heights_m = self._heights_m
+        heights_m.append(float(fit.angles_height[2]))
+        spread_m = float(np.std(heights_m))
+        if len(heights_m) >= LOOKS and spread_m > SWAY[2] * float(np.median(heights_m)):
+            varies_m = max(heights_m) - min(heights_m)
+            self.problem = (
+                'the camera is not fixed to its base: its height above the floor varies by '
+                f'{varies_m:.2f} m; fix it. There is floor only where an image shows its plane'
+            )
 
 
 def plane_of(angles_height: Array) -> Array:
@@ -344,11 +383,12 @@ def plane_of_frame(
     texture: NDArray[np.float32],
     enough: float,
     expected: Array,
+    is_fixed: bool = True,
 ) -> PlaneFit:
     """Return the plane of the floor in a frame, in its own camera's axes.
 
     disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
-    that is no noise. expected: (P, 3), as of `expectations`.
+    that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
     """
     step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
     part = disparity[::step, ::step]
@@ -362,7 +402,7 @@ def plane_of_frame(
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight, np.eye(4))
     share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
-    start = expected[likeliest(share, expected)]
+    start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
     return refine([samples], start, unknown, still, start, sigma, _NEAR_SCALES_PX)

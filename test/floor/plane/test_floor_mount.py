@@ -8,10 +8,11 @@ import pytest
 from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.floor.plane.mount import MountEstimator, disagreement
+from segfloor_ros.floor.plane.mount import MAX_KEYFRAMES, MountEstimator, disagreement
 from segfloor_ros.floor.plane.plane import mean_climb
 from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.stereo_slam import LOOK_NS
 
 
 def estimate(scene: Scene, **known) -> Mount | None:
@@ -272,3 +273,28 @@ def test_car_on_a_road(shared_data):
     mount = measured(shared_data / 'kitti06', range(0, 30, 3))
     assert mount is not None
     assert mount.height_m == pytest.approx(1.65, abs=0.05)
+
+
+def test_a_camera_that_stands_has_a_mount_too():
+    """It has but one keyframe. Its floor is seen ever again, and no better: it takes some time."""
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)], camera=SMALL_CAMERA)
+    slam = make_slam(SMALL_CAMERA, StereoSlamSettings())
+    results = []
+    for i in range(MAX_KEYFRAMES):
+        left, right, _, _ = replace(scene, seed=i).render()
+        results += slam.process(StereoFrame(i, i * LOOK_NS, left, right))
+    assert len(slam.map.keyframes) == 1
+    assert slam.mount is not None
+    assert slam.mount.height_m == pytest.approx(0.3, rel=0.03)
+    # What was held back comes, with the keyframe.
+    assert [result.index for result in results] == list(range(MAX_KEYFRAMES))
+    assert results[0].keyframe is not None
+
+
+def test_looks_at_one_view_are_worth_one():
+    scene = Scene([floor_patch(contrast=6.0), wall()], camera=SMALL_CAMERA, noise_grey=3.0)
+    estimator = MountEstimator(SMALL_CAMERA)
+    left, right, _, _ = scene.render()
+    for i in range(MAX_KEYFRAMES - 1):
+        estimator.add(left, right, np.eye(4), is_new_view=i == 0)
+    assert estimator.mount is None

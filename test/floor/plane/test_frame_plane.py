@@ -1,12 +1,17 @@
 """The plane of the floor in one frame: as the camera is mounted, or level in the map."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA
+from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.floor.disparity.profile import FloorLine
+from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame
+from segfloor_ros.floor.segmentation import FloorSegmentation
 
 
 def pitched(pitch_deg: float):
@@ -65,3 +70,36 @@ def test_rows_of_a_view_that_begins_below_the_top_are_those_of_the_image(camera)
     fit = plane_of_frame(camera, first_row, disparity, texture, 1.0, expectations(MOUNT, np.eye(4)))
     found = [true.pitch_rad, true.roll_rad, true.height_m]
     np.testing.assert_allclose(fit.angles_height, found, atol=0.004)
+
+
+def carried(heights_m: list[float], *patches: Patch) -> FloorSegmentation:
+    """Return what segments the images of a camera that is carried at these heights in turn, and is
+    said to sit 0.30 m above the floor.
+    """
+    stage = FloorSegmentation(SMALL_CAMERA, FloorSegmentationSettings())
+    for height_m in heights_m:
+        held = replace(MOUNT, height_m=height_m)
+        left, right, _, _ = Scene(list(patches), SMALL_CAMERA, held).render()
+        stage.process(left, right, MOUNT, held.T_base_left @ np.linalg.inv(MOUNT.T_base_left))
+    return stage
+
+
+def test_a_camera_in_a_hand_is_said_to_be_in_one():
+    scene = floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)
+    assert carried([0.30, 0.303, 0.30, 0.297, 0.30], *scene).fixture.problem is None
+    problem = carried([0.30, 0.33, 0.37, 0.40, 0.42], *scene).fixture.problem
+    assert problem is not None
+    varies_m = float(re.search(r'varies by (\d\.\d\d) m', problem)[1])
+    assert varies_m == pytest.approx(0.12, abs=0.02)
+
+
+def test_a_camera_in_a_hand_shows_floor_where_its_plane_is_seen():
+    """It is turned to a wall, all that it sees: nothing says how high it is then."""
+    scene = floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)
+    stage = carried([0.30, 0.33, 0.37, 0.40, 0.42], *scene)
+    for patches, sees_floor in ((scene, True), ((wall(0.4),), False)):
+        held = replace(MOUNT, height_m=0.45)
+        left, right, _, _ = Scene(list(patches), SMALL_CAMERA, held).render()
+        pose = held.T_base_left @ np.linalg.inv(MOUNT.T_base_left)
+        mask = stage.process(left, right, MOUNT, pose).mask
+        assert (mask == FLOOR).any() == sees_floor
