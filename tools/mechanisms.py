@@ -94,7 +94,7 @@ SLAM: dict[str, Mechanism] = {
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
     'relocalisation by two frames': Mechanism(
         {
-            'slam.places.place_recognition.FRAMES_IN_A_ROW': 1,
+            'slam.places.place_recognition.TIMES_SURE': 1,
             'slam.places.place_recognition.MIN_AGREEMENT': 0.0,
         }
     ),
