@@ -38,6 +38,7 @@ from segfloor_ros.messages.topics import (
 )
 from segfloor_ros.navigation import Explorer
 from segfloor_ros.processes import Interrupt
+from segfloor_ros.slam.results import UNKNOWN_COVARIANCE
 
 OnMap = Callable[[float, OccupancyGrid, str], None]
 """Told the time of the robot, the map and the phase."""
@@ -108,7 +109,7 @@ class Pilot:
         """When the last frame came, in real time."""
         self._waiting: dict[int, float] = {}
         self._scans: dict[int, FloorScan] = {}
-        self._poses: dict[int, Array] = {}
+        self._poses: dict[int, Array | None] = {}
         self._obstacles = np.zeros((0, 3))
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
@@ -175,7 +176,8 @@ class Pilot:
         self._waiting[stamp_ns] = self.last_sign_s
 
     def _take_pose(self, message: Any) -> None:
-        self._poses[stamp_of(message)] = pose_array(message.pose.pose)
+        is_known = message.pose.covariance[0] < UNKNOWN_COVARIANCE
+        self._poses[stamp_of(message)] = pose_array(message.pose.pose) if is_known else None
         self.answer()
 
     def _take_scan(self, message: Any) -> None:

@@ -142,7 +142,8 @@ class FrameResult:
     is that of wheels or a gyroscope alone. keyframe: set when
     this frame became one. moving: what moves, where this frame was searched for it. in_submap:
     whether it was mapped in a submap beside the map: `tracked` where it was merged later. repeated:
-    whether the left image is the one before, bit for bit.
+    whether the left image is the one before, bit for bit. outside: whether `map` is a frame of its
+    own, for the map that was loaded is not recognised yet.
     """
 
     index: int
@@ -159,10 +160,15 @@ class FrameResult:
     blind: bool = False
     in_submap: bool = False
     repeated: bool = False
+    outside: bool = False
 
     @property
     def covariance_in_map(self) -> Array:
-        """The covariance (6, 6) in the axes of `map`."""
+        """The covariance (6, 6) in the axes of `map`; outside of a loaded one the place in it is
+        not known.
+        """
+        if self.outside:
+            return np.eye(6) * UNKNOWN_COVARIANCE
         axes = np.kron(np.eye(2), self.T_map_odom[:3, :3])
         return np.asarray(axes @ self.covariance @ axes.T)
 

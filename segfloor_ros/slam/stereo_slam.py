@@ -402,6 +402,7 @@ class StereoSlam:
             blind=is_blind,
             in_submap=self.back_end.submap is Submap.LOST,
             repeated=self.front_end.repeats.is_repeated,
+            outside=self.back_end.submap is Submap.OUTSIDE,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -256,11 +257,22 @@ def test_load_map_takes_all_nodes_to_another_map(saved, drive, make_graph, tmp_p
 
 def test_a_map_that_was_not_recognised_is_not_overwritten(saved, loaded) -> None:
     before = saved[0].read_bytes()
-    chain = loaded()
+    chain, transforms = loaded(), []
+    with suppress(ImportError):
+        from tf2_msgs.msg import TFMessage
+
+        take = lambda message: transforms.extend(message.transforms)  # noqa: E731
+        chain.graph.tester.create_subscription(TFMessage, '/tf', take, 100)
     room = StereoRoom(seed=77)
     other = [room.frame(k, planar_pose(0.06 * k, 0.0, 0.01 * k)) for k in range(16)]
     answers = chain.drive(other)
     chain.mapped(last_keyframe(answers))
+    # Where the robot is in the loaded map is not known: tf does not say it, poses are unsure.
+    tracked = [a.stamp_ns for a in answers if a.values['tracked'] == '1']
+    chain.graph.until(lambda: len(chain.heard['pose']) >= len(tracked), 'poses')
+    assert tracked
+    assert all(message.pose.covariance[0] >= 1e6 for message in chain.heard['pose'])
+    assert {(t.header.frame_id, t.child_frame_id) for t in transforms} <= {('odom', 'base_link')}
     answer = chain.save(saved[0])
     assert (answer.success, 'stays as it was' in answer.message) == (False, True)
     assert saved[0].read_bytes() == before

@@ -8,7 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, StereoSlamSettings
 from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import load_slam, moved, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -197,6 +197,10 @@ def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mappe
     assert len(apart) > 10
     first = apart[0]
     np.testing.assert_allclose(first.T_map_odom @ first.T_odom_base, np.eye(4), atol=1e-6)
+    # Until then nobody is to take the frame of its own for that of the map.
+    assert all(r.outside == ('outside' in r.state) for r in results if r.tracked)
+    assert min(np.diag(r.covariance_in_map).min() for r in apart) == UNKNOWN_COVARIANCE
+    assert np.diag(results[-1].covariance_in_map).max() < 0.01
     last = [r.keyframe for r in results if r.keyframe][-1]
     before = [r.keyframe for r in apart if r.keyframe]
     assert len(before[0].path.stamp_ns) == 1

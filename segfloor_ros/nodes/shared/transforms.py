@@ -221,19 +221,20 @@ class Transforms:
         self._link.send_fixed(transform_message(stamp_ns, base, root, T_base_root))
 
     def broadcast(self, result: FrameResult) -> None:
-        """Broadcast the frames at one frame of the camera; while lost no pose is."""
+        """Broadcast the frames at one frame of the camera; while lost no pose is, and outside of a
+        loaded map none in it.
+        """
         if not self._link.is_there or not self._own.publish_tf:
             return
         if self._is_fused:
-            if result.tracked:
+            if result.tracked and not result.outside:
                 self._uncorrected.append(result)
             self._correct()
         elif result.tracked:
             own, stamp_ns = self._own, result.stamp_ns
-            pairs = (
-                (own.map_frame, own.odom_frame, result.T_map_odom),
-                (own.odom_frame, own.base_frame, result.T_odom_base),
-            )
+            pairs = [(own.odom_frame, own.base_frame, result.T_odom_base)]
+            if not result.outside:
+                pairs.insert(0, (own.map_frame, own.odom_frame, result.T_map_odom))
             self._link.send(*(transform_message(stamp_ns, *pair) for pair in pairs))
 
     def _correct(self) -> None:
