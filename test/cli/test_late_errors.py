@@ -83,7 +83,9 @@ def stop_midway(process: subprocess.Popen[str], folder: Path, number: int) -> st
     return ' '.join(errors.split())
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_an_interrupt_keeps_what_is_mapped_and_no_whole_result_goes(drive, tmp_path, number):
     out, saved = tmp_path / 'out', tmp_path / 'room.map'
     process = run(drive, '--out', out, '--save-map', saved)

@@ -102,8 +102,20 @@ def test_nothing_of_a_check_listens(room, tmp_path):
         check.communicate(timeout=60)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-@pytest.mark.parametrize('jobs', ['1', '2'])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ('jobs', 'number'),
+    [
+        ('2', signal.SIGINT),
+        ('1', signal.SIGTERM),
+        ('2', signal.SIGKILL),
+        pytest.param('1', signal.SIGINT, marks=SLOW),
+        pytest.param('2', signal.SIGTERM, marks=SLOW),
+        pytest.param('1', signal.SIGKILL, marks=SLOW),
+    ],
+)
 def test_a_killed_check_leaves_nothing(room, tmp_path, number, jobs):
     (temporary := tmp_path / 'temporary').mkdir()
     check = start_check(
