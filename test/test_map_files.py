@@ -83,8 +83,27 @@ def test_labels_and_evidence_move_along(first, second, merged):
     np.testing.assert_array_equal(parts['cloud']['point_id'], parts['slam']['point_stable_id'])
     assert set(parts['grid']['stamp_ns']) <= set(parts['slam']['keyframe_stamp_ns'])
     assert np.all(np.diff(parts['slam']['keyframe_stamp_ns']) > 0)
+    assert np.all(np.diff(parts['grid']['stamp_ns']) > 0)
     free = [(m.grid().cells == FREE).sum() for m in (first, second, merged)]
     assert max(free[:2]) < free[2] < sum(free[:2])
+
+
+def heights_m(saved):
+    """Return the heights above the floor by which the points of a map were judged, by id."""
+    known, cloud = saved.file.parts['cloud'], loaded_map(saved.file, 0).cloud
+    z_m = cloud.xyz_map[np.searchsorted(cloud.point_id, known['point_id']), 2]
+    return dict(zip(known['point_id'].tolist(), z_m - known['floor_z_m'], strict=True))
+
+
+def test_points_of_the_second_map_are_as_high_above_their_floor_as_before(first, second, merged):
+    before, after = heights_m(second), heights_m(merged)
+    count = int(first.slam['num_ever'][0])
+    own = [i for i in before if i + count in after]
+    assert len(own) > 200
+    expected = np.array([before[i] for i in own])
+    # A point that is in both maps lies where both saw it.
+    gap_m = np.abs(np.array([after[i + count] for i in own]) - expected)
+    assert np.median(gap_m) < 1e-5
 
 
 def test_a_robot_goes_on_with_a_merged_map(merged):
