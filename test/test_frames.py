@@ -16,13 +16,14 @@ def at(x: float, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
 def test_frames_are_found_up_and_down_the_tree() -> None:
     tree = FrameTree()
     tree.add_fixed('base', 'mast', at(0.0, 0.0, np.pi / 2))
-    tree.add_fixed('mast', 'left', at(1.0))
-    tree.add_fixed('mast', 'right', at(2.0))
+    left, right = at(1.0, 0.0, 0.7), at(2.0, 0.5, -0.3)
+    tree.add_fixed('mast', 'left', left)
+    tree.add_fixed('mast', 'right', right)
     # The mast points to the base's left: its x is the base's y.
     T_base_left = tree.lookup('base', 'left')
     assert T_base_left is not None
     np.testing.assert_allclose(T_base_left[:3, 3], [0.0, 1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(tree.lookup('left', 'right'), at(1.0), atol=1e-12)
+    np.testing.assert_allclose(left @ tree.lookup('left', 'right'), right, atol=1e-12)
     np.testing.assert_allclose(tree.lookup('left', 'base') @ T_base_left, np.eye(4), atol=1e-12)
     np.testing.assert_allclose(tree.lookup('left', 'left'), np.eye(4))
     assert tree.root_of('right') == 'base'
@@ -41,7 +42,8 @@ def test_between_two_times_position_and_turn_are_interpolated() -> None:
     tree = FrameTree()
     tree.add_moving(10 * S, 'odom', 'base', at(0.0, 0.0, 0.0))
     tree.add_moving(12 * S, 'odom', 'base', at(4.0, 2.0, 0.8))
-    np.testing.assert_allclose(tree.lookup('odom', 'base', 11 * S), at(2.0, 1.0, 0.4), atol=1e-12)
+    at_a_quarter = tree.lookup('odom', 'base', 10 * S + S // 2)
+    np.testing.assert_allclose(at_a_quarter, at(1.0, 0.5, 0.2), atol=1e-12)
     np.testing.assert_allclose(tree.lookup('odom', 'base', 10 * S), at(0.0))
     np.testing.assert_allclose(tree.lookup('odom', 'base'), at(4.0, 2.0, 0.8))
     assert tree.lookup('odom', 'base', 9 * S) is None

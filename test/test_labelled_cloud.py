@@ -114,6 +114,21 @@ def test_removed_points_disappear_moved_ones_move_ids_stay() -> None:
     np.testing.assert_allclose(labelled.xyz_map[1], [2.5, 0.1, 0.5])
 
 
+def test_what_is_known_of_a_cloud_waits_until_its_points_are_there_again() -> None:
+    """Another map took its place, and was merged with it."""
+    labelling = CloudLabelling(CloudLabellingSettings())
+    first = {2: (1.0, 0.0, 0.0), 4: (2.0, 0.0, 0.5)}
+    second = {10: (5.0, 0.0, 0.5), 11: (6.0, 0.0, 0.5), 12: (5.0, 1.0, 0.0)}
+    seen = features({2: ON_FLOOR, 4: ON_OBSTACLE})
+    labelling.update(cloud(first), seen, MASK, HERE)
+    seen = features({10: ON_OBSTACLE, 11: ON_OBSTACLE, 12: ON_FLOOR})
+    labelled = labelling.update(cloud(second), seen, MASK, HERE)
+    of_second = {10: OBSTACLE, 11: OBSTACLE, 12: FLOOR}
+    assert label_of(labelled) == of_second
+    both = labelling.update(cloud(first | second), features({}), MASK, HERE)
+    assert label_of(both) == {2: FLOOR, 4: OBSTACLE} | of_second
+
+
 def test_heights_are_those_above_the_floor_below_the_base() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     points = cloud({1: (1.0, 0.0, 2.0), 2: (1.0, 0.0, 2.3)})

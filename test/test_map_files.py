@@ -150,7 +150,11 @@ def test_what_has_come_and_what_has_gone(first):
         assert set(np.unique(change)) == {0, sign}
         at = (np.argwhere(change == sign)[:, ::-1] + 0.5) * whole.resolution_m
         assert np.abs(at + whole.origin_xy_m - xy_m).max() < 0.15
-        colours = draw_changes(whole, change).reshape(-1, 3)
+        picture = draw_changes(whole, change)
+        zoom = len(picture) // len(change)
+        shown = (picture[::zoom, ::zoom] == (APPEARED_BGR if sign > 0 else GONE_BGR)).all(axis=2)
+        np.testing.assert_array_equal(shown[::-1], change == sign)  # y is up
+        colours = picture.reshape(-1, 3)
         assert {APPEARED_BGR, GONE_BGR} & set(map(tuple, colours.tolist())) == {
             APPEARED_BGR if sign > 0 else GONE_BGR
         }
