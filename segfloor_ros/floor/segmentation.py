@@ -36,6 +36,7 @@ from segfloor_ros.floor.disparity.profile import (
 )
 from segfloor_ros.floor.disparity.view import FloorView, column_step, filtered_v_disparity
 from segfloor_ros.floor.mask.filling import (
+    NetworkFloor,
     beside_something,
     blank_feet,
     drop_islands,
@@ -44,7 +45,6 @@ from segfloor_ros.floor.mask.filling import (
     trim_to_edges,
     with_floor,
 )
-from segfloor_ros.floor.mask.network_floor import NetworkFloor
 from segfloor_ros.floor.mask.pixel_evidence import (
     TEXTURE_WINDOW_PX,
     Comparison,

@@ -5,6 +5,8 @@ Plain floor shows nothing that both cameras see alike, but what stands behind it
 surface has the disparity of the floor on which it stands. Where a plain stretch that begins with
 floor, or at the lower edge of the image, ends at such a surface, and at the row where that surface
 meets the floor, all of it is floor.
+
+How far what a network calls floor can be believed: as often as geometry agreed so far.
 """
 
 from __future__ import annotations
@@ -53,6 +55,10 @@ _WEAK_EDGE = 16
 _SETTLED_ROWS = 9
 """So far above an edge, what is measured over a window does not know of it."""
 _LEAST_BLANK_ROWS = 3
+
+TRUSTED = 0.9
+"""Probability that what a network calls floor is floor, from which on it counts where nothing is
+measured."""
 
 
 def fill_regions(
@@ -358,3 +364,38 @@ class Runs:
         edges[1:-1:2], edges[2:-1:2], edges[-1] = start, start + length, height * width
         inside = np.arange(len(edges) - 1) % 2 == 1
         return np.repeat(inside, np.diff(edges)).reshape(height, width)
+
+
+class NetworkFloor:
+    """Compares what a network calls floor with what is measured, keyframe by keyframe."""
+
+    def __init__(self) -> None:
+        self._agreed = 0.0
+        self._keyframes = 0
+
+    @property
+    def probability(self) -> float:
+        """That what the network calls floor is floor, by the rule of succession (Laplace): one
+        half before anything is known.
+        """
+        return (self._agreed + 1) / (self._keyframes + 2)
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether it counts."""
+        return self.probability > TRUSTED
+
+    @property
+    def remark(self) -> str:
+        """What is wrong with the network, in words, once that is certain."""
+        if self.is_trusted or self._keyframes * (1 - TRUSTED) < 1:
+            return ''
+        share = self._agreed / self._keyframes
+        return f'of what the network calls floor {100 * share:.0f} % is: it is not used as floor'
+
+    def note(self, said: NDArray[np.uint8], measured: NDArray[np.uint8]) -> None:
+        """Compare what is said (R, W) of a keyframe with its mask (R, W) without the network."""
+        decided = measured[(said == FLOOR) & (measured != NO_EVIDENCE)]
+        if len(decided):
+            self._agreed += float((decided == FLOOR).mean())
+            self._keyframes += 1

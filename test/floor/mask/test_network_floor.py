@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from floor_scenes import SMALL_CAMERA, Scene, floor_patch, wall
 
-from segfloor_ros.floor.mask.network_floor import TRUSTED, NetworkFloor
+from segfloor_ros.floor.mask.filling import TRUSTED, NetworkFloor
 from segfloor_ros.floor.observation import (
     FLOOR,
     MOVING,
