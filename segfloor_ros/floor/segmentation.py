@@ -249,7 +249,7 @@ class FloorSegmentation:
         if mount == self._mount:
             return
         self._make_tools(mount)
-        self._mount = mount
+        self._mount, self.fixture = mount, Fixture()
 
     def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)

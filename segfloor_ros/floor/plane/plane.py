@@ -110,6 +110,8 @@ SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
 """How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
 as standard deviations: robots sway, and where they are is known so well.
 """
+_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
+"""One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MAX_VIOLATIONS = 0.08, 0.05
 """A floor is so much of what is seen where it is visible, and so little is seen below it."""
 
@@ -145,14 +147,12 @@ class Fixture:
         """Take in the plane of a frame."""
         if not fit.is_seen:
             return
-        heights_m = self._heights_m
-        heights_m.append(float(fit.angles_height[2]))
-        spread_m = float(np.std(heights_m))
-        if len(heights_m) >= LOOKS and spread_m > SWAY[2] * float(np.median(heights_m)):
-            varies_m = max(heights_m) - min(heights_m)
+        self._heights_m.append(float(fit.angles_height[2]))
+        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
+        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
             self.problem = (
                 'the camera is not fixed to its base: its height above the floor varies by '
-                f'{varies_m:.2f} m; fix it. There is floor only where an image shows its plane'
+                f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
             )
 
 

@@ -87,6 +87,7 @@ def carried(heights_m: list[float], *patches: Patch) -> FloorSegmentation:
 def test_a_camera_in_a_hand_is_said_to_be_in_one():
     scene = floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)
     assert carried([0.30, 0.303, 0.30, 0.297, 0.30], *scene).fixture.problem is None
+    assert carried([*6 * [0.30], 0.40], *scene).fixture.problem is None
     problem = carried([0.30, 0.33, 0.37, 0.40, 0.42], *scene).fixture.problem
     assert problem is not None
     varies_m = float(re.search(r'varies by (\d\.\d\d) m', problem)[1])
