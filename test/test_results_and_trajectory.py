@@ -6,7 +6,12 @@ import pytest
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert, se3_exp
-from segfloor_ros.results_folder import OutputFolder, lost_intervals, submap_intervals
+from segfloor_ros.results_folder import (
+    OutputFolder,
+    lost_intervals,
+    relocalisations,
+    submap_intervals,
+)
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.timing import StageTimes
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
@@ -20,6 +25,14 @@ def test_lost_intervals_are_closed_and_cover_the_ends():
     tracked = np.array([False, True, True, False, False, True, False])
     assert lost_intervals(range(10, 17), tracked) == [(10, 10), (13, 14), (16, 16)]
     assert lost_intervals(range(3), np.ones(3, bool)) == []
+
+
+def test_tracking_is_found_again_at_the_first_stamp_with_a_pose():
+    tracked = np.array([False, True, False, False, True, True, False])
+    stamps = [10**18 + k * 100_000_000 for k in range(7)]
+    (found,) = relocalisations(stamps, tracked)
+    assert found == {'lost_s': pytest.approx(1e9 + 0.2), 'found_s': pytest.approx(1e9 + 0.4)}
+    assert found['found_s'] - found['lost_s'] == pytest.approx(0.2)
 
 
 def test_submaps_say_whether_they_were_merged():
