@@ -190,6 +190,7 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
         'feature_point': point,
         'loop_ends': np.array([(e.i, e.j) for e in loops], np.int32).reshape(-1, 2),
         'loop_T_i_j': _stack([e.T_i_j for e in loops]),
+        'loop_by_floor': np.array([e.by_floor for e in loops], bool),
     }
 
 
@@ -204,8 +205,11 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
         if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
             raise ValueError('features of points that are not there')
         sparse_map.restore(record)
-    ends = zip((arrays['loop_ends'] + first).tolist(), arrays['loop_T_i_j'], strict=True)
-    sparse_map.loops += [LoopEdge(i, j, T) for (i, j), T in ends]
+    ends, T_i_j = (arrays['loop_ends'] + first).tolist(), arrays['loop_T_i_j']
+    # Maps of earlier releases have loops by points alone.
+    by_floor = arrays.get('loop_by_floor', np.zeros(len(ends), bool)).tolist()
+    of_loops = zip(ends, T_i_j, by_floor, strict=True)
+    sparse_map.loops += [LoopEdge(i, j, T, by) for (i, j), T, by in of_loops]
 
 
 def moved(arrays: Arrays, T_new_old: Array) -> Arrays:

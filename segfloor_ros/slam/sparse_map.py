@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Up
 from segfloor_ros.files.results import Arrays, check_lengths
 from segfloor_ros.geometry import Array, invert
+from segfloor_ros.slam.places.ground_views import NOTHING, GroundView
 from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
@@ -207,13 +208,22 @@ class Retirement:
     T_camera_reference: Array
 
 
+LINK_SIGMA, LOOP_FACTOR = (0.01, 0.002), 2.0
+"""Error, m and rad, of the motion between two keyframes that share points, and that of a loop in
+units of it; how far from each other they stand does not matter. What is no larger than that of a
+loop is no drift."""
+
+
 @dataclass(frozen=True)
 class LoopEdge:
-    """Where keyframe i was when it saw the place of keyframe j again: T_i_j (4, 4), of cameras."""
+    """Where keyframe i was when it saw the place of keyframe j again: T_i_j (4, 4), of cameras.
+    by_floor: by the floor alone; else they share points.
+    """
 
     i: int
     j: int
     T_i_j: Array
+    by_floor: bool = False
 
 
 @dataclass(frozen=True)
@@ -240,6 +250,7 @@ class KeyframeRecord:
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
     motion: since the keyframe before, by wheels. up: in the camera, as it was measured.
     links: indices of earlier keyframes that it shared many points with when it was made.
+    ground: what it shows of the floor.
     """
 
     index: int
@@ -253,6 +264,7 @@ class KeyframeRecord:
     up: Up | None = None
     retired: Retirement | None = None
     links: tuple[int, ...] = ()
+    ground: GroundView = NOTHING
 
     @property
     def T_world_camera(self) -> Array:
@@ -391,6 +403,7 @@ class SparseMap:
         keyframe.features = keyframe.features.take(none)
         keyframe.observations = keyframe.observations.take(none)
         keyframe.point_id = keyframe.point_id[none]
+        keyframe.ground = NOTHING
         keyframe.retired = Retirement(
             reference.index, keyframe.T_camera_world @ reference.T_world_camera
         )

@@ -19,6 +19,7 @@ from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
+from segfloor_ros.slam.places.ground_views import GroundViews
 from segfloor_ros.slam.results import (
     NO_POINT,
     UNKNOWN_COVARIANCE,
@@ -97,6 +98,7 @@ class StereoSlam:
         self.rig_check = RigCheck(camera)
         self.front_end = FrontEnd(settings, self.map, self.sensors)
         self.back_end = BackEnd(settings, self.map, self.front_end, background)
+        self._ground = GroundViews(self.rig)
         self._held = HeldResults()
         self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
@@ -323,6 +325,7 @@ class StereoSlam:
             self.map.living(observed.point_id),
             motion.since_keyframe.start(motion.T_camera_world, motion.covariance),
             self.sensors.gravity.up_camera(self.front_end.motion.T_odom_camera),
+            ground=self._ground.take(frame.left),
         )
         patches = sample_patches(images.left, keyframe.observations.uvd_px[:, :2]).astype(np.uint8)
         self.back_end.mapper.insert(keyframe, patches)

@@ -25,6 +25,7 @@ from segfloor_ros.slam.mapping.normal_equations import (
     System,
     cost,
     factors_of,
+    loop_factors,
     normal_equations,
     with_factors,
 )
@@ -39,7 +40,7 @@ from segfloor_ros.slam.rig import (
     residuals,
     squared_norms,
 )
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""
@@ -214,6 +215,7 @@ class MapCopy:
     row: NDArray[np.int32]
     features: list[Observations]
     records: list[KeyframeRecord]
+    loops: list[LoopEdge]
     offset: OffsetEstimate
     up_world: Up | None
 
@@ -245,6 +247,7 @@ def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None)
         edges.row.copy(),
         [k.observations for k in keyframes],
         keyframes,
+        list(sparse_map.loops),
         offset,
         up_world,
     )
@@ -277,7 +280,7 @@ def solve_global(
         np.searchsorted(ids, point),
         gather(copied.features, keyframe, row),
         OffsetEstimate(copied.offset.value_px, NO_OFFSET.information),
-        factors_of(copied.records, slot, copied.up_world),
+        factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)
     return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])

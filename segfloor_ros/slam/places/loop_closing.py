@@ -36,8 +36,6 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.known_views import views_near
 from segfloor_ros.slam.places.loops import (
-    LINK_SIGMA,
-    LOOP_FACTOR,
     LoopChecks,
     LoopDetector,
     Sightings,
@@ -49,7 +47,14 @@ from segfloor_ros.slam.places.place_recognition import TIMES_SURE, PlaceRecognit
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
-from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Match, SparseMap
+from segfloor_ros.slam.sparse_map import (
+    LINK_SIGMA,
+    LOOP_FACTOR,
+    KeyframeRecord,
+    LoopEdge,
+    Match,
+    SparseMap,
+)
 from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
@@ -96,7 +101,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
 
 def _edge(sparse_map: SparseMap, match: Match) -> LoopEdge:
     place = sparse_map.keyframes[match.place]
-    return LoopEdge(match.keyframe, match.place, match.T_camera_world @ place.T_world_camera)
+    T_i_j = match.T_camera_world @ place.T_world_camera
+    return LoopEdge(match.keyframe, match.place, T_i_j, by_floor=len(match.rows) == 0)
 
 
 def solve_closing(closing: Closing) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
+from segfloor_ros.slam.places.ground_views import motion_between, seen_ahead_m
 from segfloor_ros.slam.places.known_views import ALIKE_SHARE, views_near
 from segfloor_ros.slam.places.place_recognition import (
     BEST_GROUPS,
@@ -24,7 +25,7 @@ from segfloor_ros.slam.places.place_recognition import (
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
 from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX, in_view
-from segfloor_ros.slam.sparse_map import KeyframeRecord, Match, SparseMap
+from segfloor_ros.slam.sparse_map import LINK_SIGMA, LOOP_FACTOR, KeyframeRecord, Match, SparseMap
 from segfloor_ros.slam.tracking.map_tracking import Pixels
 
 MAX_MISSES = 1
@@ -32,17 +33,15 @@ MAX_MISSES = 1
 DRIFT_PER_M = 0.04, 0.01
 """Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
 
-LINK_SIGMA, LOOP_FACTOR = (0.01, 0.002), 2.0
-"""Error, m and rad, of the motion between two keyframes that share points, and that of a loop in
-units of it; how far from each other they stand does not matter. What is no larger than that of a
-loop is no drift."""
-
 FREE_DRIFT = 0.3, 0.1
 """Drift, in m and rad, of the shortest of ways."""
 
 MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
 """Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
 as before: floors slope, and carts shake."""
+
+SAME_WAY = 0.7
+"""Cosine between two views up to which the same points are seen; beyond, the floor is."""
 
 IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by this share."""
@@ -91,12 +90,13 @@ class LoopDetector:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
         lengths = path_lengths(self._map, keyframe.index)
         near, far = self._sides(keyframe, lengths)
-        if not far.any():
-            self.reset()
-            return []
         known = self._map.points_of(np.flatnonzero(near))
         look = self._follow if self._sightings.matches else self._find
-        match = look(keyframe, images, far, known)
+        match = look(keyframe, images, far, known) if far.any() else None
+        match = match or self._from_above(keyframe, ~near, lengths)
+        if match is None and not far.any():
+            self.reset()
+            return []
         is_sound = match is not None and self._is_sound(keyframe, match, lengths)
         if not self._sightings.add(match if is_sound else None):
             return []
@@ -140,7 +140,38 @@ class LoopDetector:
         cosine = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2]
         reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths
         # A view shows a place also from some way before and behind it.
-        return (distance < reach + 1.0) & (cosine > 0.7)
+        return (distance < reach + 1.0) & (cosine > SAME_WAY)
+
+    def _from_above(
+        self, keyframe: KeyframeRecord, others: NDArray[np.bool_], lengths: Array
+    ) -> Match | None:
+        """Look for the floor of other keyframes (K,) that look another way; None where they do not
+        agree.
+        """
+        mount, keyframes = self._map.rig.mount, self._map.keyframes
+        if mount is None or not len(keyframe.ground.xy_m):
+            return None
+        T_left_base = invert(mount.T_base_left)
+        middle = T_left_base @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
+        poses = invert(np.stack([k.T_camera_world for k in keyframes]))
+        distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
+        turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= SAME_WAY
+        reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths + seen_ahead_m(mount)
+        near = np.flatnonzero(others & turned & (distance < reach))
+        found: list[Match] = []
+        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
+        for place in near[np.argsort(distance[near])][:PROOF].tolist():
+            ground = keyframes[place].ground
+            T_base_place = motion_between(keyframe.ground, ground, mount.height_m)
+            if T_base_place is not None:
+                T_camera_place = T_left_base @ T_base_place @ mount.T_base_left
+                pose = T_camera_place @ keyframes[place].T_camera_world
+                found.append(Match(keyframe.index, place, pose, *nothing))
+        if not found:
+            return None
+        back = invert(found[0].T_camera_world)
+        agree = all(is_within(match.T_camera_world @ back, AGREE) for match in found[1:])
+        return found[0] if agree else None
 
     def _find(
         self,
@@ -204,7 +235,9 @@ class LoopChecks:
         """
         moved = match.T_camera_world @ keyframe.T_world_camera
         sigma_m, sigma_rad = LINK_SIGMA
-        if is_within(moved, (LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad)):
+        least = LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad
+        # The floor, of which less is in view, is as exact as what keyframes in a row agree on.
+        if is_within(moved, least if len(match.rows) else AGREE):
             return 'no drift'
         (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
         reach = free_m + per_m * length_m, free_rad + rad_per_m * length_m
@@ -224,7 +257,7 @@ class LoopChecks:
         """Return what else speaks against a match, '' for nothing."""
         if not self.is_level(match):
             return 'another floor'
-        if not self._holds_back(keyframe, match):
+        if len(match.rows) and not self._holds_back(keyframe, match):
             return 'not seen from the other side'
         if self._seen_through(keyframe, match) > MAX_SEEN_THROUGH:
             return 'free space through obstacles'
