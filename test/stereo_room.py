@@ -26,8 +26,16 @@ MOUNT = Mount(0.4, 0.15)
 class StereoRoom:
     """Renders stereo pairs of the room for camera poses in world coordinates."""
 
-    def __init__(self, seed: int = 0, contrast: float = 60.0, noise: float = 1.0) -> None:
+    def __init__(
+        self,
+        seed: int = 0,
+        contrast: float = 60.0,
+        noise: float = 1.0,
+        floor: np.ndarray | None = None,
+    ) -> None:
         self._textures, state = _textures(seed, contrast)
+        if floor is not None:
+            self._textures = [*self._textures[:4], floor.astype(np.float32), self._textures[5]]
         self._rng = np.random.default_rng()
         self._rng.bit_generator.state = state
         self._noise = noise

@@ -235,9 +235,7 @@ class LoopChecks:
         """
         moved = match.T_camera_world @ keyframe.T_world_camera
         sigma_m, sigma_rad = LINK_SIGMA
-        least = LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad
-        # The floor, of which less is in view, is as exact as what keyframes in a row agree on.
-        if is_within(moved, least if len(match.rows) else AGREE):
+        if is_within(moved, (LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad)):
             return 'no drift'
         (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
         reach = free_m + per_m * length_m, free_rad + rad_per_m * length_m

@@ -1,0 +1,84 @@
+"""The floor as seen from above: from the opposite side, and where it looks the same elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.geometry import invert
+from segfloor_ros.slam.places.ground_views import NOTHING, GroundViews, motion_between
+from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.saved_slam import load_slam, save_slam
+from segfloor_ros.slam.stereo_slam import StereoSlam
+
+HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)
+RNG = np.random.default_rng(5)
+TILE = np.kron(RNG.integers(60, 200, (8, 8)), np.ones((5, 5)))
+"""0.4 m wide."""
+
+
+def view(room, pose, mount=MOUNT):
+    return GroundViews(Rig(CAMERA, mount)).take(room.view(pose @ MOUNT.T_base_left))
+
+
+def test_the_same_floor_from_the_opposite_side_gives_the_motion_between():
+    room = StereoRoom(1)
+    T = motion_between(view(room, HERE), view(room, OPPOSITE), MOUNT.height_m)
+    off = invert(invert(HERE) @ OPPOSITE) @ T
+    assert np.linalg.norm(off[:3, 3]) < 0.02
+    assert abs(np.arctan2(off[1, 0], off[0, 0])) < 0.01
+
+
+@pytest.mark.parametrize(
+    'floor', [np.tile(TILE, (25, 25)), np.full((1000, 1000), 128)], ids=['tiles', 'plain']
+)
+def test_tiles_and_plain_floor_say_nothing(floor):
+    room = StereoRoom(1, floor=floor)
+    assert motion_between(view(room, HERE), view(room, OPPOSITE), MOUNT.height_m) is None
+
+
+def test_different_floors_have_nothing_in_common():
+    views = view(StereoRoom(1), HERE), view(StereoRoom(2), OPPOSITE)
+    assert motion_between(*views, MOUNT.height_m) is None
+
+
+def test_where_it_is_not_known_how_the_camera_is_mounted_there_is_no_floor():
+    assert view(StereoRoom(1), HERE, mount=None) is NOTHING
+
+
+THERE = [planar_pose(-1.5 + 0.09 * k, 0.0, 0.0) for k in range(34)]
+TURN = [planar_pose(1.47, 0.0, np.pi * k / 26) for k in range(1, 27)]
+BACK = [planar_pose(1.47 - 0.09 * k, 0.0, np.pi) for k in range(1, 34)]
+
+
+@pytest.fixture(scope='module')
+def driven_back():
+    """There, a turn on the spot and back, with a focal length that is 1 % too long."""
+    room = StereoRoom(0)
+    room.reset_noise()
+    camera = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)
+    slam, results = StereoSlam(camera, StereoSlamSettings(num_features=600), MOUNT), []
+    for k, pose in enumerate(THERE + TURN + BACK):
+        results += slam.process(room.frame(k, pose))
+    return slam, results
+
+
+def test_a_corridor_that_is_driven_back_is_known(driven_back):
+    slam, results = driven_back
+    assert len(slam.map.loops) >= 3
+    assert all(loop.by_floor for loop in slam.map.loops)
+    poses = THERE + TURN + BACK
+    off = [
+        invert(invert(poses[0]) @ poses[r.index]) @ r.T_map_odom @ r.T_odom_base for r in results
+    ]
+    # 0.057 m by points alone, which nothing ties together.
+    assert np.linalg.norm(np.array(off)[:, :3, 3], axis=1).max() < 0.04
+
+
+def test_a_saved_map_keeps_what_the_floor_ties_together(driven_back):
+    slam, _ = driven_back
+    again = StereoSlam(slam.rig.camera, StereoSlamSettings())
+    load_slam(again, slam.rig.camera, save_slam(slam, slam.rig.camera), 'x')
+    assert [loop.by_floor for loop in again.map.loops] == [True] * len(slam.map.loops)
