@@ -384,9 +384,9 @@ def _barriers(
     found = np.flatnonzero((said == NOT_FLOOR).any(axis=0) & (rows < said.shape[0] - 1))
     rows = rows[found]
     derolled = rows + view.shear_px[found] + view.first_row
-    below = derolled > view.line.horizon
-    floor_px = profile.at_rows(derolled[below]).astype(np.float32)
-    return view.positions(rows[below], found[below], floor_px)
+    floor_px = profile.at_rows(derolled).astype(np.float32)
+    below = floor_px > 0
+    return view.positions(rows[below], found[below], floor_px[below])
 
 
 def _with_angles(mount: Mount, angles_height: Array) -> Mount:

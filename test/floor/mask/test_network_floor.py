@@ -94,6 +94,23 @@ def test_a_barrier_ends_the_floor_and_stands_in_the_scan_though_floor_is_seen_th
     assert np.nanmax(scan.ranges_m[ahead] * np.cos(scan.bearings_rad[ahead])) < 2.2
 
 
+@pytest.mark.parametrize('below_px', [0, 2, 4, 6])
+def test_a_barrier_that_ends_close_to_the_horizon_stands_nowhere_near(below_px) -> None:
+    """There, no row has a disparity of the floor."""
+    scene = Scene([floor_patch(), wall()], SMALL_CAMERA)
+    horizon = SMALL_CAMERA.cy - SMALL_CAMERA.fy * np.tan(scene.mount.pitch_rad)
+
+    def say(floor):
+        said = np.full(floor.shape, NO_EVIDENCE, np.uint8)
+        said[: int(horizon) + below_px] = NOT_FLOOR
+        return said
+
+    _, without, _ = masks(scene, None)
+    _, seen, _ = masks(scene, say, 1)
+    nearest = [np.nanmin(observed.scan.obstacle_m) for observed in (without[0], seen[0])]
+    assert nearest[1] == pytest.approx(nearest[0], abs=0.05)
+
+
 def test_the_probability_follows_the_rule_of_succession() -> None:
     network, measured = NetworkFloor(), np.full((4, 4), FLOOR, np.uint8)
     said = np.full((4, 4), FLOOR, np.uint8)
