@@ -140,14 +140,15 @@ class SimulatedRobotNode(StageNode[SimulatedRobotNodeSettings]):
         return LOOK_S if index > 1 and self._stamps_ns[index - 2] not in self._commands else 0.0
 
     def _obey(self, index: int, stamp_ns: int) -> None:
-        """Drive as commanded last, or at the frame before the last; not at all after a while
-        without commands.
+        """Drive as commanded last, but not after a while without commands; in step as commanded at
+        the frame before the last, however long ago that is.
         """
         given = self._commands
-        last_ns = max(given, default=0)
+        last_ns, is_late = max(given, default=0), False
         if self._is_in_step:
             last_ns = self._stamps_ns[index - 2] if index > 1 else 0
-        is_late = stamp_ns - last_ns > 1e9 * self.settings.command_timeout_s
+        else:
+            is_late = stamp_ns - last_ns > 1e9 * self.settings.command_timeout_s
         self._robot.drive(*(STOP if is_late or not last_ns else given[last_ns]))
         self._commands = {ns: command for ns, command in given.items() if ns >= last_ns}
 

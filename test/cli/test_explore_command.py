@@ -34,6 +34,18 @@ path: {waypoints: [[0, 0], [0.5, 0]]}
 """
 
 
+CHAMBER = """
+description: As little as can be explored; few and small images keep it below a minute of CPU time.
+seed: 5
+floor: {texture: marble}
+walls:
+  - {points: [[-0.5, -0.6], [1.4, -0.6], [1.4, 0.6], [-0.5, 0.6]], closed: true,
+     texture: rough_plaster, posters: 6}
+camera: {width: 320, height: 240, rate_hz: 3}
+path: {waypoints: [[0, 0], [0.5, 0]]}
+"""
+
+
 def kill_slam_after(seconds: float) -> threading.Timer:
     """Start a timer that kills the node of SLAM that this process has started."""
 
@@ -48,6 +60,19 @@ def kill_slam_after(seconds: float) -> threading.Timer:
     timer = threading.Timer(seconds, kill)
     timer.start()
     return timer
+
+
+@pytest.mark.timeout(600)
+def test_a_robot_maps_a_chamber_and_drives_to_a_goal(tmp_path) -> None:
+    scene, out = tmp_path / 'chamber.yaml', tmp_path / 'out'
+    scene.write_text(CHAMBER)
+    done = segfloor('explore', scene, '--out', out, '--goals', '1', '--minutes', '1')
+    assert done.returncode == 0, done.stderr
+    found = json.loads((out / 'summary.json').read_text())
+    assert found['mapped_share'] > 0.95
+    assert found['bumps'] == 0
+    assert (found['goals_reached'], found['goals_total']) == (1, 1)
+    assert found['path_rmse_m'] < 0.02
 
 
 @pytest.mark.slow
