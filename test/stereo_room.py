@@ -48,12 +48,16 @@ class StereoRoom:
         """Return the grey image (H, W) uint8 seen from an optical frame."""
         directions = (T_world_camera[:3, :3] @ _rays(camera)).astype(np.float32)
         origin = T_world_camera[:3, 3].astype(np.float32)
-        bound = [np.where(directions[k] > 0, ROOM_MAX[k], ROOM_MIN[k]) for k in range(3)]
+        upper = directions > 0
+        bound = [np.where(upper[k], ROOM_MAX[k], ROOM_MIN[k]) for k in range(3)]
         with np.errstate(divide='ignore'):
             to_face = (np.array(bound, np.float32) - origin[:, None]) / directions
-        axis, distance = to_face.argmin(axis=0), to_face.min(axis=0)
-        is_upper = np.take_along_axis(directions, axis[None], 0)[0] > 0
-        image, seen = np.zeros(len(axis), np.float32), 2 * axis + is_upper
+        # Of three rows this is several times faster than argmin.
+        distance = np.minimum(np.minimum(to_face[0], to_face[1]), to_face[2])
+        faces = [np.uint8(2 * k) + upper[k] for k in range(3)]
+        hit = [to_face[k] == distance for k in range(2)]
+        seen = np.where(hit[0], faces[0], np.where(hit[1], faces[1], faces[2]))
+        image = np.zeros(len(seen), np.float32)
         for face in range(6):
             at = np.flatnonzero(seen == face)
             across = [k for k in range(3) if k != face // 2]
