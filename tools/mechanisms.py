@@ -85,7 +85,7 @@ SLAM: dict[str, Mechanism] = {
         {'slam.tracking.map_tracking.views_near': _no_rows}
     ),
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
-    'following between keyframes': Mechanism({'slam.tracking.following.Follower.follow': _none}),
+    'following between keyframes': Mechanism({'slam.tracking.map_tracking.Follower.follow': _none}),
     'disparity offset': Mechanism({'slam.rig.EXPECTED_SIGMA_PX': 0.0}),
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
     'known views': Mechanism({'slam.places.known_views.COVERED_SHARE': 2.0}),

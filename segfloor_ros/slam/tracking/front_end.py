@@ -31,7 +31,6 @@ from segfloor_ros.slam.results import (
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
-from segfloor_ros.slam.tracking.following import Follower
 from segfloor_ros.slam.tracking.images import (
     ImageRotation,
     Images,
@@ -42,7 +41,7 @@ from segfloor_ros.slam.tracking.images import (
     is_inside,
     union,
 )
-from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
+from segfloor_ros.slam.tracking.map_tracking import Follower, LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
 from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
