@@ -165,7 +165,8 @@ def _legend(axes: Axes, colours: dict[str, str]) -> None:
     axes.legend(
         handles=[*lines, *areas],
         loc='upper center',
-        bbox_to_anchor=(0.5, -0.12),
+        bbox_to_anchor=(0.5, 0.0),
+        borderaxespad=4.5,
         ncols=4,
         fontsize=9,
         frameon=False,
