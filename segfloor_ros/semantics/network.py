@@ -207,8 +207,10 @@ def _onnxruntime(path: Path, data: bytes) -> Run:
         raise InputError(
             f'{path}: onnxruntime cannot read this network ({_first_line(error)})'
         ) from None
-    name = session.get_inputs()[0].name
-    return lambda given: session.run(None, {name: given})
+    first = session.get_inputs()[0]
+    # Mask R-CNN of torchvision takes one image (C, h, w).
+    has_batch = len(first.shape) == 4
+    return lambda given: session.run(None, {first.name: given if has_batch else given[0]})
 
 
 RUNTIMES: dict[str, Callable[[Path, bytes], Run]] = {'opencv': _opencv, 'onnxruntime': _onnxruntime}

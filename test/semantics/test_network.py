@@ -33,6 +33,21 @@ def test_a_network_labels_an_image_of_any_size(tmp_path, runtime) -> None:
     assert not found.instances.any()
 
 
+def test_onnxruntime_also_runs_a_network_for_one_image_without_a_batch(tmp_path) -> None:
+    pytest.importorskip('onnxruntime')
+    file = write_network(
+        tmp_path / 'n.onnx',
+        [helper.make_node('Mul', ['image', 'factor'], ['numbers'])],
+        {'factor': np.array([1 / 200])},
+        [1, 6, 8],
+        {'numbers': [1, 6, 8]},
+        kind='semantic', input=[8, 6], classes=['a', 'b'], mean=[0.0], scale=[1.0],
+        runtime='onnxruntime',
+    )  # fmt: skip
+    labels = Network(file).infer(IMAGE).labels
+    assert (labels[:, :20] == 0).all() and (labels[:, 40:] == 1).all()
+
+
 def test_a_colour_image_goes_in_as_red_green_blue(tmp_path) -> None:
     file = write_network(
         tmp_path / 'red.onnx',
