@@ -75,6 +75,8 @@ def timed(function: Timed) -> Timed:
 
     @wraps(function)
     def with_time(*arguments: Any, **named: Any) -> Any:
+        if Profile._current is None:
+            return function(*arguments, **named)
         with Profile.step(name):
             return function(*arguments, **named)
 
