@@ -8,10 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from chessboards import BASELINE_M, K_TRUE, draw, plain_texture
+from chessboards import pose as board_pose
 from stereo_room import CAMERA, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.camera.rig.check import SETTLED_FRAMES, InputFault, RigCheck
+from segfloor_ros.camera.rig.check import EVERY, RECENT, SETTLED_FRAMES, InputFault, RigCheck
+from segfloor_ros.geometry import make_transform
 
 FRAME_S = 0.1
 
@@ -184,6 +187,20 @@ def test_an_eye_that_is_rolled_and_zoomed_is_mended(frames) -> None:
     error = np.abs(right[inner].astype(float) - frames[10].right[inner])
     assert np.median(error) < 4  # interpolated twice
     assert np.median(error) < np.median(np.abs(off[10].right[inner] - 1.0 * right[inner])) / 4
+
+
+def test_a_chessboard_that_fills_the_view_is_no_fault() -> None:
+    K = K_TRUE * np.array([[2.0], [2.0], [1.0]])
+    camera = StereoCamera(640, 480, K[0, 0], K[1, 1], K[0, 2], K[1, 2], BASELINE_M)
+    generator, board = np.random.default_rng(0), plain_texture()
+    T_right_left = make_transform(np.eye(3), np.array([-BASELINE_M, 0, 0]))
+    seen = []
+    for index in range(RECENT):
+        T = board_pose(generator, BASELINE_M / 2, np.array([0.03, 0.03, 0.05]))
+        left, right = (draw(board, at, K, (640, 480)) for at in (T, T_right_left @ T))
+        noisy = np.stack([left, right]) + generator.normal(0, 2, (2, 480, 640))
+        seen.append(StereoFrame(index, index * 10**8, *np.clip(noisy, 0, 255).astype(np.uint8)))
+    assert faults([frame for frame in seen for _ in range(EVERY)], camera) == {}
 
 
 def test_a_lag_is_said_of_five_looks_and_of_no_fewer(frames) -> None:

@@ -3,9 +3,10 @@
 Points of the left image are found in the right one and in the left one before. In images that are
 rectified and taken together, both eyes have a point in one row. Row differences that depend on the
 place in the image are those of a wrong rectification: offset, roll, focal length. Those that grow
-with the motion of the points along the columns are those of a lag between the eyes. How wide the
-sharpest edges are, how bright the images and how bright a point is in both of them is seen at once;
-it counts where all of the last looks show it.
+with the motion of the points along the columns are those of a lag between the eyes. Those that
+scatter more than they differ are those of points that look alike, as on a chessboard: nothing is
+said. How wide the sharpest edges are, how bright the images and how bright a point is in both of
+them is seen at once; it counts where all of the last looks show it.
 """
 
 from __future__ import annotations
@@ -294,7 +295,11 @@ class RigCheck:
         sigma = noise_px * np.sqrt(np.diag(covariance))
         bent_px = abs(rows) - SURE * sigma[0]
         bent_px += (np.hypot(roll, size) - SURE * sigma[1:].max()) * centre.min()
-        rows_px = self.rows_px = max(float(np.median(np.abs(apart[:, 1]))), float(bent_px))
+        rows_px = float(np.median(np.abs(apart[:, 1])))
+        if noise_px > max(rows_px, ROWS_PX):  # things that look alike are taken for each other
+            self.rows_px = float('nan')
+            return
+        rows_px = self.rows_px = max(rows_px, float(bent_px))
         if lag_s:
             self.faults.pop('rows_apart', None)  # it may have been the lag
             self._mend = None
