@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
 from functools import partial
@@ -34,7 +35,7 @@ from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_d
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
 from segfloor_ros.semantics.network import Network
 from segfloor_ros.slam.mapping.back_end import Submap
-from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, lost_frame
+from segfloor_ros.slam.results import MAJORITY, FrameResult, Keyframe, KeyframePath, lost_frame
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.timing import MemoryLog
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
@@ -366,6 +367,10 @@ class LockstepRun:
             return f'{name}: no frame could be read, so there is no map'
         if self._map_options.load is not None:
             return self._map_options.why_not_found(name, self._frames)
+        lost = Counter(result.state for result in self._results if not result.tracked)
+        for state, count in lost.most_common(1):
+            if count > MAJORITY * self._frames:
+                return f'{name}: {count} of {self._frames} frames {state}; so there is no map'
         if self._known_mount is None:
             return no_floor(name, self._frames)
         if self._pipeline.fault:

@@ -19,6 +19,9 @@ from segfloor_ros.settings import StageSettings, setting
 SENSORS = ('wheel_odometry', 'imu')
 """Sensors of a recording that can be left out."""
 
+MAX_BASELINE_M = 10.0
+"""No robot carries eyes farther apart; a baseline in millimetres is larger."""
+
 MAX_LAG_S = 0.1
 """So much later than those of the images the stamps of a sensor may be."""
 
@@ -52,6 +55,11 @@ class StereoCamera:
             raise CalibrationError(
                 f'baseline is {self.baseline_m:g} m, it must be positive: '
                 'are left and right swapped, or is P[3] of the right camera missing?'
+            )
+        if self.baseline_m > MAX_BASELINE_M:
+            raise CalibrationError(
+                f'baseline is {self.baseline_m:g} m; are lengths in millimetres? They must be in '
+                'metres: P[3] of the right camera is -fx times the baseline'
             )
         if self.width <= 0 or self.height <= 0:
             raise CalibrationError(f'image size {self.width}x{self.height} is impossible')

@@ -275,6 +275,15 @@ def remove_a_time(folder: Path) -> None:
     (folder / 'times.txt').write_text('0\n0.1\n0.2\n')
 
 
+def stop_the_clock(folder: Path) -> None:
+    (folder / 'times.txt').write_text(4 * '7.5\n')
+
+
+def double_images(folder: Path) -> None:
+    for path in folder.glob('image_?/*.png'):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), None, fx=2, fy=2))
+
+
 def spoil_a_time(folder: Path) -> None:
     (folder / 'times.txt').write_text('0\nsoon\n0.2\n0.3\n')
 
@@ -291,6 +300,8 @@ def spoil_a_time(folder: Path) -> None:
         (shrink_last_image, CalibrationError, 'frame 3 is 64x40, but .* 64x48; use the calibrat'),
         (go_backwards, InputError, 'times.txt, line 3: the stamp goes backwards, from 0.1.* cut'),
         (remove_a_time, InputError, 'times.txt: 3 times for 4 pairs of images; .* or remove it'),
+        (double_images, CalibrationError, 'calib.txt, P0: .* images of about 64x48, these are 128'),
+        (stop_the_clock, InputError, 'times.txt: all 4 times are the same; it needs the time in'),
         (spoil_a_time, InputError, 'times.txt, line 2: expected a time in seconds'),
     ],
 )
@@ -302,6 +313,17 @@ def test_faults_of_kitti_folders_are_named(
     with pytest.raises(error, match=message) as caught:
         list(opened(folder).frames())
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('unit', 'said'), [(1000.0, '100 s'), (1e-6, '1e-07 s'), (1.0, '')])
+def test_times_in_another_unit_are_said(tmp_path: Path, caplog, unit: float, said: str) -> None:
+    folder = write_kitti(tmp_path / 'drive', grey_pairs(4))
+    (folder / 'times.txt').write_text(''.join(f'{0.1 * unit * i:.9f}\n' for i in range(4)))
+    opened(folder)
+    assert [r.getMessage() for r in caplog.records] == (
+        [f'{folder}: {said} from pair to pair; times must be in seconds, where their name does not '
+         'say otherwise'] if said else []
+    )  # fmt: skip
 
 
 def test_faults_of_image_folders_are_named(tmp_path: Path) -> None:

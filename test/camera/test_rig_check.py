@@ -91,6 +91,20 @@ def test_eyes_that_are_exchanged_are_named(frames) -> None:
     assert 'exchange' in found['eyes_swapped'].remedy
 
 
+def test_one_image_for_both_eyes_is_named(frames) -> None:
+    found = faults([replace(f, right=f.left) for f in frames[:1]])
+    assert set(found) == {'same_image'}
+    assert 'one and the same' in found['same_image'].line()
+
+
+def test_an_eye_that_is_upside_down_sees_different_things(frames) -> None:
+    turned = [replace(f, right=f.right[::-1, ::-1].copy()) for f in frames]
+    found = faults(turned)
+    assert set(found) == {'different_views'}
+    assert found['different_views'].value < 10
+    assert 'turned' in found['different_views'].remedy
+
+
 @pytest.mark.parametrize('lag_frames', [1.0, 0.5, -1.0, 2.0])
 def test_a_lag_between_the_eyes_is_measured(frames, lag_frames) -> None:
     found = faults(late(frames, lag_frames))

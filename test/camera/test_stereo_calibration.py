@@ -282,6 +282,13 @@ def test_zero_and_negative_baselines_are_refused(offset: float) -> None:
         StereoCalibration(calibration().left, dataclasses.replace(right, P=P))
 
 
+def test_a_baseline_in_millimetres_is_refused() -> None:
+    right = calibration().right
+    P = with_entry(right.P, (0, 3), 1000 * right.P[0, 3])
+    with pytest.raises(CalibrationError, match=r'right: baseline is .*; are lengths in millimetre'):
+        StereoCalibration(calibration().left, dataclasses.replace(right, P=P))
+
+
 def test_eyes_of_different_size_are_refused() -> None:
     right = dataclasses.replace(calibration().right, width=80)
     with pytest.raises(CalibrationError, match='left is for images of 64x48, right for 80x48'):

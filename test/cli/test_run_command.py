@@ -287,7 +287,8 @@ def test_no_floor_no_map_and_no_success(tmp_path, recording):
         cv2.imwrite(str(image), np.zeros((240, 320), np.uint8))
     done = segfloor('run', blank, '--out', tmp_path / 'out')
     assert done.returncode == 1
-    assert 'no' in done.stderr and 'Traceback' not in done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith('segfloor: '))
+    assert 'frames lost: left image without contrast' in line and line.endswith('is no map')
     assert not (tmp_path / 'out').exists()
 
 

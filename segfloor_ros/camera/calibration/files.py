@@ -20,6 +20,10 @@ from segfloor_ros.geometry import Array, invert
 KALIBR_NAMES = ('camchain.yaml', 'dso/camchain.yaml')
 """Both cameras are in one file; TUM-VI has it in `dso`."""
 
+OTHER_SIZE = 2**0.5
+"""A principal point farther off by this factor, both ways, is nearer to the middle of images of
+twice or half the size."""
+
 FILE_NAMES = (
     ('left.yaml', 'right.yaml'),
     ('left.yml', 'right.yml'),
@@ -69,6 +73,13 @@ def read_kitti_eye(path: Path, width: int, height: int, camera: int) -> EyeCalib
     if name not in rows:
         raise CalibrationError(f'{path}: no line {name}: with the projection of camera {camera}')
     P = _numbers(rows[name], 12, f'{path}, {name}').reshape(3, 4)
+    in_x, in_y = 2 * P[:2, 2] / (width, height)
+    if min(in_x, in_y) > OTHER_SIZE or max(in_x, in_y) * OTHER_SIZE < 1:
+        raise CalibrationError(
+            f'{path}, {name}: the principal point ({P[0, 2]:g}, {P[1, 2]:g}) is the middle of '
+            f'images of about {2 * P[0, 2]:.0f}x{2 * P[1, 2]:.0f}, these are {width}x{height}; use '
+            'the calibration of images of this size'
+        )
     return EyeCalibration.of_rectified(width, height, P, f'{path}, {name}')
 
 

@@ -49,6 +49,9 @@ FEATURES, LEVELS = 500, 2
 REACH_SHARE = 0.4, 0.15
 """Of width and height: a point is no further from its place in the other eye."""
 
+FOUND_SHARE = 0.1
+"""Two eyes of one scene find four to six of ten points again; of two scenes one of thirty."""
+
 LAG_FRAMES = 0.15
 """A lag counts where it is more than this share of a frame: what rectification leaves of two real
 cameras, which were triggered together, looked like half of it."""
@@ -96,7 +99,18 @@ FAULTS = {
     'eyes_swapped': (
         '%',
         'are exchanged: {value:.0f}% of the disparities are negative',
-        'exchange the two, and their calibrations if these are exchanged, too',
+        'exchange the two, and their calibrations if these are exchanged, too; or turn the images '
+        'of a camera that hangs upside down',
+    ),
+    'same_image': (
+        '%',
+        'are one and the same: {value:.0f}% of their pixels are equal',
+        'give the images of the right camera: its topic, folder or device',
+    ),
+    'different_views': (
+        '%',
+        'show different things: {value:.0f}% of the points of one are found in the other',
+        'check that both are of one camera, none of them turned, mirrored or of another time',
     ),
     'depth_unaligned': (
         'px',
@@ -156,6 +170,8 @@ class RigCheck:
         self._looks: deque[Array] = deque(maxlen=RECENT)
         self._pictures: deque[Array] = deque(maxlen=RECENT)
         self._before: tuple[NDArray[np.uint8], int] | None = None
+        self._points: deque[int] = deque(maxlen=RECENT)
+        self._point_count = 0
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
         self._frame_s = 0.0
         self._moving_looks = self._watched = 0
@@ -188,6 +204,9 @@ class RigCheck:
             self._focal.look(frame.left, matches)
             if is_look:
                 self._looks.append(self._look(frame, matches))
+                self._points.append(self._point_count)
+                if self._point_count and np.array_equal(frame.left, frame.right):
+                    self._found('same_image', 100.0)
                 self._pictures.append(_picture([frame.left, frame.right]))
                 self._judge()
                 self._judge_pictures()
@@ -254,6 +273,7 @@ class RigCheck:
         (left_points, left_words), (right_points, right_words) = (
             self._orb.detectAndCompute(image, None) for image in (left, right)
         )
+        self._point_count = min(len(left_points), len(right_points))
         if left_words is None or right_words is None:
             return nothing
         matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
@@ -281,7 +301,10 @@ class RigCheck:
 
     def _judge(self) -> None:
         seen = np.concatenate(self._looks)
-        if len(seen) < MIN_MATCHES:
+        points = sum(self._points)
+        if len(seen) < max(MIN_MATCHES, FOUND_SHARE * points):
+            if len(self._looks) == RECENT and min(self._points) >= MIN_MATCHES:
+                self._found('different_views', 100 * len(seen) / points)
             return
         followed = seen[np.isfinite(seen).all(axis=1)]
         lag_s = self._lag_s(followed)

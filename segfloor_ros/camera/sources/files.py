@@ -61,7 +61,8 @@ UPRIGHT = 0.8
 def read_times(path: Path) -> list[int]:
     """Return the stamps in ns of a file with one time in seconds per line.
 
-    Raises InputError naming the line where one is no number or earlier than the one before.
+    Raises InputError naming the line where one is no number or earlier than the one before; and
+    where all are the same.
     """
     stamps: list[int] = []
     for where, line in read_lines(path):
@@ -71,6 +72,11 @@ def read_times(path: Path) -> list[int]:
             raise InputError(f'{where}: expected a time in seconds ({error})') from None
         check_forward(where, stamps[-1:], stamp_ns)
         stamps.append(stamp_ns)
+    if len(stamps) > 1 and stamps[0] == stamps[-1]:
+        raise InputError(
+            f'{path}: all {len(stamps)} times are the same; it needs the time in seconds of each '
+            'pair, or remove it to read the images at stereo_camera.rate_hz'
+        )
     return stamps
 
 

@@ -24,6 +24,9 @@ from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, Stere
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_mask
 
+PLAUSIBLE_HZ = 0.1, 1000.0
+"""Pairs per second of a robot's camera; others come of times in another unit."""
+
 DEFAULT_RATE_HZ = 10.0
 """Frame rate of a recording that has no stamps."""
 
@@ -120,6 +123,12 @@ class StereoSource:
         self._warned_of: set[int] = set()
         self._eight_bit = EightBitScale(bit_depth)
         self._check_first_pair()
+        slowest, fastest = PLAUSIBLE_HZ
+        if not slowest <= rate_hz <= fastest:
+            logger.warning(
+                '%s: %.3g s from pair to pair; times must be in seconds, where their name does not '
+                'say otherwise', name, 1 / rate_hz,
+            )  # fmt: skip
 
     @property
     def camera(self) -> StereoCamera:
