@@ -14,6 +14,7 @@ structured light measure disparities, too: their noise is about constant in this
 from __future__ import annotations
 
 import dataclasses
+import struct
 from typing import Any
 
 import cv2
@@ -49,6 +50,10 @@ SUBPIXEL = 16
 """OpenCV's semi-global disparities are in 1/16 px, and their number is a multiple of as many."""
 
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
+
+DEPTH_HEADER = struct.Struct('<iff')
+"""What compressed_depth_image_transport writes before the PNG: a format, and for depth in metres a
+and b of the pixel's value a / depth + b."""
 
 _STEP_PX = 2
 _MARGIN_PX = 12
@@ -96,15 +101,36 @@ def grey_image(message: Any, name: str) -> Grey:
 
 
 def depth_image(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Return the depth image (H, W) of a sensor_msgs Image (REP-118): uint16 in mm or float32 in
-    metres. Raises as `grey_image`.
+    """Return the depth image (H, W) of a sensor_msgs Image (REP-118), or of a CompressedImage of
+    compressed_depth_image_transport: uint16 in mm or float32 in metres. Raises as `grey_image`.
     """
+    if not hasattr(message, 'encoding'):
+        return _unpacked_depth(message, name)
     if message.encoding not in DEPTH_TYPES:
         raise InputError(
             f'{name}: encoding {message.encoding} is no depth; depth images are 16UC1 (mm) or '
             '32FC1 (m)'
         )
     return _unpacked(message, name, 1, np.dtype(DEPTH_TYPES[message.encoding]))[:, :, 0]
+
+
+def _unpacked_depth(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.float32]:
+    encoding, _, transport = message.format.partition(';')
+    data = bytes(message.data)
+    if encoding not in DEPTH_TYPES or 'compressedDepth' not in transport or 'rvl' in transport:
+        raise InputError(
+            f'{name}: format "{message.format}" is no depth; it must be compressedDepth of 16UC1 '
+            'or 32FC1 as png'
+        )
+    if len(data) < DEPTH_HEADER.size:
+        raise CorruptImageError(f'{name}: {len(data)} bytes are no compressed depth image')
+    _, scale, offset = DEPTH_HEADER.unpack_from(data)
+    pixels = decode_file(data[DEPTH_HEADER.size :], name).astype(np.uint16, copy=False)
+    if DEPTH_TYPES[encoding] == np.uint16:
+        return pixels
+    with np.errstate(divide='ignore'):
+        metres = np.float32(scale) / (pixels.astype(np.float32) - np.float32(offset))
+    return np.where(pixels > 0, metres, np.float32(np.nan))
 
 
 def _unpacked(message: Any, name: str, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:

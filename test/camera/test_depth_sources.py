@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from camera_recordings import (
     MS,
     P_LEFT,
     calibration,
+    compressed_message,
     grey_pairs,
     image_message,
     info_message,
@@ -28,13 +31,14 @@ from segfloor_ros.camera.calibration.rectification import StereoRectifier
 from segfloor_ros.camera.images import (
     VIRTUAL_BASELINE_M,
     depth_calibration,
+    depth_image,
     disparity_at,
     disparity_of_depth,
     seen_from_right,
 )
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources.bag_file import IMAGE, find_depth_topics
-from segfloor_ros.errors import InputError
+from segfloor_ros.errors import InputError, SegfloorError
 
 SCALE = FX * VIRTUAL_BASELINE_M
 """Disparity times depth."""
@@ -150,6 +154,30 @@ def test_depth_of_a_bag_is_that_of_its_registered_topic(tmp_path: Path, encoding
     frame = next(source.frames())
     np.testing.assert_allclose(frame.right[5:], SCALE / 1.5, rtol=1e-6)
     np.testing.assert_allclose(frame.left, grey_pairs(2)[0][0], atol=1)
+
+
+@pytest.mark.parametrize('encoding', ['16UC1', '32FC1'])
+def test_compressed_depth_of_a_bag_is_read(tmp_path: Path, encoding: str) -> None:
+    pixels, header = depth_mm(), struct.pack('<iff', 0, 0.0, 0.0)
+    if encoding == '32FC1':  # a / depth + b
+        pixels, header = depth_mm(120 + 20), struct.pack('<iff', 0, 180.0, 20.0)
+    topic = '/camera/aligned_depth_to_color/image_raw/compressedDepth'
+    data = header + cv2.imencode('.png', pixels)[1].tobytes()
+    (left, _) = grey_pairs(1)[0]
+    messages = [
+        info_message('/camera/color/camera_info', 0, calibration().left),
+        image_message('/camera/color/image_raw', 0, left, 'mono8'),
+        compressed_message(topic, MS, data, f'{encoding}; compressedDepth png'),
+    ]
+    source = opened(write_rosbag2(tmp_path / 'drive', messages))
+    assert [sensor.where for sensor in source.sensors] == [topic]
+    right = next(source.frames()).right
+    np.testing.assert_allclose(right[5:], SCALE / 1.5, rtol=1e-6)
+    assert np.isnan(right[:5]).all()
+    for words, problem in (('rvl', 'must be compressedDepth of'), ('png', 'are no compressed')):
+        message = SimpleNamespace(format=f'{encoding}; compressedDepth {words}', data=header[:8])
+        with pytest.raises(SegfloorError, match=problem):
+            depth_image(message, topic)
 
 
 def test_of_two_depth_topics_the_one_that_is_set_is_taken() -> None:

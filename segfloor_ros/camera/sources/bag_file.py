@@ -27,6 +27,8 @@ MISSING_LIBRARY = (
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+COMPRESSED_DEPTH = '/compressedDepth'
+"""End of the name of a topic of compressed_depth_image_transport."""
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 
 IMAGE_NAMES = (
@@ -260,7 +262,11 @@ def find_depth_topics(
     camera's where its name says so or there is no left one. None where there is none.
     """
     images = sorted(t for t, kind in types.items() if kind in (IMAGE, COMPRESSED))
-    depth = [t for t in images if types[t] == IMAGE and 'depth' in t.lower()]
+    depth = [
+        t
+        for t in images
+        if 'depth' in t.lower() and (types[t] == IMAGE or t.endswith(COMPRESSED_DEPTH))
+    ]
     check_given(name, settings.depth_topic, depth, 'depth images', 'depth_topic')
     depth = [settings.depth_topic] if settings.depth_topic else depth
     pictures = [t for t in images if not any(word in t.lower() for word in NO_PICTURES)]
