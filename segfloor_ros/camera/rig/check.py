@@ -49,8 +49,9 @@ FEATURES, LEVELS = 500, 2
 REACH_SHARE = 0.4, 0.15
 """Of width and height: a point is no further from its place in the other eye."""
 
-FOUND_SHARE = 0.1
-"""Two eyes of one scene find four to six of ten points again; of two scenes one of thirty."""
+FOUND_SHARE = 0.05
+"""Two eyes of one scene find four to six of ten points again, in strong noise one; of two scenes
+one of thirty."""
 
 LAG_FRAMES = 0.15
 """A lag counts where it is more than this share of a frame: what rectification leaves of two real
