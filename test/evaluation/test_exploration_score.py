@@ -1,0 +1,52 @@
+"""Figures of an exploration, worked out by hand, in a map whose frame lies elsewhere and turned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from segfloor_ros.evaluation.exploration import Exploration, figures, reachable_floor
+from segfloor_ros.evaluation.maps import from_frame
+from segfloor_ros.geometry import Array, make_transform
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
+from segfloor_ros.navigation import Goal
+
+START = (3.0, 1.0, np.pi / 2)
+
+
+def two_rooms() -> OccupancyGrid:
+    """Two rooms of 3 m x 2 m side by side without a door, the outer corner of all at (2, -0.5)."""
+    cells = np.full((22, 62), FREE, np.int8)
+    cells[[0, -1]] = cells[:, [0, 31, -1]] = OCCUPIED
+    return OccupancyGrid(cells, 0.1, (2.0, -0.5))
+
+
+def pose(x: float, y: float, yaw: float = 0.0) -> Array:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return make_transform(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), np.array([x, y, 0.0]))
+
+
+def test_only_the_room_of_the_start_can_be_reached() -> None:
+    floor = reachable_floor(two_rooms(), 0.2, START)
+    assert not floor[:, 31:].any()
+    assert floor[5:-5, 5:26].all()
+    there = reachable_floor(two_rooms(), 0.2, (7.0, 1.0, 0.0))
+    assert there[5:-5, 36:-5].all() and not there[:, :32].any()
+
+
+def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
+    # In the map ahead is +x; in the scene the robot looks along +y.
+    in_map = np.array([[0.0, 0.0], [0.3, 0.0], [0.4, -0.5]])
+    in_scene = from_frame(in_map, START)
+    stamps = [0, 10**9, 2 * 10**9]
+    poses = {t: pose(*xy) for t, xy in zip(stamps, in_map, strict=True)}
+    true = {t: pose(*xy) for t, xy in zip(stamps, in_scene, strict=True)}
+    reached = Goal(in_map[2], is_reached=True)
+    goals = [(reached, pose(*in_scene[2])), (reached, pose(*in_scene[0]))]
+    grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
+    found = Exploration(START, poses, true, [(2 * 10**9, grid)], [], goals, 4.0)
+    told = figures(found, two_rooms(), 0.2)
+    assert (told['goals_reached'], told['goals_total']) == (1, 2)
+    assert told['path_rmse_m'] == pytest.approx(0.0, abs=1e-4)
+    assert told['path_m'] == pytest.approx(0.3 + np.hypot(0.1, 0.5), abs=0.01)
+    assert told['real_time_factor'] == pytest.approx(0.5)
