@@ -242,8 +242,8 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
             self.seen = 0
             self.mount = None
 
-        def add(self, left, right, T_world_left, up_world):
-            self.seen += 1
+        def add(self, left, right, T_world_left, up_world, is_new_view):
+            self.seen += is_new_view
             self.mount = MOUNT if self.seen == 3 else None
 
     slam = StereoSlam(CAMERA, SETTINGS, None, LateMeter())
