@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from segfloor_ros.camera.sources.pairing import Dropped, StampJoiner
+from segfloor_ros.camera.sources.source import Dropped, StampJoiner
 from segfloor_ros.geometry import MAX_DISORDER_NS
 
 

@@ -7,7 +7,7 @@ import logging
 import pytest
 from camera_recordings import MS
 
-from segfloor_ros.camera.sources.pairing import StampPairing
+from segfloor_ros.camera.sources.source import StampPairing
 from segfloor_ros.errors import InputError
 
 

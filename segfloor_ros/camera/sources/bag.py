@@ -46,8 +46,7 @@ from segfloor_ros.camera.sources.files import (
     is_upright,
     rate_of,
 )
-from segfloor_ros.camera.sources.pairing import Stamped, StampPairing
-from segfloor_ros.camera.sources.source import PairEntry, StereoSource
+from segfloor_ros.camera.sources.source import PairEntry, Stamped, StampPairing, StereoSource
 from segfloor_ros.errors import CalibrationError, InputError
 from segfloor_ros.files.whole import checked_ns
 from segfloor_ros.geometry import Array, FrameTree, make_transform

@@ -17,8 +17,14 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.calibration.files import read_body_pose
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.model import DEPTH, ImuSample, Measurement, RecordedSensor, WheelPose
-from segfloor_ros.camera.sources.pairing import Stamped, StampPairing, check_forward
-from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, PairEntry, StereoSource
+from segfloor_ros.camera.sources.source import (
+    DEFAULT_RATE_HZ,
+    PairEntry,
+    Stamped,
+    StampPairing,
+    StereoSource,
+    check_forward,
+)
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds

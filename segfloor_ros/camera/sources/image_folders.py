@@ -39,8 +39,7 @@ from segfloor_ros.camera.sources.files import (
     side_pairs,
     stamps_of_rate,
 )
-from segfloor_ros.camera.sources.pairing import Stamped
-from segfloor_ros.camera.sources.source import StereoSource
+from segfloor_ros.camera.sources.source import Stamped, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
 from segfloor_ros.files.whole import nanoseconds, whole_nanoseconds

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from segfloor_ros.camera.sources.pairing import StampJoiner
+from segfloor_ros.camera.sources.source import StampJoiner
 from segfloor_ros.messages.topics import TOPICS, stamp_of, to_ns
 from segfloor_ros.nodes.shared.reporter import Reporter
 

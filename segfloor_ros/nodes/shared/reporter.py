@@ -30,7 +30,7 @@ from segfloor_ros.messages.topics import DIAGNOSTICS, PATIENCE_S, TOPICS, Topic,
 from segfloor_ros.timing import rss_mb
 
 if TYPE_CHECKING:
-    from segfloor_ros.camera.sources.pairing import StampJoiner
+    from segfloor_ros.camera.sources.source import StampJoiner
 
 MOST = 3
 
