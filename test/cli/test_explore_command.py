@@ -62,6 +62,7 @@ def kill_slam_after(seconds: float) -> threading.Timer:
     return timer
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_robot_maps_a_chamber_and_drives_to_a_goal(tmp_path) -> None:
     scene, out = tmp_path / 'chamber.yaml', tmp_path / 'out'
