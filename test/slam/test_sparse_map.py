@@ -5,7 +5,7 @@ from hand_made_maps import CAMERA, add, keyframe
 
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.sparse_map import PointRows, SparseMap
 
 
 def two_keyframes():
@@ -94,3 +94,13 @@ def test_grows_beyond_its_first_buffer():
     xyz = np.random.default_rng(0).normal(size=(3000, 3))
     add(sparse_map, keyframe(0, [NO_POINT] * 3000), np.arange(3000), xyz)
     np.testing.assert_array_equal(sparse_map.xyz_world, xyz)
+
+
+def test_points_of_a_map_behind_another_count_its_keyframes_from_where_they_come():
+    own, other = PointRows(), PointRows()
+    own.add(3)
+    other.add(2, born=np.array([0, 4]), seen_last=np.array([4, 5]))
+    own.from_arrays(other.to_arrays(np.arange(2)), first_keyframe=7)
+    assert own['born'].tolist() == [0, 0, 0, 7, 11]
+    assert own['seen_last'][3:].tolist() == [11, 12]
+    assert own['stable_id'].tolist() == [0, 1, 2, 0, 1]
