@@ -85,7 +85,8 @@ def _projection(
     points = floor @ invert(mount.T_base_left)[:3].T
     uvw = points @ camera.K.T
     ahead = points[..., 2] > CELL * h
-    u, v = (np.where(ahead, uvw[..., k] / uvw[..., 2], -1.0).astype(np.float32) for k in (0, 1))
+    depth_m = np.where(ahead, points[..., 2], np.inf)
+    u, v = ((uvw[..., k] / depth_m).astype(np.float32) for k in (0, 1))
     inside = ahead & (u > 1) & (u < camera.width - 2) & (v > 1) & (v < camera.height - 2)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8))
     return np.array([x[0, 0], y[0, 0]]), (u, v), inside
