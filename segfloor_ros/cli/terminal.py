@@ -337,7 +337,7 @@ def shipped_params() -> dict[str, Path]:
     """Return the parameter files of this package that come with it, by name."""
     package = Path(segfloor_ros.__file__).parent
     # Of a checkout, and of an installation by pip or colcon, which is lib/python3/site-packages.
-    places = package.parent, package.parents[3] / 'share' / package.name
+    places = [package.parent, *(p / 'share' / package.name for p in package.parents[3:4])]
     found = next((place / 'params' for place in places if (place / 'params').is_dir()), package)
     files = sorted(found.glob('*.yaml'))
     return {path.stem: path for path in files if path.stem != NAV2}

@@ -88,9 +88,9 @@ class Chain:
         counts = {s.node: s.values for s in self.graph.statuses if s.kind == 'connections'}
         found = {name: int(n) for values in counts.values() for name, n in values.items()}
         return len(counts) == 4 and all(
-            found.get(topic.name, 0) >= len(topic.subscribers)
+            found.get(topic.name, 0) >= len(counts.keys() & topic.subscribers)
             for topic in TOPICS.values()
-            if topic.publisher not in ('', 'stereo_camera')
+            if topic.publisher in counts
         )
 
 
