@@ -71,7 +71,7 @@ noble-python:
 	echo 'no Python 3.12 with venv was found; name one: make test-noble PYTHON312=/path/to/it' >&2; \
 	exit 1
 
-# The four packages come in the versions of Ubuntu 24.04, everything else as in .venv.
+# These packages come in the versions of Ubuntu 24.04, everything else as in .venv.
 $(NOBLE)/.installed: constraints-noble.txt constraints.txt setup.py setup.cfg pyproject.toml
 	@python="$$($(MAKE) -s noble-python)" && "$$python" -m venv --clear $(NOBLE)
 	@{ cat constraints-noble.txt; grep -vE \
