@@ -149,7 +149,7 @@ def test_a_pose_faces_where_ros_says() -> None:
 
 
 def test_of_the_two_quaternions_of_a_turn_the_one_with_a_positive_w_is_sent() -> None:
-    turns = Rotation.random(200, rng=np.random.default_rng(3))
+    turns = Rotation.from_quat(np.random.default_rng(3).normal(size=(200, 4)))
     T = np.tile(np.eye(4), (200, 1, 1))
     T[:, :3, :3] = turns.as_matrix()
     expected = turns.as_quat(canonical=True)
