@@ -59,7 +59,7 @@ fast-tests: $(STAMP) $(TF)
 	$(BIN)/python -m pytest $(PARALLEL) -m 'not slow'
 
 test-slow: $(STAMP) $(TF)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest $(PARALLEL) -m slow
 
 test-noble: $(NOBLE)/.installed
 	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(APART_FROM:%=--ignore=test/%.py)
