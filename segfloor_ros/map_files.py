@@ -5,7 +5,8 @@ Saved maps are the files of `--save-map`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,14 @@ from segfloor_ros.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
 from segfloor_ros.slam.results import KeyframePath, SparseCloud
 from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.saved_slam import PART, gap_ns, loaded_map, mount_of, saved_camera
+from segfloor_ros.slam.saved_slam import (
+    PART,
+    gap_ns,
+    loaded_map,
+    mount_of,
+    saved_camera,
+    sessions_of,
+)
 
 APPEARED_BGR, GONE_BGR = (40, 40, 220), (60, 170, 60)
 PICTURE_PX = 800
@@ -74,20 +82,25 @@ class SavedMap:
             ],
             'camera': f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.3f} m',
             'camera_height_m': round(mount.height_m, 3),
-            'sessions': self.file.header.get('sessions', []),
+            'sessions': sessions_of(self.file),
         }
 
 
 def open_map(path: Path) -> SavedMap:
     """Read a saved map with all its parts. Raises InputError."""
     saved = SavedMap(str(path), read_map_file(path))
-    try:
-        loaded_map(saved.file, 0)
-        saved.grid()
+    with _parts_that_fit(saved.name):
         saved.facts()
-    except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
-        raise InputError(f'{path}: parts of the map do not fit; save it anew') from None
     return saved
+
+
+@contextmanager
+def _parts_that_fit(name: str) -> Iterator[None]:
+    """Raise InputError, by the name of a file, where its parts turn out to be damaged."""
+    try:
+        yield
+    except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
+        raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
 
 
 def merge(first: SavedMap, second: SavedMap) -> SavedMap:
@@ -98,13 +111,14 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     _check_mounts(first, second)
     added = _after(first, second)
     camera = saved_camera(first.file, first.name)
-    slam = merge_slam(first.slam, added.parts[PART], Rig(camera, mount_of(first.file)))
+    with _parts_that_fit(f'{first.name} or {second.name}'):
+        slam = merge_slam(first.slam, added.parts[PART], Rig(camera, mount_of(first.file)))
     if slam is None:
         raise MapError(
             f'{second.name}: shows no place of {first.name}; both must have seen the same things '
             'from the same side over half a metre or more'
         )
-    sessions = [s for m in (first, second) for s in m.file.header.get('sessions', [])]
+    sessions = sessions_of(first.file) + sessions_of(second.file)
     merged = MapFile(first.file.header | {'sessions': sessions}, {PART: slam})
     both = first.file, added
     merged.parts['cloud'] = _labels(loaded_map(merged, 0).cloud, both)

@@ -176,8 +176,34 @@ def test_a_camera_that_is_mounted_otherwise_is_said(first, second):
         merge(first, SavedMap('tall.map', replace(second.file, header=header)))
 
 
-def test_a_file_without_all_parts_is_one_line(first, tmp_path):
+def damaged(file):
+    """Yield a saved map without a part, and with drives that nobody can have driven."""
+    yield replace(file, parts={'slam': file.parts['slam']})
+    for sessions in (3, [{'first_ns': 0}], ['monday']):
+        yield replace(file, header=file.header | {'sessions': sessions})
+
+
+def test_a_file_whose_parts_do_not_fit_is_one_line(first, tmp_path):
     path = tmp_path / 'x.map'
-    path.write_bytes(to_bytes(replace(first.file, parts={'slam': first.slam})))
-    with pytest.raises(InputError, match=r'x\.map: parts of the map do not fit'):
-        open_map(path)
+    for file in damaged(first.file):
+        path.write_bytes(to_bytes(file))
+        with pytest.raises(InputError, match=r'x\.map: parts of the map do not fit'):
+            open_map(path)
+
+
+def test_a_damaged_map_is_not_merged(first, second):
+    slam = second.slam | {'feature_octave': second.slam['feature_octave'][:-1]}
+    parts = second.file.parts | {'slam': slam}
+    with pytest.raises(InputError, match=r'or broken\.map: parts of the map do not fit'):
+        merge(first, SavedMap('broken.map', replace(second.file, parts=parts)))
+
+
+@pytest.mark.parametrize('sessions', [3, [{'first_ns': 0}]])
+def test_a_drive_does_not_begin_in_a_map_that_it_could_not_save(first, sessions):
+    file = replace(first.file, header=first.file.header | {'sessions': sessions})
+    pipeline = Pipeline(CAMERA, resolve(assignments=[]))
+    try:
+        with pytest.raises(InputError, match=r'x\.map: parts of the map do not fit'):
+            pipeline.load(file, 'x.map', localize=False)
+    finally:
+        pipeline.close()

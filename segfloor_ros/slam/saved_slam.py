@@ -92,7 +92,7 @@ def load_slam(
             'num_ever': arrays['num_ever'] + skipped,
         }
         slam.load(moved, mount, localize, last)
-        slam.sessions = list(saved.header.get('sessions', []))
+        slam.sessions = sessions_of(saved)
         return loaded_map(saved, shift_ns)
     except (ArithmeticError, LookupError, ValueError, TypeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
@@ -141,6 +141,14 @@ def loaded_map(saved: MapFile, shift_ns: int) -> LoadedMap:
 def gap_ns(first: Arrays, second: Arrays) -> int:
     """Return by how much the stamps of a second map are to grow to come after those of a first."""
     return int(first['keyframe_stamp_ns'][-1] - BEFORE_ALL_NS - second['keyframe_stamp_ns'][0])
+
+
+def sessions_of(saved: MapFile) -> list[dict[str, int]]:
+    """Return the drives that made a map; none are known of maps of earlier releases. Raises
+    KeyError, TypeError or ValueError.
+    """
+    names = ('first_ns', 'last_ns', 'keyframes')
+    return [{name: int(s[name]) for name in names} for s in saved.header.get('sessions', [])]
 
 
 def mount_of(saved: MapFile) -> Mount:

@@ -157,7 +157,8 @@ class LoopDetector:
         distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
         turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= SAME_WAY
         reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths + seen_ahead_m(mount)
-        near = np.flatnonzero(others & turned & (distance < reach))
+        shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
+        near = np.flatnonzero(others & turned & shown & (distance < reach))
         found: list[Match] = []
         nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
         for place in near[np.argsort(distance[near])][:PROOF].tolist():
