@@ -143,6 +143,12 @@ def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
     return make_transform(Rotation.from_quat(quat_xyzw.copy()).as_matrix(), translation)
 
 
+def planar(T: Array) -> NDArray[np.float64]:
+    """Return x, y and yaw (..., 3) of poses (..., 4, 4)."""
+    yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
+    return np.stack([T[..., 0, 3], T[..., 1, 3], yaw], axis=-1)
+
+
 def rotation_angle(R: Array) -> Any:
     """Return the angles (...) of rotations (..., 3, 3) in radians, in [0, pi]."""
     return np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1.0, 1.0))

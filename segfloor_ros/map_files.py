@@ -16,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.evaluation.maps import resample
 from segfloor_ros.files.results import Arrays, MapFile, read_map_file
+from segfloor_ros.geometry import planar
 from segfloor_ros.grid.map_file import (
     FREE,
     OCCUPIED,
     UNKNOWN,
     OccupancyGrid,
     OccupancyGridSettings,
-    pixels_of,
+    enlarged,
 )
-from segfloor_ros.grid.mapper import OccupancyGridMapper, planar
+from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
 from segfloor_ros.slam.results import KeyframePath, SparseCloud
@@ -40,7 +42,6 @@ from segfloor_ros.slam.saved_slam import (
 )
 
 APPEARED_BGR, GONE_BGR = (40, 40, 220), (60, 170, 60)
-PICTURE_PX = 800
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,6 @@ class SavedMap:
         """Return what the map holds, by name: counts, areas in m², metres."""
         slam, camera, mount = self.slam, saved_camera(self.file, self.name), mount_of(self.file)
         grid = self.grid()
-        cell_m2 = grid.resolution_m**2
         known_y, known_x = np.nonzero(grid.cells != UNKNOWN)
         poses = loaded_map(self.file, 0).path.T_map_base
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -74,8 +74,8 @@ class SavedMap:
             'points': len(slam['point_stable_id']),
             'loops': len(slam['loop_ends']),
             'path_m': round(float(steps_m.sum()), 2),
-            'free_m2': round(float((grid.cells == FREE).sum() * cell_m2), 2),
-            'occupied_m2': round(float((grid.cells == OCCUPIED).sum() * cell_m2), 2),
+            'free_m2': round(grid.area_m2(grid.cells == FREE), 2),
+            'occupied_m2': round(grid.area_m2(grid.cells == OCCUPIED), 2),
             'size_m': [
                 round(float(np.ptp(known) + 1) * grid.resolution_m, 2) if len(known) else 0.0
                 for known in (known_x, known_y)
@@ -198,7 +198,7 @@ def changes(first: SavedMap, second: SavedMap) -> tuple[OccupancyGrid, NDArray[n
     grid, count = grid_of(whole), len(first.file.parts['grid']['stamp_ns'])
     poses = whole['pose'][:count], whole['pose'][count:]
     then, now = (
-        _on(grid, grid_of(saved.file.parts['grid'] | {'pose': pose}))
+        resample(grid_of(saved.file.parts['grid'] | {'pose': pose}), grid)
         for saved, pose in zip((first, second), poses, strict=True)
     )
     stood, stands = (_occupied_or_beside(cells) for cells in (then, now))
@@ -210,11 +210,10 @@ def changes(first: SavedMap, second: SavedMap) -> tuple[OccupancyGrid, NDArray[n
 
 def draw_changes(grid: OccupancyGrid, change: NDArray[np.int8]) -> NDArray[np.uint8]:
     """Return a picture (h, w, 3) BGR of a map and of what `changes` says of it."""
-    picture = cv2.cvtColor(pixels_of(grid.cells), cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(grid.picture, cv2.COLOR_GRAY2BGR)
     for sign, colour in ((1, APPEARED_BGR), (-1, GONE_BGR)):
         picture[change[::-1] == sign] = colour
-    zoom = max(1, round(PICTURE_PX / max(picture.shape)))
-    return np.repeat(np.repeat(picture, zoom, axis=0), zoom, axis=1)
+    return enlarged(picture)
 
 
 def grid_of(evidence: Arrays) -> OccupancyGrid:
@@ -222,18 +221,6 @@ def grid_of(evidence: Arrays) -> OccupancyGrid:
     mapper = OccupancyGridMapper(OccupancyGridSettings())
     mapper.from_arrays(evidence, evidence['stamp_ns'])
     return mapper.grid()
-
-
-def _on(grid: OccupancyGrid, part: OccupancyGrid) -> NDArray[np.int8]:
-    """Return the cells of a part of a grid on the whole grid (H, W)."""
-    offset = (np.array(part.origin_xy_m) - grid.origin_xy_m) / grid.resolution_m
-    column, row = np.rint(offset).astype(int)
-    cells = np.full(grid.cells.shape, UNKNOWN, np.int8)
-    height, width = part.cells.shape
-    low, high = max(row, 0), max(column, 0)
-    there = cells[low : row + height, high : column + width]
-    there[:] = part.cells[low - row :, high - column :][: there.shape[0], : there.shape[1]]
-    return cells
 
 
 def _occupied_or_beside(cells: NDArray[np.int8]) -> NDArray[np.bool_]:

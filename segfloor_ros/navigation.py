@@ -18,11 +18,10 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from segfloor_ros.floor.observation import CELL_M, FloorScan
-from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.geometry import Array, invert, planar, transform_points
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, Cells, OccupancyGrid
 
 Mask = NDArray[np.bool_]
-Cells = NDArray[np.int64]
 
 REPLAN_S = 1.0
 
@@ -47,16 +46,6 @@ OBSTACLE_REACH_M = 3.0
 
 REVERSE_S = 3.0
 """Lost for so long, the robot turns back to where it came from, where the map is."""
-
-
-def room_around(free_of_obstacles: Mask, cell_m: float) -> Array:
-    """Return how far each cell (rows, columns) is from the nearest obstacle, in metres. What is
-    beyond the border is not one.
-    """
-    mask = free_of_obstacles.astype(np.uint8)
-    if mask.all():
-        return np.full(mask.shape, np.inf)
-    return np.asarray(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * cell_m)
 
 
 def graph_of(places: Mask, cell_m: float, weight: Array) -> csr_array:
@@ -124,7 +113,7 @@ class Costmap:
         self.grid = grid
         trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
-        marked[tuple(self._on_map(self.cells_of(obstacles)).T)] = True
+        marked[tuple(self._on_map(obstacles).T)] = True
         standing = (grid.cells >= OCCUPIED) | (marked & ~trodden)
         standing &= ~self._discs(driven[-1:], radius_m)
         self.free = ((grid.cells == FREE) | trodden) & ~standing
@@ -132,8 +121,8 @@ class Costmap:
         dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         self.dark = dark[1:-1, 1:-1] > 0
         """What is unknown, but for slits that the map leaves along walls."""
-        self._dark_m = room_around(dark == 0, grid.resolution_m)[1:-1, 1:-1]
-        standing_m = room_around(~standing, grid.resolution_m)
+        self._dark_m = grid.away_m(dark > 0)[1:-1, 1:-1]
+        standing_m = grid.away_m(standing)
         self.room_m = np.minimum(standing_m, self._dark_m)
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
@@ -142,15 +131,6 @@ class Costmap:
         self._index[self.places] = np.arange(len(self._cells))
         tightness = np.clip((comfort_m - standing_m) / (comfort_m - radius_m), 0, 1)
         self._graph = graph_of(self.places, grid.resolution_m, 1 + 2 * tightness[self.places])
-
-    def cells_of(self, points: Array) -> Cells:
-        """Return rows and columns (N, 2) of points (N, 2) in the map."""
-        xy = (np.reshape(points, (-1, 2)) - self.grid.origin_xy_m) / self.grid.resolution_m
-        return np.floor(xy[:, ::-1]).astype(np.int64)
-
-    def points_of(self, cells: Cells) -> Array:
-        """Return the middles (N, 2) of cells in the map."""
-        return np.array(self.grid.origin_xy_m) + (cells[:, ::-1] + 0.5) * self.grid.resolution_m
 
     def ways_from(self, point: Array, reach_m: float) -> Ways | None:
         """Return the ways from the place nearest to a point (2,); None where none is in reach."""
@@ -161,27 +141,28 @@ class Costmap:
 
     def nearest_place(self, point: Array) -> tuple[int, float]:
         """Return the number of the place nearest to a point (2,), and how far it is in metres."""
-        away_m = np.hypot(*(self.points_of(self._cells) - point).T)
+        away_m = np.hypot(*(self.grid.centres_of(self._cells) - point).T)
         nearest = int(np.argmin(away_m))
         return nearest, float(away_m[nearest])
 
     def least_room_m(self, start: Array, end: Array) -> float:
         """Return how near what may be in the way comes to the straight line between points (2,)."""
         count = 2 + int(2 * np.hypot(*(end - start)) / self.grid.resolution_m)
-        cells = self._on_map(self.cells_of(np.linspace(start, end, count)))
+        cells = self._on_map(np.linspace(start, end, count))
         return float(self.room_m[tuple(cells.T)].min(initial=np.inf))
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
         return np.asarray(self._index[tuple(cells.T)])
 
-    def _on_map(self, cells: Cells) -> Cells:
-        return cells[((cells >= 0) & (cells < self.grid.cells.shape)).all(axis=1)]
+    def _on_map(self, points: Array) -> Cells:
+        cells = self.grid.cells_of(np.reshape(points, (-1, 2)))
+        return cells[self.grid.holds(cells)]
 
     def _discs(self, points: Array, radius_m: float) -> Mask:
         """Return the cells around points."""
         mask = np.zeros(self.grid.cells.shape, np.uint8)
-        for row, column in self.cells_of(points).tolist():
+        for row, column in self.grid.cells_of(np.reshape(points, (-1, 2))).tolist():
             cv2.circle(mask, (column, row), round(radius_m / self.grid.resolution_m), 1, -1)
         return mask > 0
 
@@ -282,7 +263,7 @@ class Explorer:
         if T_map_base is None or self.grid is None:
             return self._look_for_place(time_s)
         self._lost_since_s = None
-        pose = np.array([*T_map_base[:2, 3], np.arctan2(T_map_base[1, 0], T_map_base[0, 0])])
+        pose = planar(T_map_base)
         if not self._driven or np.hypot(*(self._driven[-1] - pose[:2])) > self.body.radius_m / 2:
             self._driven.append(pose[:2])
         if time_s >= self._planned_s + REPLAN_S:
@@ -321,7 +302,7 @@ class Explorer:
             return
         number, away_m = costmap.nearest_place(self._target)
         if np.isfinite(ways.cost[number]) and away_m < radius_m:
-            way = costmap.points_of(ways.cells[ways.to(number)])
+            way = self.grid.centres_of(ways.cells[ways.to(number)])
             self.path = np.vstack([way, self._target])
 
     def _frontier(self, costmap: Costmap, ways: Ways) -> Array | None:
@@ -329,7 +310,7 @@ class Explorer:
         least = self.body.radius_m
         best, best_cost = None, np.inf
         for cells in costmap.frontiers():
-            points = costmap.points_of(cells)
+            points = costmap.grid.centres_of(cells)
             cost = ways.cost[costmap.numbers_of(cells)]
             for given_up in self._given_up:
                 cost = np.where(np.hypot(*(points - given_up).T) < 2 * least, np.inf, cost)
@@ -340,7 +321,7 @@ class Explorer:
             if cost[nearest] < best_cost:
                 best, best_cost = points[nearest], cost[nearest]
         if best is not None:
-            dark = costmap.points_of(np.argwhere(costmap.dark))
+            dark = costmap.grid.centres_of(np.argwhere(costmap.dark))
             near = dark[np.hypot(*(dark - best).T) < 4 * least]
             self._facing = near.mean(axis=0) if len(near) else best
         return best
@@ -351,7 +332,7 @@ class Explorer:
         if isinstance(self.goals, int):
             places = ways.cells[np.isfinite(ways.cost)]
             drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
-            points = costmap.points_of(places[drawn])
+            points = costmap.grid.centres_of(places[drawn])
             self._ahead = [Goal(point, f'goal_{i + 1}') for i, point in enumerate(points)]
 
     def _aim_at(self, time_s: float, target: Array | None) -> None:

@@ -16,7 +16,6 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud import LabelledPoints, write_ply
 from segfloor_ros.configuration import Configuration
 from segfloor_ros.errors import InputError, SegfloorError
+from segfloor_ros.files.images import png_bytes
 from segfloor_ros.files.results import (
     check_target,
     folder_in_the_making,
@@ -256,7 +256,7 @@ class OutputFolder:
         target = self._made / folder / f'{name}.png'
         try:
             target.parent.mkdir(exist_ok=True)
-            target.write_bytes(cv2.imencode('.png', picture)[1].tobytes())
+            target.write_bytes(png_bytes(picture))
         except OSError as error:
             target.unlink(missing_ok=True)
             if not self.problems:
@@ -352,9 +352,7 @@ def _label_writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
         return of_points
     return of_points | {
         'map_labels.yaml': lambda path: save_labels(path, grid, labels),
-        'map_semantic.png': lambda path: path.write_bytes(
-            cv2.imencode('.png', draw_labels(grid, labels))[1].tobytes()
-        ),
+        'map_semantic.png': lambda path: path.write_bytes(png_bytes(draw_labels(grid, labels))),
     }
 
 

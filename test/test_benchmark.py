@@ -25,7 +25,7 @@ from segfloor_ros.benchmark import (
 from segfloor_ros.cli.commands import DRIVE, benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
-from segfloor_ros.evaluation.maps import sample_states, states
+from segfloor_ros.evaluation.maps import sample_states
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.geometry import invert, transform_points
 from segfloor_ros.grid.map_file import FREE, OCCUPIED
@@ -142,10 +142,10 @@ def test_the_chain_makes_the_map_of_the_pipeline():
     assert workload.points == len(pipeline.keyframe_stages.labelled.point_id)
     # The corridor is 3 m wide.
     places = np.array([[2.0, 0.0], [2.5, 1.2], [2.5, -1.2]])
-    assert sample_states(states(grid), grid, places).tolist() == [FREE] * 3
+    assert sample_states(grid, places).tolist() == [FREE] * 3
     x, y = np.meshgrid(np.arange(2.2, 2.8, 0.05), [1.45, 1.5, 1.55])
     for side in (1, -1):
-        wall = sample_states(states(grid), grid, np.stack([x.ravel(), side * y.ravel()], 1))
+        wall = sample_states(grid, np.stack([x.ravel(), side * y.ravel()], 1))
         assert (wall.reshape(x.shape) == OCCUPIED).any(axis=0).mean() > 0.5
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.floor.observation import FloorScan
@@ -52,8 +51,10 @@ def pose_of(x: float, y: float, yaw: float) -> np.ndarray:
 
 def test_cells_and_points_are_of_the_map_whatever_its_origin() -> None:
     costmap = costmap_of(grid_of(TWO_ROOMS, (-3.0, 2.0)), driven=[(-2.35, 2.55)])
-    assert costmap.cells_of(np.array([-2.95, 2.25])).tolist() == [[2, 0]]
-    assert costmap.points_of(np.array([[2, 0]])) == pytest.approx(np.array([[-2.95, 2.25]]))
+    place, away_m = costmap.nearest_place(np.array([-2.35, 2.55]))
+    ways = costmap.ways_from(np.array([-2.35, 2.55]), 0.3)
+    assert away_m < CELL_M and ways is not None
+    assert np.hypot(*(costmap.grid.centres_of(ways.cells[place]) - (-2.35, 2.55))) == away_m
 
 
 def test_a_way_leads_through_the_door_and_keeps_off_the_walls() -> None:
@@ -61,11 +62,11 @@ def test_a_way_leads_through_the_door_and_keeps_off_the_walls() -> None:
     ways = costmap.ways_from(np.array([0.35, 0.85]), 0.3)
     goal, away_m = costmap.nearest_place(np.array([2.2, 0.85]))
     assert away_m < CELL_M
-    way = costmap.points_of(ways.cells[ways.to(goal)])
+    way = costmap.grid.centres_of(ways.cells[ways.to(goal)])
     crossing = way[np.abs(way[:, 0] - 1.35) < 0.06]
     assert len(crossing)
     assert ((crossing[:, 1] > 0.4) & (crossing[:, 1] < 0.7)).all()
-    rows, columns = costmap.cells_of(way).T
+    rows, columns = costmap.grid.cells_of(way).T
     assert (costmap.room_m[rows, columns] > 0.15).all()
     assert np.hypot(*np.diff(way, axis=0).T).max() < 1.5 * CELL_M
 

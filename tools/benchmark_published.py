@@ -35,7 +35,7 @@ from segfloor_ros.evaluation.map_score import (
     RoadMapPlan,
     RoadMapScore,
     compare,
-    save_overlay,
+    overlay_png,
     score_map,
 )
 from segfloor_ros.evaluation.maps import load_truth
@@ -98,7 +98,7 @@ def run_scene(
     truth = load_truth(recording)
     pose = truth.start
     save_map(grid, folder / 'map.yaml')
-    save_overlay(compare(grid, truth, pose), folder / 'overlay.png')
+    (folder / 'overlay.png').write_bytes(overlay_png(compare(grid, truth, pose)))
     score = score_map(grid, truth, pose, RoadMapPlan(nodes=published.nodes))
     return SceneResult(name, workload, score, published, cell_m)
 

@@ -24,10 +24,9 @@ from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import console
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.maps import states
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorObservation
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.grid.map_file import UNKNOWN, OccupancyGrid
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.slam.results import Keyframe
 
@@ -87,12 +86,11 @@ def drawn(view: tuple[Picture, OccupancyGrid, Array], last: OccupancyGrid, width
     seen, mapped = figure.subplots(1, 2)
     seen.imshow(image)
     seen.set_axis_off()
-    grey = np.select([states(grid) == FREE, states(grid) == OCCUPIED], [255, 0], 205)
-    mapped.imshow(grey, extent=_extent(grid), origin='lower', cmap='gray', vmin=0, vmax=255,
+    mapped.imshow(grid.picture, extent=grid.extent_m, cmap='gray', vmin=0, vmax=255,
                   interpolation='nearest')  # fmt: skip
     mapped.plot(*path[:, :2, 3].T, color='tab:blue', linewidth=2)
     mapped.plot(*path[-1, :2, 3], 'o', color='tab:orange', markersize=5)
-    left, _, bottom, _ = _extent(last)
+    left, _, bottom, _ = last.extent_m
     rows, columns = np.nonzero(last.cells != UNKNOWN)
     across = left + last.resolution_m * np.array([columns.min() - 3, columns.max() + 4])
     along = bottom + last.resolution_m * np.array([rows.min() - 3, rows.max() + 4])
@@ -101,12 +99,6 @@ def drawn(view: tuple[Picture, OccupancyGrid, Array], last: OccupancyGrid, width
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _extent(grid: OccupancyGrid) -> tuple[float, float, float, float]:
-    rows, columns = grid.cells.shape
-    x, y = grid.origin_xy_m
-    return (x, x + columns * grid.resolution_m, y, y + rows * grid.resolution_m)
 
 
 if __name__ == '__main__':

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 import typer
 
@@ -31,14 +30,7 @@ from segfloor_ros.evaluation.map_score import (
     score_map,
     score_road_maps,
 )
-from segfloor_ros.evaluation.maps import (
-    MapTruth,
-    Mask,
-    cell_centres,
-    load_truth,
-    observable,
-    states,
-)
+from segfloor_ros.evaluation.maps import MapTruth, Mask, load_truth, observable
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.whole import read_table
 from segfloor_ros.geometry import Array
@@ -133,7 +125,7 @@ def _seen_again(scene: Scene, truth: MapTruth, poses: Array) -> tuple[Mask, Mask
     those that came into sight then some time before the end.
     """
     grid = truth.grid
-    centres = cell_centres(grid)
+    centres = grid.centres_of(grid.all_cells)
     seen_s, since_s = np.zeros(len(centres)), np.full(len(centres), np.inf)
     for time_s, *pose in poses:
         people = np.array([place(mover, float(time_s))[:2] for mover in scene.people])
@@ -154,9 +146,7 @@ def _seen_again(scene: Scene, truth: MapTruth, poses: Array) -> tuple[Mask, Mask
 
 def _away_from_what_stands(truth: MapTruth) -> Mask:
     """Return the cells (rows, columns) that are not the outline of something."""
-    free = (states(truth.grid) != OCCUPIED).astype(np.uint8)
-    away_m = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(away_m * truth.grid.resolution_m > STANDS_M)
+    return np.asarray(truth.grid.away_m(truth.grid.states == OCCUPIED) > STANDS_M)
 
 
 def main(

@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import typer
 import yaml
@@ -106,17 +105,16 @@ def _way(scene: Scene, rng: np.random.Generator) -> list[list[float]]:
     """
     made = scene_from_mapping(scene, 'room')
     truth = true_map(made, obstacles(made), floors(made), np.zeros(2))
-    free = (truth.cells == FREE).astype(np.uint8)
-    room_m = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * truth.resolution_m
-    places = np.argwhere(room_m > CLEARANCE_M)[:, ::-1]
-    way, length_m = [np.zeros(2)], 0.0
+    room_m = truth.away_m(truth.cells != FREE)
+    places = np.argwhere(room_m > CLEARANCE_M)
+    way: list[Array] = [np.zeros(2)]
+    length_m = 0.0
     while length_m < WAY_M:
         cell = places[int(rng.integers(len(places)))]
-        there = truth.origin_xy_m + (cell + 0.5) * truth.resolution_m
+        there = truth.centres_of(cell)
         step_m = float(np.hypot(*(there - way[-1])))
-        line = np.linspace(way[-1], there, 50) - truth.origin_xy_m
-        columns, rows = (line / truth.resolution_m).astype(int).T
-        if step_m > LEG_M and (room_m[rows, columns] > CLEARANCE_M).all():
+        line = truth.cells_of(np.linspace(way[-1], there, 50))
+        if step_m > LEG_M and (room_m[tuple(line.T)] > CLEARANCE_M).all():
             way.append(there)
             length_m += step_m
     return [np.round(place, 2).tolist() for place in way]

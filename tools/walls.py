@@ -12,7 +12,6 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 import typer
 import yaml
@@ -23,9 +22,9 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.evaluation.map_score import compare, score_cells
-from segfloor_ros.evaluation.maps import MapTruth, cell_centres, from_frame, load_truth, states
+from segfloor_ros.evaluation.maps import MapTruth, from_frame, load_truth
 from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import Array, invert
+from segfloor_ros.geometry import invert, planar
 from segfloor_ros.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.grid.map_file import FREE, OccupancyGrid, render
 from segfloor_ros.grid.mapper import EvidenceFolder, EvidenceHistory
@@ -59,8 +58,7 @@ def map_by_truth(drive: Path, every: int, configuration: Configuration) -> Occup
             scan = floor.process(frame.left, frame.right, mount, T).scan
             grid = configuration.occupancy_grid
             evidence = gather_evidence(NO_POINTS, NO_FEATURES, T, scan, grid)
-            yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-            history.extend([evidence], np.array([[T[0, 3], T[1, 3], yaw]]))
+            history.extend([evidence], planar(T)[None])
     return render(history.raster(), history.poses[:, :2], configuration.occupancy_grid)
 
 
@@ -75,15 +73,12 @@ def fine_truth(scene: str, drive: Path) -> MapTruth:
 
 def depth_m(grid: OccupancyGrid, truth: MapTruth) -> NDArray[np.float64]:
     """Return how far the centres of the free cells (N,) lie from the nearest true floor."""
-    blocked = (states(truth.grid) != FREE).astype(np.uint8)
-    far = cv2.distanceTransform(blocked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    free = cell_centres(grid)[states(grid).ravel() == FREE]
-    there: Array = from_frame(free, truth.start)
-    there = (there - np.array(truth.grid.origin_xy_m)) / truth.grid.resolution_m
-    column, row = np.floor(there).astype(np.intp).T
-    height, width = far.shape
-    found = far[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return found.astype(np.float64) * truth.grid.resolution_m
+    far_m = truth.grid.away_m(truth.grid.states == FREE)
+    free = grid.centres_of(np.argwhere(grid.states == FREE))
+    row, column = truth.grid.cells_of(from_frame(free, truth.start)).T
+    height, width = far_m.shape
+    found = far_m[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return found.astype(np.float64)
 
 
 def main(

@@ -12,7 +12,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,13 +21,14 @@ from segfloor_ros.camera.model import ImuSample, Measurement, MeasurementLog, Wh
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, os_errors
+from segfloor_ros.files.images import jpeg_bytes, png_bytes
 from segfloor_ros.files.results import scratch_folder
 from segfloor_ros.geometry import Array, make_transform, quaternion_xyzw
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
 TF_TOPIC = '/tf_static'
-JPEG_QUALITY = 90
+
 WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
 WHEELS_FRAME = 'wheel_odom'
 
@@ -247,10 +247,7 @@ class BagWriter:
         self.file = NewBag(out, compressed=coding is ImageCoding.raw)
         self._calibration = calibration
         self._coding = coding
-        self._encoders: dict[ImageCoding, tuple[str, list[int]]] = {
-            ImageCoding.png: ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 3]),
-            ImageCoding.jpeg: ('.jpg', [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]),
-        }
+
         self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
 
     def __enter__(self) -> BagWriter:
@@ -334,11 +331,10 @@ class BagWriter:
     def _picture_message(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Any:
         if self._coding is ImageCoding.raw:
             return self.image_message(stamp_ns, image, 'mono8', frame_id)
-        suffix, options = self._encoders[self._coding]
-        _, data = cv2.imencode(suffix, np.ascontiguousarray(image), options)
+        encoded = (png_bytes if self._coding is ImageCoding.png else jpeg_bytes)(image)
         words = f'mono8; {self._coding.value} compressed mono8'
         header = self.messages.header(stamp_ns, frame_id)
-        data = self.file.library.sequence(data.ravel())
+        data = self.file.library.sequence(np.frombuffer(encoded, np.uint8))
         return self.messages.types[COMPRESSED](header=header, format=words, data=data)
 
     def _info_message(self, header: Any, eye: EyeCalibration) -> Any:

@@ -19,7 +19,7 @@ from segfloor_ros.evaluation.map_score import (
     RoadMapPlan,
     Spread,
     compare,
-    save_overlay,
+    overlay_png,
     score_map,
 )
 from segfloor_ros.evaluation.maps import (
@@ -30,6 +30,7 @@ from segfloor_ros.evaluation.maps import (
     load_truth,
     read_base_poses,
 )
+from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number, read_table
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
@@ -95,7 +96,7 @@ def evaluate_map(
     plan = RoadMapPlan(nodes=nodes, min_distance_m=min_distance, repetitions=repetitions, seed=seed)
     score = score_map(grid, known, pose, plan, sight)
     if overlay is not None:
-        save_overlay(compare(grid, known, pose, sight), overlay)
+        write_file(overlay, overlay_png(compare(grid, known, pose, sight)))
     if as_json:
         return print_json(dataclasses.asdict(score))
     console.print(map_table(score))

@@ -17,7 +17,7 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import MapError, SettingsError, about, os_errors
 from segfloor_ros.files.results import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.files.whole import read_json, read_yaml
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, planar
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.processes import first_interrupt_noted
 from segfloor_ros.trajectory import Trajectory, write_tum
@@ -94,10 +94,10 @@ def explore(
     described = open_scene(scene, [*of_camera, *values])
     with about(scene):
         driven = DrivenRobot(described, published)
-        T_world_base = driven.T_world_base(0.0)
-        x, y, yaw = *T_world_base[:2, 3], np.arctan2(T_world_base[1, 0], T_world_base[0, 0])
-        truth = true_map(described, obstacles(described), floors(described), T_world_base[:2, 3])
-    start: Pose2d = (float(x), float(y), float(yaw))
+        x, y, yaw = planar(driven.T_world_base(0.0)).tolist()
+        solids = obstacles(described), floors(described)
+        truth = true_map(described, *solids, np.array([x, y]))
+    start: Pose2d = (x, y, yaw)
     floor = exploration.reachable_floor(truth, published.radius_m, start)
     body = Body(
         published.radius_m,

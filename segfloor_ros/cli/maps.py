@@ -6,11 +6,11 @@ import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import typer
 
 from segfloor_ros.cli.terminal import Json, console, print_json, value_table
 from segfloor_ros.errors import SettingsError
+from segfloor_ros.files.images import png_bytes
 from segfloor_ros.files.results import write_file, write_map_file
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.map_files import changes, draw_changes, merge, open_map
@@ -112,15 +112,11 @@ def diff(
     segfloor map diff monday.map friday.map changes.png
     """
     grid, change = changes(open_map(first), open_map(second))
-    write_file(out, cv2.imencode('.png', draw_changes(grid, change))[1].tobytes())
-    cell_m2 = grid.resolution_m**2
-    areas = {
-        f'{name}_m2': round(float((change == sign).sum() * cell_m2), 2)
-        for name, sign in (('appeared', 1), ('gone', -1))
-    }
+    write_file(out, png_bytes(draw_changes(grid, change)))
+    areas = {name: grid.area_m2(change == sign) for name, sign in (('appeared', 1), ('gone', -1))}
     if as_json:
-        return print_json(areas)
-    rows = [(name.removesuffix('_m2'), f'{area:.2f} m²') for name, area in areas.items()]
+        return print_json({f'{name}_m2': round(area, 2) for name, area in areas.items()})
+    rows = [(name, f'{area:.2f} m²') for name, area in areas.items()]
     console.print(value_table('change', [*rows, ('picture', str(out))]))
 
 

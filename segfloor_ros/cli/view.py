@@ -24,12 +24,12 @@ from segfloor_ros.cli.terminal import console, progress_bar
 from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.files.images import read_mask
+from segfloor_ros.files.images import jpeg_bytes, read_mask
 from segfloor_ros.files.results import check_writable
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.segmentation import mask_overlay
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map, pixels_of
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.results_folder import MAP, MOUNT_FIGURES, RunResult, read_summary, summary_rows
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, MovingPoints
@@ -43,8 +43,8 @@ WEB_PORT = 9090
 SHARE = 0.015
 """Of the time of a drive that showing its frames may take, and as much its keyframes."""
 
-WIDTH_PX, QUALITY = 480, 80
-"""Of the JPEG images that are shown."""
+WIDTH_PX = 480
+"""Of the images that are shown."""
 
 PATH_M, POINT_M, CAMERA_M = 0.02, 0.015, 0.3
 """Radii of path and points, and how far ahead of the camera its image is drawn."""
@@ -242,7 +242,7 @@ class View:
             width=columns, height=rows, color_model='L', channel_datatype='U8'
         )
         drawn = self._rr.GridMap(
-            data=pixels_of(grid.cells).tobytes(),
+            data=grid.picture.tobytes(),
             format=form,
             colormap=self._rr.components.Colormap.Grayscale,
             cell_size=grid.resolution_m,
@@ -329,8 +329,7 @@ class View:
     def _picture(self, stamp_ns: int, entity: str, picture: NDArray[np.uint8]) -> None:
         height = round(WIDTH_PX / picture.shape[1] * picture.shape[0])
         small = cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_LINEAR)
-        _, jpeg = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-        image = self._rr.EncodedImage(contents=jpeg.tobytes(), media_type='image/jpeg')
+        image = self._rr.EncodedImage(contents=jpeg_bytes(small), media_type='image/jpeg')
         self._log(stamp_ns, entity, image)
 
     def _text(self, stamp_ns: int, words: str, level: str = 'INFO') -> None:

@@ -19,7 +19,7 @@ from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_
 from segfloor_ros.evaluation.maps import MapTruth, Mask, Pose2d, from_frame, resample
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
-from segfloor_ros.navigation import ARRIVED_M, Goal, room_around
+from segfloor_ros.navigation import ARRIVED_M, Goal
 
 FILM_FRAMES = 60
 """At most, ten of them in a second."""
@@ -44,10 +44,10 @@ class Exploration:
 
 def reachable_floor(truth: OccupancyGrid, radius_m: float, start: Pose2d) -> Mask:
     """Return the floor (rows, columns) that a robot of some radius can stand on."""
-    room_m = room_around(truth.cells != OCCUPIED, truth.resolution_m)
+    room_m = truth.away_m(truth.cells == OCCUPIED)
     _, labels = cv2.connectedComponents((room_m > radius_m).astype(np.uint8), connectivity=4)
-    column, row = ((np.array(start[:2]) - truth.origin_xy_m) / truth.resolution_m).astype(int)
-    away_m = room_around(labels != labels[row, column], truth.resolution_m)
+    at_start = labels[tuple(truth.cells_of(np.array(start[:2])))]
+    away_m = truth.away_m(labels == at_start)
     return np.asarray((away_m <= radius_m) & (truth.cells == FREE))
 
 
@@ -126,10 +126,7 @@ def _canvas(found: Exploration, truth: OccupancyGrid) -> tuple[Figure, Any]:
     height, width = truth.cells.shape
     figure = Figure(figsize=(6 * max(width / height, 0.6), 6), layout='tight')
     axes = figure.add_subplot()
-    x, y = truth.origin_xy_m
-    size = truth.resolution_m
-    extent = (x, x + width * size, y, y + height * size)
-    shown = axes.imshow(np.zeros((height, width, 3)), origin='lower', extent=extent)
+    shown = axes.imshow(np.zeros((height, width, 3)), origin='lower', extent=truth.extent_m)
     (way,) = axes.plot([], [], color='tab:blue', linewidth=1.2, label='true way')
     (robot,) = axes.plot([], [], 'o', color='tab:blue', markersize=6)
     stamps = np.array(sorted(found.true_poses))

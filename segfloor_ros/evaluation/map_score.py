@@ -10,24 +10,14 @@ repetitions.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.evaluation.maps import (
-    SAME_PLACE_M,
-    Cells,
-    MapTruth,
-    Mask,
-    Pose2d,
-    observable,
-    resample,
-    states,
-)
-from segfloor_ros.files.results import write_file
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN_PIXEL, OccupancyGrid
+from segfloor_ros.evaluation.maps import SAME_PLACE_M, MapTruth, Mask, Pose2d, observable, resample
+from segfloor_ros.files.images import png_bytes
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN_PIXEL, Cells, OccupancyGrid, enlarged
 
 DEFAULT_RANGE_M = 5.0
 
@@ -42,8 +32,7 @@ COLOURS = {
 }
 """Blue, green, red of each class in the picture."""
 
-WANTED_SIDE_PX, LEGEND_ROW_PX = 1000, 26
-"""Of the picture, and of each line of its legend."""
+LEGEND_ROW_PX = 26
 
 
 @dataclass(frozen=True)
@@ -138,7 +127,7 @@ def compare(
     None: where the drive starts, as far as that is known. Where the drive is known, only what it
     could see within `range_m` counts for recall.
     """
-    true_states = states(truth.grid)
+    true_states = truth.grid.states
     floor, obstacles = true_states == FREE, true_states == OCCUPIED
     if truth.base_poses is not None:
         floor, obstacles = observable(truth.grid, truth.base_poses, truth.fov_rad, range_m)
@@ -286,21 +275,14 @@ def _grown(mask: Mask, side: int) -> Mask:
 
 
 def draw_overlay(maps: Comparison) -> NDArray[np.uint8]:
-    """Return a colour picture (BGR), y up, enlarged to about a thousand pixels, with a legend."""
-    picture = coloured(maps)[::-1]
-    factor = max(1, WANTED_SIDE_PX // max(picture.shape[:2]))
-    picture = np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)
+    """Return a colour picture (BGR), y up, enlarged, with a legend."""
+    picture = enlarged(coloured(maps)[::-1])
     return np.vstack([picture, _legend(picture.shape[1])])
 
 
 def overlay_png(maps: Comparison) -> bytes:
     """Return the picture as a PNG file."""
-    return cv2.imencode('.png', draw_overlay(maps))[1].tobytes()
-
-
-def save_overlay(maps: Comparison, path: Path) -> None:
-    """Write the picture as PNG. Raises InputError where it cannot be written."""
-    write_file(path, overlay_png(maps))
+    return png_bytes(draw_overlay(maps))
 
 
 def coloured(maps: Comparison) -> NDArray[np.uint8]:

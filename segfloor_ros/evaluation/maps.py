@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,16 +20,8 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_table, read_yaml
-from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import (
-    FREE,
-    FREE_THRESH,
-    OCCUPIED,
-    OCCUPIED_THRESH,
-    UNKNOWN,
-    OccupancyGrid,
-    load_map,
-)
+from segfloor_ros.geometry import Array, planar
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map
 from segfloor_ros.trajectory import read_trajectory
 
 Pose2d = tuple[float, float, float]
@@ -41,9 +34,10 @@ compared, and the step of the search for an alignment.
 """
 
 Mask = NDArray[np.bool_]
-Cells = NDArray[np.int64]
 
-MAX_SCORED_CELLS = 40000
+ENOUGH = 40000
+"""Cells or points, to score an alignment by or to draw."""
+
 REFINEMENTS = 4
 """Steps of the refinement: that of the search, then half of the one before."""
 
@@ -90,9 +84,7 @@ def read_base_poses(path: Path) -> Array:
     table = read_table(path)
     if table.shape[1] == 4:
         return table[:, 1:]
-    _, poses = read_trajectory(path)
-    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    return np.column_stack([poses[:, 0, 3], poses[:, 1, 3], yaw])
+    return planar(read_trajectory(path)[1])
 
 
 def _read_scene(path: Path) -> tuple[Pose2d, float]:
@@ -105,35 +97,19 @@ def _read_scene(path: Path) -> tuple[Pose2d, float]:
     return (x, y, yaw), fov_rad
 
 
-def states(grid: OccupancyGrid) -> NDArray[np.int8]:
-    """Return the cells (rows, columns) int8 as map files store them: `FREE`, `OCCUPIED` or
-    `UNKNOWN`.
-    """
-    result = np.full(grid.cells.shape, UNKNOWN, np.int8)
-    result[(grid.cells >= FREE) & (grid.cells < 100 * FREE_THRESH)] = FREE
-    result[grid.cells > 100 * OCCUPIED_THRESH] = OCCUPIED
-    return result
-
-
-def cell_centres(grid: OccupancyGrid) -> Array:
-    """Return the centres (rows * columns, 2) of a grid's cells in its frame, row by row."""
-    rows, columns = np.indices(grid.cells.shape)
-    cells = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
-    return np.array(grid.origin_xy_m) + cells * grid.resolution_m
-
-
-def sample_states(
-    cell_states: NDArray[np.int8], grid: OccupancyGrid, points: Array
-) -> NDArray[np.int8]:
+def sample_states(grid: OccupancyGrid, points: Array) -> NDArray[np.int8]:
     """Return the states (N,) of the cells that hold points (N, 2) of the grid's frame; `UNKNOWN`
     outside.
     """
-    cells = np.floor((points - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(np.int64)
-    column, row = cells[:, 0], cells[:, 1]
-    height, width = cell_states.shape
-    inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
-    result = np.full(len(points), UNKNOWN, np.int8)
-    result[inside] = cell_states[row[inside], column[inside]]
+    return _values_at(grid, grid.states, points, UNKNOWN)
+
+
+def _values_at(grid: OccupancyGrid, values: NDArray[Any], points: Array, outside: Any) -> Any:
+    """Return what the cells (rows, columns) that hold points (N, 2) have; `outside` beyond them."""
+    cells = grid.cells_of(points)
+    inside = grid.holds(cells)
+    result = np.full(len(points), outside, values.dtype)
+    result[inside] = values[tuple(cells[inside].T)]
     return result
 
 
@@ -151,13 +127,15 @@ def from_frame(points: Array, pose: Pose2d) -> Array:
     return np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=1)
 
 
-def resample(estimate: OccupancyGrid, raster: OccupancyGrid, pose: Pose2d) -> NDArray[np.int8]:
+def resample(
+    estimate: OccupancyGrid, raster: OccupancyGrid, pose: Pose2d = (0.0, 0.0, 0.0)
+) -> NDArray[np.int8]:
     """Return the states of an estimate on the raster of another grid, (rows, columns) int8.
 
-    pose: where the estimate's frame lies in the raster's frame.
+    pose: where the estimate's frame lies in the raster's frame, without one they are the same.
     """
-    points = to_frame(cell_centres(raster), pose)
-    return sample_states(states(estimate), estimate, points).reshape(raster.cells.shape)
+    points = to_frame(raster.centres_of(raster.all_cells), pose)
+    return sample_states(estimate, points).reshape(raster.cells.shape)
 
 
 def observable(
@@ -167,31 +145,23 @@ def observable(
 
     base_poses: (N, 3) x, y, yaw. Sight is horizontal, `fov_rad` wide and `range_m` long.
     """
-    cell_states = states(truth)
+    cell_states = truth.states
     seen = np.zeros(cell_states.shape, bool)
     hit = np.zeros(cell_states.shape, bool)
     bearings = np.linspace(-fov_rad / 2, fov_rad / 2, BEARINGS)
     distances = np.arange(0.0, range_m, truth.resolution_m / 2)
     for x, y, yaw in _distinct(base_poses):
         heading = (yaw + bearings)[:, None]
-        ray_x, ray_y = x + np.cos(heading) * distances, y + np.sin(heading) * distances
-        row, column = _clipped_cells(truth, ray_x, ray_y)
+        rays = np.stack([x + np.cos(heading) * distances, y + np.sin(heading) * distances], axis=-1)
+        # What lies beyond the map has the state of its border.
+        cells = truth.cells_of(rays).clip(0, np.array(seen.shape) - 1)
+        row, column = cells[..., 0], cells[..., 1]
         state = cell_states[row, column]
         blocked = np.logical_or.accumulate(state != FREE, axis=1)
         seen[row[~blocked], column[~blocked]] = True
         first = blocked & (np.cumsum(blocked, axis=1) == 1) & (state == OCCUPIED)
         hit[row[first], column[first]] = True
     return seen & (cell_states == FREE), hit
-
-
-def _clipped_cells(
-    grid: OccupancyGrid, x: Array, y: Array
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return rows and columns of points; those outside fall on the border."""
-    height, width = grid.cells.shape
-    row = ((y - grid.origin_xy_m[1]) / grid.resolution_m).astype(np.int64)
-    column = ((x - grid.origin_xy_m[0]) / grid.resolution_m).astype(np.int64)
-    return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
 
 
 def _distinct(base_poses: Array) -> Array:
@@ -235,28 +205,23 @@ class _Fit:
         return free + self._earned(self.occupied, self.occupied_gain, pose, 0.0)
 
     def _earned(self, points: Array, gain: Array, pose: Pose2d, outside: float) -> float:
-        moved = from_frame(points, pose) - np.array(self.truth.origin_xy_m)
-        cells = np.floor(moved / self.truth.resolution_m).astype(np.int64)
-        height, width = gain.shape
-        inside = ((cells >= 0) & (cells < (width, height))).all(axis=1)
-        hit = cells[inside]
-        return float(gain[hit[:, 1], hit[:, 0]].sum() + outside * (~inside).sum())
+        return float(_values_at(self.truth, gain, from_frame(points, pose), outside).sum())
 
 
 def _known_points(grid: OccupancyGrid) -> tuple[Array, Array]:
     """Return centres of free and of occupied cells, thinned evenly where there are many."""
-    state = states(grid).ravel()
-    centres = cell_centres(grid)
-    thinned = []
-    for wanted in (FREE, OCCUPIED):
-        points = centres[state == wanted]
-        thinned.append(points[:: max(1, len(points) // MAX_SCORED_CELLS)])
-    return thinned[0], thinned[1]
+    free, occupied = (thinned(np.argwhere(grid.states == state)) for state in (FREE, OCCUPIED))
+    return grid.centres_of(free), grid.centres_of(occupied)
+
+
+def thinned(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return rows (N, ...) evenly thinned where they are more than a score or a picture needs."""
+    return rows[:: max(1, len(rows) // ENOUGH)]
 
 
 def _gain_images(truth: OccupancyGrid) -> tuple[Array, Array]:
     """Return what a free and what an occupied estimated cell earn at each cell of the truth."""
-    state = states(truth)
+    state = truth.states
     free_gain = np.where(state == FREE, 1.0, -1.0)
     reach = 2 * max(1, round(SAME_PLACE_M / 2 / truth.resolution_m)) + 1
     near = cv2.dilate((state == OCCUPIED).astype(np.uint8), np.ones((reach, reach), np.uint8))

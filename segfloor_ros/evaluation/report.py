@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from segfloor_ros.camera.calibration.chessboard import PAGE, CalibrationResult
 from segfloor_ros.errors import os_errors
-from segfloor_ros.evaluation.map_score import MapScore, compare, draw_overlay, score_map
+from segfloor_ros.evaluation.map_score import MapScore, compare, overlay_png, score_map
 from segfloor_ros.evaluation.report_pictures import (
     ReportData,
     cloud_picture,
@@ -196,9 +195,8 @@ def _map_facts(score: MapScore) -> list[tuple[str, str]]:
 def _maps(data: ReportData) -> str:
     figures = [_figure(map_picture(data), 'Map with the path of the robot')]
     if data.truth is not None:
-        overlay = draw_overlay(compare(data.grid, data.truth))
-        png = bytes(cv2.imencode('.png', overlay)[1])
-        figures.append(_figure(png, 'Map laid on the true one'))
+        overlay = overlay_png(compare(data.grid, data.truth))
+        figures.append(_figure(overlay, 'Map laid on the true one'))
     figures.append(_figure(cloud_picture(data), 'Labelled cloud from above'))
     return f'<h2>Map</h2><div class="row">{"".join(figures)}</div>'
 

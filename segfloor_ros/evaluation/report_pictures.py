@@ -31,8 +31,8 @@ from segfloor_ros.cloud import FLOOR as FLOOR_POINT
 from segfloor_ros.cloud import OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.cloud import UNKNOWN as UNKNOWN_POINT
 from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.maps import MapTruth, load_truth
-from segfloor_ros.files.images import check_same_size, read_grey, read_mask
+from segfloor_ros.evaluation.maps import MapTruth, load_truth, thinned
+from segfloor_ros.files.images import check_same_size, jpeg_bytes, read_grey, read_mask
 from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import CELL_M, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
@@ -43,7 +43,6 @@ from segfloor_ros.grid.map_file import (
     UNKNOWN_PIXEL,
     OccupancyGrid,
     load_map,
-    pixels_of,
 )
 from segfloor_ros.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.trajectory import read_trajectory
@@ -53,7 +52,6 @@ FLOOR, NO_EVIDENCE = '#3aa655', f'{UNKNOWN_PIXEL / 255}'
 
 CORNER_TINT, CORNER_PX = (40, 140, 250), 4
 
-MAX_DRAWN_POINTS = 60000
 MARGIN_CELLS = 5
 
 STRIP_LENGTH, STRIP_WIDTH_PX = 6, 480
@@ -79,9 +77,9 @@ def cloud_picture(data: ReportData) -> bytes:
     figure, axes = _figure(data.grid)
     axes.set_facecolor('#f4f4f4')
     for label, colour in ((UNKNOWN_POINT, NO_EVIDENCE), (FLOOR_POINT, FLOOR)):
-        points = _some(data.cloud, label)
+        points = thinned(data.cloud.xyz_map[data.cloud.label == label])
         axes.scatter(points[:, 0], points[:, 1], s=1.0, color=colour, linewidths=0)
-    points = _some(data.cloud, OBSTACLE)
+    points = thinned(data.cloud.xyz_map[data.cloud.label == OBSTACLE])
     drawn = axes.scatter(
         points[:, 0], points[:, 1], s=1.6, c=points[:, 2], cmap='plasma', vmin=0, vmax=2,
         linewidths=0,
@@ -141,8 +139,7 @@ def memory_picture(memory: dict[str, Any]) -> bytes | None:
 def _tinted(item: MaskedFrame) -> bytes:
     picture = mask_overlay(item.frame.left, item.mask, item.moving)
     scale = STRIP_WIDTH_PX / picture.shape[1]
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return bytes(cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+    return jpeg_bytes(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def _show_ends(axes: Axes, data: ReportData) -> None:
@@ -203,7 +200,7 @@ def pair_picture(result: CalibrationResult) -> bytes:
     by_row = left_px[np.argsort(left_px[:, 1])]
     for _, v in np.rint(by_row[:: result.board.columns]).astype(int).tolist():
         cv2.line(drawn, (0, v), (pair.shape[1] - 1, v), CORNER_TINT, 1)
-    return bytes(cv2.imencode('.jpg', drawn)[1])
+    return jpeg_bytes(drawn)
 
 
 def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
@@ -215,30 +212,15 @@ def _figure(grid: OccupancyGrid) -> tuple[Figure, Axes]:
     rows, columns = high - low
     figure = Figure(figsize=(8, float(np.clip(8 * rows / columns, 2.5, 10)) + 0.8))
     axes = figure.subplots()
-    x, y = grid.origin_xy_m
-    axes.set(
-        xlabel='x [m]',
-        ylabel='y [m]',
-        xlim=(x + low[1] * grid.resolution_m, x + high[1] * grid.resolution_m),
-        ylim=(y + low[0] * grid.resolution_m, y + high[0] * grid.resolution_m),
-    )
-    axes.set_aspect('equal')
+    shown = np.array(grid.origin_xy_m) + np.stack([low, high])[:, ::-1] * grid.resolution_m
+    axes.set(xlabel='x [m]', ylabel='y [m]', xlim=shown[:, 0], ylim=shown[:, 1], aspect='equal')
     return figure, axes
 
 
 def _show_grid(axes: Axes, grid: OccupancyGrid) -> None:
-    rows, columns = grid.cells.shape
-    x, y = grid.origin_xy_m
-    extent = (x, x + columns * grid.resolution_m, y, y + rows * grid.resolution_m)
     axes.imshow(
-        pixels_of(grid.cells), extent=extent, cmap='gray', vmin=0, vmax=255, interpolation='nearest'
+        grid.picture, extent=grid.extent_m, cmap='gray', vmin=0, vmax=255, interpolation='nearest'
     )
-
-
-def _some(cloud: LabelledPoints, label: int) -> NDArray[np.float32]:
-    """Return the points (N, 3) of a label, thinned evenly where there are many."""
-    points = cloud.xyz_map[cloud.label == label]
-    return points[:: max(1, len(points) // MAX_DRAWN_POINTS)]
 
 
 def _png(figure: Figure) -> bytes:

@@ -39,6 +39,10 @@ _silent: set[object] = set()
 _standard_error: int | None = None
 
 
+JPEG_QUALITY = 90
+"""Above this, JPEG images grow much faster than they improve."""
+
+
 class CorruptImageError(InputError):
     """The data of one image is damaged; the rest of the recording may be fine."""
 
@@ -71,6 +75,16 @@ def decode_file(data: bytes, name: str) -> Grey:
     make up the missing part.
     """
     return _decoded(data, name, GREY)
+
+
+def png_bytes(image: NDArray[Any]) -> bytes:
+    """Return an image (H, W) or (H, W, 3), BGR, as a PNG file."""
+    return cv2.imencode('.png', image)[1].tobytes()
+
+
+def jpeg_bytes(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
+    """Return an image (H, W) or (H, W, 3), BGR, as a JPEG file."""
+    return cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def check_size(width: int, height: int, name: str) -> None:

@@ -24,6 +24,7 @@ from segfloor_ros.errors import InputError, MapError
 from segfloor_ros.files.images import read_picture
 from segfloor_ros.files.results import replacing
 from segfloor_ros.files.whole import read_yaml
+from segfloor_ros.geometry import Array
 from segfloor_ros.settings import StageSettings, setting
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
@@ -33,6 +34,12 @@ MODES = ('trinary', 'scale', 'raw')
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cells, as nav_msgs/OccupancyGrid has them."""
 
+PICTURE_PX = 1000
+"""Side of a picture of a map for people, about."""
+
+Cells = NDArray[np.int64]
+"""Rows and columns (..., 2)."""
+
 _NOTHING, _UNREACHED, _REACHED, _STANDING = range(4)
 """What a cell is while the map is drawn."""
 _HOLE_M2 = 0.01
@@ -41,9 +48,9 @@ _HOLE_M2 = 0.01
 QUANTUM = 0.05
 HIT, MISS = 0.7, 0.4
 """Evidence of one keyframe that sees an obstacle, or floor, in a cell."""
-OCCUPIED_FROM, FREE_FROM = 1.2, 0.4
-"""Cells with more evidence than this are occupied, and rays end there; with so much for floor they
-are free."""
+OCCUPIED_FROM, FREE_FROM = 1.2, MISS
+"""Cells with more evidence than this are occupied, and rays end there; one look at floor makes a
+cell free."""
 SURE = OCCUPIED_FROM + HIT
 """Occupied cells with more evidence than this are not beside what is seen now, but in its way."""
 MOST, LEAST = SURE + QUANTUM, -2.0
@@ -74,7 +81,7 @@ def save_map(
         'free_thresh': FREE_THRESH,
         **(facts or {}),
     }
-    pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else pixels_of(grid.cells)
+    pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else grid.picture
     _replace_file(image_path, _pgm_bytes(pixels))
     _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
 
@@ -92,14 +99,10 @@ def load_map(path: Path) -> OccupancyGrid:
     return OccupancyGrid(np.ascontiguousarray(cells[::-1]), description['resolution'], (x, y))
 
 
-def pixels_of(cells: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Return cells (H, W) as a picture (H, W) in the grey levels of map_server: its first row is
-    their last.
-    """
-    pixels = np.full(cells.shape, UNKNOWN_PIXEL, np.uint8)
-    pixels[(cells >= FREE) & (cells < 100 * FREE_THRESH)] = FREE_PIXEL
-    pixels[cells > 100 * OCCUPIED_THRESH] = OCCUPIED_PIXEL
-    return pixels[::-1]
+def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) of a map, a pixel a cell, with whole pixels as large as fit."""
+    zoom = max(1, PICTURE_PX // max(picture.shape[:2]))
+    return np.repeat(np.repeat(picture, zoom, axis=0), zoom, axis=1)
 
 
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
@@ -189,6 +192,61 @@ class OccupancyGrid:
     cells: NDArray[np.int8]
     resolution_m: float
     origin_xy_m: tuple[float, float]
+
+    def cells_of(self, points: Array) -> Cells:
+        """Return rows and columns (..., 2) of points (..., 2) in `map`, on the grid or beyond."""
+        xy = (np.asarray(points) - self.origin_xy_m) / self.resolution_m
+        return np.floor(xy[..., ::-1]).astype(np.int64)
+
+    def centres_of(self, cells: Cells) -> Array:
+        """Return the middles (..., 2) in `map` of cells, rows and columns (..., 2)."""
+        return np.array(self.origin_xy_m) + (cells[..., ::-1] + 0.5) * self.resolution_m
+
+    def holds(self, cells: Cells) -> NDArray[np.bool_]:
+        """Return which cells, rows and columns (..., 2), lie on the grid."""
+        return np.asarray(((cells >= 0) & (cells < self.cells.shape)).all(axis=-1))
+
+    @property
+    def all_cells(self) -> Cells:
+        """Rows and columns (rows * columns, 2) of all cells, row by row."""
+        return np.indices(self.cells.shape).reshape(2, -1).T
+
+    @property
+    def states(self) -> NDArray[np.int8]:
+        """The cells (rows, columns) as map files store them: `FREE`, `OCCUPIED` or `UNKNOWN`."""
+        states = np.full(self.cells.shape, UNKNOWN, np.int8)
+        states[(self.cells >= FREE) & (self.cells < 100 * FREE_THRESH)] = FREE
+        states[self.cells > 100 * OCCUPIED_THRESH] = OCCUPIED
+        return states
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper border in `map`."""
+        (rows, columns), (x, y) = self.cells.shape, self.origin_xy_m
+        return (x, x + columns * self.resolution_m, y, y + rows * self.resolution_m)
+
+    @property
+    def picture(self) -> NDArray[np.uint8]:
+        """The cells as a picture (rows, columns) in the grey levels of map_server: its first row is
+        their last.
+        """
+        pixels = np.full(self.cells.shape, UNKNOWN_PIXEL, np.uint8)
+        pixels[self.states == FREE], pixels[self.states == OCCUPIED] = FREE_PIXEL, OCCUPIED_PIXEL
+        return pixels[::-1]
+
+    def away_m(self, where: NDArray[np.bool_]) -> Array:
+        """Return how far each cell (rows, columns) is from the nearest of some cells, infinite
+        where there are none; nothing is beyond the border.
+        """
+        others = (~where).astype(np.uint8)
+        if others.all():
+            return np.full(where.shape, np.inf)
+        away = cv2.distanceTransform(others, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return np.asarray(away * self.resolution_m)
+
+    def area_m2(self, where: NDArray[np.bool_]) -> float:
+        """Return the area of some cells (rows, columns)."""
+        return float(where.sum() * self.resolution_m**2)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.files.results import Arrays, check_lengths
 from segfloor_ros.floor.observation import CELL_M, FloorScan
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, planar
 from segfloor_ros.grid.keyframe_evidence import (
     SUBPIXEL_BITS,
     Fan,
@@ -52,17 +52,14 @@ from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
 
-_MOVE_SHARE = 0.25
-"""The map follows keyframes that moved by more than this share of a cell."""
+_FINE = 0.25
+"""Share of a cell that its raster does not show: so far apart are samples of a ray, and keyframes
+that moved by less are not followed."""
 
 UNDO_BYTES = 4_000_000
 _MAX_STRIDE_M = 2.0
 """Between keyframes farther apart than this the base's way is not known."""
 
-_AROUND = np.ones((3, 3), np.uint8)
-
-_RAY_STEP = 0.25
-"""Cells between two samples of a ray."""
 
 Pose2d = tuple[float, float, float]
 """x and y in metres, yaw in radians."""
@@ -138,7 +135,7 @@ class OccupancyGridMapper:
         now, then = poses[row], self._history.poses
         moved_m = np.hypot(now[:, 0] - then[:, 0], now[:, 1] - then[:, 1])
         turn = np.abs(np.remainder(now[:, 2] - then[:, 2] + np.pi, 2 * np.pi) - np.pi)
-        limit_m = _MOVE_SHARE * self._settings.resolution_m
+        limit_m = _FINE * self._settings.resolution_m
         moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
         if len(moved):
             self._history.move(int(moved[0]), now[moved[0] :])
@@ -154,12 +151,6 @@ class OccupancyGridMapper:
         for history in (before, latest):
             self._history.extend(history.evidence, history.poses)
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
-
-
-def planar(T_map_base: Array) -> NDArray[np.float64]:
-    """Return x, y and yaw (K, 3) of poses (K, 4, 4)."""
-    yaw = np.arctan2(T_map_base[:, 1, 0], T_map_base[:, 0, 0])
-    return np.stack([T_map_base[:, 0, 3], T_map_base[:, 1, 3], yaw], axis=1)
 
 
 class EvidenceHistory:
@@ -328,7 +319,7 @@ class EvidenceFolder:
         near = self._draw_near(cells.shape, placed)
         in_the_way = self._standing(cells, near) & touched
         if cv2.countNonZero(in_the_way):
-            in_the_way &= 1 - cv2.dilate(hits, _AROUND)
+            in_the_way &= 1 - cv2.dilate(hits, np.ones((3, 3), np.uint8))
         hidden = self._draw_hidden(in_the_way, placed.fan)
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible
@@ -452,7 +443,7 @@ def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: floa
     length = np.maximum(np.sqrt((offset**2).sum(axis=0)) - short, 0)
     if len(length) == 0:
         return
-    along = np.arange(0, length.max() + _RAY_STEP, _RAY_STEP)
+    along = np.arange(0, length.max() + _FINE, _FINE)
     direction = offset / np.maximum(np.sqrt((offset**2).sum(axis=0)), 1e-9)
     distance = np.minimum(along, length[:, None])
     column, row = (base[:, None, None] + direction[:, :, None] * distance).astype(np.intp)

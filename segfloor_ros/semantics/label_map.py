@@ -18,15 +18,7 @@ from segfloor_ros.errors import InputError, SettingsError
 from segfloor_ros.files.whole import read_yaml
 from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR
 from segfloor_ros.geometry import transform_points
-from segfloor_ros.grid.map_file import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    OccupancyGrid,
-    load_map,
-    pixels_of,
-    save_map,
-)
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 from segfloor_ros.semantics.outputs import UNLABELLED
 from segfloor_ros.settings import suggestion
 from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
@@ -111,10 +103,9 @@ class LabelMap:
             if seen is None:
                 continue
             xy = seen.xy_m @ T[:2, :2].T + T[:2, 3]
-            column, row = np.floor((xy - grid.origin_xy_m) / grid.resolution_m).astype(np.intp).T
-            inside = (row >= 0) & (row < grid.cells.shape[0])
-            inside &= (column >= 0) & (column < grid.cells.shape[1])
-            cell = row[inside] * grid.cells.shape[1] + column[inside]
+            cells = grid.cells_of(xy)
+            inside = grid.holds(cells)
+            cell = np.ravel_multi_index(cells[inside].T, grid.cells.shape)
             np.add.at(counts, (seen.stands[inside].astype(int), cell, seen.label[inside]), 1)
         kinds = grid.cells.reshape(-1)
         best = np.full(len(kinds), UNLABELLED, np.uint8)
@@ -179,7 +170,7 @@ def draw_labels(grid: OccupancyGrid, labels: Labels) -> NDArray[np.uint8]:
     """
     assert labels.cells is not None
     colours = class_colours(len(labels.classes))
-    picture = cv2.cvtColor(np.ascontiguousarray(pixels_of(grid.cells)), cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(np.ascontiguousarray(grid.picture), cv2.COLOR_GRAY2BGR)
     cells, kinds = labels.cells[::-1], grid.cells[::-1]
     known = cells < len(labels.classes)
     painted = colours[cells[known]].astype(np.uint16)

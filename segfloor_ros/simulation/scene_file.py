@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_yaml, shortened, yaml_value
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid, load_map
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, Cells, OccupancyGrid, load_map
 from segfloor_ros.navigation import Ways, graph_of
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation import scene as scene_module
@@ -46,8 +46,6 @@ RANGES = {
     'flying_share': (0, 1), 'dark_grey': (0, 255), 'shiny_grey': (0, 255),
 }  # fmt: skip
 """Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
-
-Cells = NDArray[np.int64]
 
 Mask = NDArray[np.bool_]
 
@@ -236,7 +234,7 @@ def scene_of_map(file: Path, overrides: dict[str, Any]) -> dict[str, Any]:
     seed = int(overrides.get('seed', Scene.seed))
     waypoints = overrides.get('path', {}).get('waypoints')
     if waypoints is None:
-        waypoints = plan_tour(grid.cells == FREE, grid.resolution_m, grid.origin_xy_m).tolist()
+        waypoints = plan_tour(grid).tolist()
     return {
         'description': f'Floor plan {file.name}, walls extruded, a tour through its free space.',
         'seed': seed,
@@ -297,15 +295,14 @@ def _wall_texture(place_m: Array, seed: int) -> str:
     return PLAN.wall_textures[int(chosen)]
 
 
-def plan_tour(free: Mask, resolution_m: float, origin_xy_m: tuple[float, float]) -> Array:
+def plan_tour(grid: OccupancyGrid) -> Array:
     """Return waypoints (N, 2) in metres: from the widest place on to the nearest part not yet seen,
-    again and again, and back to the start. free: (rows, columns), row 0 at the lowest y.
+    again and again, and back to the start.
 
     Raises InputError where no place is wide enough.
     """
-    room_m = cv2.distanceTransform(
-        np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-    )[1:-1, 1:-1] * resolution_m  # fmt: skip
+    resolution_m = grid.resolution_m
+    room_m = grid.away_m(np.pad(grid.cells != FREE, 1, constant_values=True))[1:-1, 1:-1]
     stride = max(1, round(PLAN.cell_m / resolution_m))
     places = _reachable(room_m[stride // 2 :: stride, stride // 2 :: stride])
     cells = np.argwhere(places)
@@ -313,8 +310,7 @@ def plan_tour(free: Mask, resolution_m: float, origin_xy_m: tuple[float, float])
     graph = _graph(places, coarse_room_m, stride * resolution_m)
     visits = _tour(graph, cells, coarse_room_m, stride * resolution_m)
     fine = cells[visits] * stride + stride // 2
-    corners = _pulled_straight(room_m >= PLAN.clearance_m - resolution_m, fine)
-    return np.array(origin_xy_m) + (corners[:, ::-1] + 0.5) * resolution_m
+    return grid.centres_of(_pulled_straight(room_m >= PLAN.clearance_m - resolution_m, fine))
 
 
 def _reachable(room_m: Array) -> Mask:

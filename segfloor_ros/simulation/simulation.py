@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from segfloor_ros import __version__
 from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.errors import InputError, SegfloorError, os_errors
+from segfloor_ros.files.images import png_bytes
 from segfloor_ros.files.results import RENDERED, folder_in_the_making, move_into_place
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw
 from segfloor_ros.grid.map_file import OCCUPIED, OccupancyGrid, save_map
@@ -55,8 +56,6 @@ from segfloor_ros.simulation.solids import (
 )
 from segfloor_ros.simulation.world import CAMERAS, RIG, World, build_world, mover_bodies
 
-GREY_OF_RGB = np.array([0.299, 0.587, 0.114], np.float32)
-
 DISPARITY_SCALE = 256
 """Disparity files are 16-bit PNG in units of 1/256 px, as in KITTI's stereo benchmark."""
 
@@ -65,7 +64,6 @@ IMU_COLUMNS = (
     'a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]'
 )
 
-PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 3]
 
 Progress = Callable[[int], None]
 
@@ -236,8 +234,8 @@ class Simulation:
 
 
 def _check_clear(grid: OccupancyGrid, drive: Drive) -> None:
-    cells = ((drive.xy_yaw[:, :2] - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(int)
-    hits = np.nonzero(grid.cells[cells[:, 1], cells[:, 0]] == OCCUPIED)[0]
+    cells = grid.cells_of(drive.xy_yaw[:, :2])
+    hits = np.nonzero(grid.cells[tuple(cells.T)] == OCCUPIED)[0]
     if len(hits):
         x, y, _ = drive.xy_yaw[hits[0]]
         raise InputError(f'the path runs into an obstacle at x {x:.2f}, y {y:.2f} m')
@@ -314,7 +312,7 @@ class View:
 
     def grey(self, camera: str) -> NDArray[np.float32]:
         """Return the picture (H, W) float32, 0 to 255, of the camera `left` or `right`."""
-        return self._render(camera).astype(np.float32) @ GREY_OF_RGB
+        return cv2.cvtColor(self._render(camera).astype(np.float32), cv2.COLOR_RGB2GRAY)
 
     def depth_m(self, camera: str) -> NDArray[np.float32]:
         """Return the depths (H, W) float32 along the optical axis in metres."""
@@ -508,7 +506,7 @@ def _write_poses(path: Path, T_world_left: Array) -> None:
 
 def _write_png(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(cv2.imencode('.png', image, PNG_SPEED)[1].tobytes())
+    path.write_bytes(png_bytes(image))
 
 
 def render_once(

@@ -267,11 +267,11 @@ def true_map(
     for prism in standing:
         rows, columns, hit = _hit_cells(grid, scene, prism, floors)
         blocked[rows, columns] |= hit
-    column, row = ((start - np.array(grid.origin_xy_m)) / grid.resolution_m).astype(int)
-    if blocked[row, column]:
+    at_start = tuple(grid.cells_of(start))
+    if blocked[at_start]:
         raise InputError(f'the path starts on an obstacle, at x {start[0]:g}, y {start[1]:g} m')
     _, labels = cv2.connectedComponents((~blocked).astype(np.uint8), connectivity=4)
-    reached = labels == labels[row, column]
+    reached = labels == labels[at_start]
     cells = np.full(blocked.shape, UNKNOWN, np.int8)
     cells[blocked], cells[reached] = OCCUPIED, FREE
     return OccupancyGrid(cells, grid.resolution_m, grid.origin_xy_m)
@@ -296,21 +296,21 @@ def _hit_cells(
     """Return rows, columns, and in which of their cells a sample point lies in a prism at the
     robot's height.
     """
-    origin, size = np.array(grid.origin_xy_m), grid.resolution_m
-    first = np.floor((prism.footprint.min(axis=0) - origin) / size).astype(int)
-    last = np.floor((prism.footprint.max(axis=0) - origin) / size).astype(int) + 1
-    columns, rows = last - first
+    corners = grid.cells_of(prism.footprint)
+    first, last = corners.min(axis=0), corners.max(axis=0) + 1
     steps = (np.arange(SAMPLES_PER_CELL) + 0.5) / SAMPLES_PER_CELL
-    x = (first[0] + np.arange(columns)[:, None] + steps).ravel() * size + origin[0]
-    y = (first[1] + np.arange(rows)[:, None] + steps).ravel() * size + origin[1]
+    x, y = (
+        (np.arange(first[i], last[i])[:, None] + steps).ravel() * grid.resolution_m + origin_m
+        for i, origin_m in zip((1, 0), grid.origin_xy_m, strict=True)
+    )
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     hit = inside_footprint(prism, points)
     ground_m, top_m = floor_height_m(floors, points[hit]), _top_at(prism, points[hit])
     below = float(prism.bottom_m.min()) < ground_m + scene.robot_height_m
     hit[hit] = below & (top_m > ground_m + scene.step_height_m)
-    shape = (rows, SAMPLES_PER_CELL, columns, SAMPLES_PER_CELL)
-    cells = np.asarray(hit.reshape(shape).any(axis=(1, 3)))
-    return slice(first[1], last[1]), slice(first[0], last[0]), cells
+    (rows, columns), each = last - first, SAMPLES_PER_CELL
+    cells = np.asarray(hit.reshape(rows, each, columns, each).any(axis=(1, 3)))
+    return slice(first[0], last[0]), slice(first[1], last[1]), cells
 
 
 def _top_at(prism: Prism, points: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
-from segfloor_ros.evaluation.maps import Pose2d, load_truth, resample, states
+from segfloor_ros.evaluation.maps import Pose2d, load_truth, resample
 from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number as finite_number
 from segfloor_ros.files.whole import read_json
@@ -88,8 +88,7 @@ def measure_run(
     # A run without a map says so in its summary.
     if (run / 'map.yaml').is_file() or not summary.is_file():
         grid = load_map(run / 'map.yaml')
-        known = float((states(grid) != UNKNOWN).sum())
-        measured['known_area_m2'] = known * grid.resolution_m**2
+        measured['known_area_m2'] = grid.area_m2(grid.states != UNKNOWN)
     if summary.is_file():
         measured.update(_of_summary(read_summary(summary), reference_ms))
     if (run / 'trajectory.txt').is_file():
@@ -125,7 +124,7 @@ def agreement(grid: OccupancyGrid, reference: OccupancyGrid) -> float:
     """Return the share of the cells known in both maps, of one frame, that say the same. NaN where
     there is none.
     """
-    here, there = resample(grid, reference, (0.0, 0.0, 0.0)), states(reference)
+    here, there = resample(grid, reference), reference.states
     both = (here != UNKNOWN) & (there != UNKNOWN)
     return float((here == there)[both].mean()) if both.any() else float('nan')
 

@@ -30,7 +30,7 @@ from junitparser.junitparser import SystemErr, SystemOut
 
 from segfloor_ros import __version__
 from segfloor_ros.errors import InputError, printable, without_credentials
-from segfloor_ros.files.images import read_mask
+from segfloor_ros.files.images import png_bytes, read_mask
 from segfloor_ros.files.results import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.files.whole import read_bytes, read_json
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
@@ -255,7 +255,7 @@ def _thumbnail(path: Path) -> str:
     scale = THUMBNAIL_PX / max(image.shape)
     size = np.maximum(1, np.rint(scale * np.array(image.shape[::-1]))).astype(int)
     small = cv2.resize(image, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
-    data = base64.b64encode(bytes(cv2.imencode('.png', small)[1])).decode()
+    data = base64.b64encode(png_bytes(small)).decode()
     return f'<img alt="map" src="data:image/png;base64,{data}">'
 
 

@@ -15,7 +15,7 @@ from command_line import segfloor, segfloor_process
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.cli import main, view
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map, pixels_of
+from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 
 FRAMES = 16
 SAME = ('map.pgm', 'trajectory.txt', 'keyframes.txt', 'labelled_cloud.ply', 'settings.yaml')
@@ -77,7 +77,7 @@ def test_a_run_shows_images_floor_cloud_path_map_times_and_state(run):
     assert len(values(shown, '/world/keyframes', 'positions')) == keyframes
     grid = load_map(out / 'map.yaml')
     (data,) = values(shown, '/world/map', 'data')
-    np.testing.assert_array_equal(np.ravel(data), pixels_of(grid.cells).ravel())
+    np.testing.assert_array_equal(np.ravel(data), grid.picture.ravel())
     assert values(shown, '/world/map', 'colormap') == [1]  # grey levels
     assert values(shown, '/world/map', 'cell_size') == pytest.approx([grid.resolution_m])
 

@@ -13,8 +13,8 @@ from segfloor_ros.evaluation.map_score import (
     draw_overlay,
     edges_are_free,
     opened,
+    overlay_png,
     sample_nodes,
-    save_overlay,
     score_cells,
     score_map,
     score_road_maps,
@@ -227,5 +227,5 @@ def test_overlay_colours_each_class(tmp_path):
         COLOURS['floor missed'],
     ]
     assert corners[1] == [COLOURS['free, agree']] * 3
-    save_overlay(maps, tmp_path / 'new' / 'overlay.png')
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / 'new' / 'overlay.png')), picture)
+    decoded = cv2.imdecode(np.frombuffer(overlay_png(maps), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(decoded, picture)

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map, save_map
+from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 
 # Three rows, four columns, no symmetry: a transposed, flipped or turned copy differs.
 CELLS = np.array([[0, 100, 0, -1], [100, 0, 0, 0], [-1, -1, 100, 0]], np.int8)
@@ -126,3 +126,19 @@ def test_saving_where_one_cannot_write_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(MapError, match='cannot write the map'):
         save_map(GRID, tmp_path / 'missing' / 'map.yaml')
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_grid_knows_where_its_cells_lie_whatever_its_origin_and_shape() -> None:
+    cells = np.array([[FREE, FREE, OCCUPIED], [UNKNOWN, FREE, FREE]], np.int8)
+    grid = OccupancyGrid(cells, 0.1, (-3.0, 2.0))
+    at = grid.cells_of(np.array([[-2.75, 2.05], [-2.95, 2.15], [-3.01, 2.05], [-2.95, 2.21]]))
+    assert at.tolist() == [[0, 2], [1, 0], [0, -1], [2, 0]]
+    assert grid.holds(at).tolist() == [True, True, False, False]
+    assert cells[tuple(at[:2].T)].tolist() == [OCCUPIED, UNKNOWN]
+    assert grid.centres_of(at[:2]) == pytest.approx(np.array([[-2.75, 2.05], [-2.95, 2.15]]))
+    np.testing.assert_array_equal(grid.cells_of(grid.centres_of(grid.all_cells)), grid.all_cells)
+    assert cells[tuple(grid.all_cells.T)].tolist() == cells.ravel().tolist()
+    assert grid.extent_m == pytest.approx((-3.0, -2.7, 2.0, 2.2))
+    assert grid.area_m2(cells == FREE) == pytest.approx(0.04)
+    assert grid.away_m(cells == OCCUPIED)[1, 0] == pytest.approx(0.1 * np.hypot(1, 2))
+    assert grid.picture.tolist() == [[205, 254, 254], [254, 254, 0]]

@@ -257,7 +257,8 @@ def test_tour_keeps_clear_of_walls_and_comes_back():
     free = np.zeros((120, 200), bool)
     free[10:110, 10:190] = True
     free[40:80, 60:140] = False
-    tour = plan_tour(free, 0.05, (-1.0, 2.0))
+    cells = np.where(free, FREE, OCCUPIED).astype(np.int8)
+    tour = plan_tour(OccupancyGrid(cells, 0.05, (-1.0, 2.0)))
     np.testing.assert_allclose(tour[0], tour[-1])
     blocked = np.argwhere(~free)[:, ::-1] * 0.05 + 0.025 + np.array([-1.0, 2.0])
     for start, end in pairwise(tour):
@@ -267,7 +268,7 @@ def test_tour_keeps_clear_of_walls_and_comes_back():
     # All around the block in the middle.
     assert np.ptp(tour, axis=0).min() > 2.0
     with pytest.raises(InputError, match='no place'):
-        plan_tour(np.zeros((20, 20), bool), 0.05, (0.0, 0.0))
+        plan_tour(OccupancyGrid(np.full((20, 20), OCCUPIED, np.int8), 0.05, (0.0, 0.0)))
 
 
 def test_people_walk_to_and_fro():
