@@ -51,6 +51,7 @@ from segfloor_ros.floor.mask.pixel_evidence import (
     Evidence,
     Heights,
     HeightTable,
+    below_floor,
     compare,
     compare_measured,
     enough_texture,
@@ -356,7 +357,9 @@ def _evidence(
     seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
     odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
     off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
-    seen[(seen == FLOOR) & odd & off] = NO_EVIDENCE
+    doubtful = (seen == FLOOR) & odd
+    seen[doubtful] = NO_EVIDENCE
+    seen[doubtful & ~off & below_floor(seen)] = FLOOR
     above = (heights.height > 0) & (texture >= _LEAST_SHARE * enough)
     return Evidence(seen, above, off, standing, odd)
 

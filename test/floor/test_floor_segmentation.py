@@ -142,10 +142,10 @@ def test_blank_floor_is_filled_to_the_foot_of_what_stands_on_it(seed, grey):
     textured = floor_patch(far_m=1.0, seed=seed, grey=grey, contrast=9.0)
     scene = Scene([textured, *blank, wall(1.6)], SMALL_CAMERA)
     observation, floor, depth = segment(scene)
-    lit = floor & (points_of(scene, depth)[..., 0] > 1.3)
-    assert lit.sum() > 2000
-    # The last row before the wall looks like both.
-    assert np.mean(observation.mask[lit] == FLOOR) > 0.8
+    # The last rows before the wall look like both.
+    lit = floor & (np.abs(points_of(scene, depth)[..., 0] - 1.4) < 0.1)
+    assert lit.sum() > 1000
+    assert np.mean(observation.mask[lit] == FLOOR) > 0.9
     assert np.mean(observation.mask[~floor] == FLOOR) < 0.01
 
 
@@ -185,6 +185,30 @@ def test_a_door_sill_is_floor():
     assert np.mean(observation.mask[sill] == FLOOR) > 0.9
     ahead = np.abs(observation.scan.bearings_rad) < np.radians(3)
     assert np.all(observation.scan.ranges_m[ahead] > 3.5)
+
+
+@pytest.mark.parametrize('x_m', [1.0, 1.5])
+def test_a_step_at_the_foot_of_what_stands_is_no_sill(x_m):
+    scene = Scene([floor_patch(), wall(), *box(x_m, 0.0, 0.3, 0.02), *box(x_m + 0.1, 0, 0.3, 0.3)])
+    observation, _, depth = segment(scene)
+    points = points_of(scene, depth)
+    step = (points[..., 2] > 0.01) & (points[..., 2] < 0.025) & (points[..., 0] < x_m + 0.1)
+    step &= np.abs(points[..., 1]) < 0.14
+    assert step.sum() > 300
+    assert np.mean(observation.mask[step] == FLOOR) < 0.1
+
+
+@pytest.mark.parametrize(('stands', 'least', 'most'), [(False, 0.97, 1.0), (True, 0.0, 0.02)])
+def test_what_looks_like_what_stands_on_it_is_not_floor(stands, least, most):
+    """A dark patch alone is: it was measured."""
+    dark = {'contrast': 10.0, 'grey': 25.0}
+    patch = Patch((1.0, -0.2, 0.001), (0.2, 0, 0), (0, 0.4, 0), False, seed=4, **dark)
+    scene = Scene([floor_patch(), wall(), patch, *(box(1.2, 0, 0.4, 0.3, **dark) * stands)])
+    observation, _, depth = segment(scene)
+    points = points_of(scene, depth)
+    inside = (np.abs(points[..., 2]) < 0.005) & (np.abs(points[..., 0] - 1.1) < 0.09)
+    inside &= np.abs(points[..., 1]) < 0.18
+    assert least <= np.mean(observation.mask[inside] == FLOOR) <= most
 
 
 @pytest.mark.parametrize('floor_kind', FLOORS)

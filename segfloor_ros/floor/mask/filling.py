@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from segfloor_ros.floor.disparity.matching import SAME_PX
 from segfloor_ros.floor.disparity.profile import FloorProfile, pixels_where
 from segfloor_ros.floor.disparity.view import STEP_PX, FloorView, surface_above
-from segfloor_ros.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison
+from segfloor_ros.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 _MIN_REGION_PX = 15
@@ -152,18 +152,10 @@ def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     that to the right.
     """
     nothing = mask == NO_EVIDENCE
-    across, turned = Runs.of(nothing), np.ascontiguousarray(mask.T)
+    across = Runs.of(nothing)
     between = across.before(mask, NO_EVIDENCE) == FLOOR
     between &= across.after(mask, NO_EVIDENCE) == FLOOR
-    return across.painted(between) | _below_floor(turned).T
-
-
-def _below_floor(turned: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Tell of NO_EVIDENCE in a mask that is turned, (W, R), where the next evidence up the column
-    is floor.
-    """
-    nothing = Runs.of(turned == NO_EVIDENCE)
-    return nothing.painted(nothing.before(turned, NO_EVIDENCE) == FLOOR)
+    return across.painted(between) | (nothing & below_floor(mask))
 
 
 def beside_something(view: FloorView, mask: NDArray[np.uint8]) -> NDArray[np.bool_]:

@@ -30,8 +30,6 @@ from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorS
 
 _MIN_DISPARITY_PX = 2.5
 """Farther floor is not judged."""
-_SURE_SHARE = 1.5
-"""Disparities tell a step from floor while their noise widens it by no more than this."""
 _CONTACT_HEIGHT_M = 0.12
 """Up to this height an upright surface is taken to stand on the floor below it."""
 
@@ -184,17 +182,28 @@ def judge(
     # What seems to lie below the floor may be what the floor mirrors.
     sure = (textured & compared.against) | (compared.denied & above)
     near = disparity >= np.float32(_MIN_DISPARITY_PX)
-    # On a sill the images contradict the floor, and show that it is a sill.
-    step_m, up = np.float32(settings.step_height_m), table.up.take(heights.index)
-    sill = compared.against & (np.abs(heights.height) <= step_m) & (up < _SURE_SHARE * step_m)
-    floor = textured & near & ~off & (sill | ~(compared.against | compared.unlike))
+    may_be = textured & near & ~off
     mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
-    mask[floor] = FLOOR
+    mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
     mask[off & sure] = NOT_FLOOR
+    up = table.up.take(heights.index)
     low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
     mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
     mask[view.derolled <= view.line.horizon] = NOT_FLOOR
+    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
+    # where above a foot there is what stands on it.
+    step_m = np.float32(settings.step_height_m)
+    sill = compared.against & (np.abs(heights.height) <= step_m)
+    mask[may_be & sill & below_floor(mask)] = FLOOR
     return mask
+
+
+def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of each pixel of a mask (R, W) whether the next evidence up its column is floor."""
+    rows = np.arange(len(mask), dtype=np.int16)[:, None]
+    next_up = np.maximum.accumulate(np.where(mask != NO_EVIDENCE, rows, np.int16(0)), axis=0)
+    is_floor: NDArray[np.bool_] = np.take_along_axis(mask, next_up, axis=0) == FLOOR
+    return is_floor
 
 
 def mean_height(heights: Heights) -> NDArray[np.float32]:
