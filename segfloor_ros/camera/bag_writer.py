@@ -16,8 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.images import NOT_MEASURED, is_disparity
-from segfloor_ros.camera.model import ImuSample, Measurement, MeasurementLog, WheelPose
+from segfloor_ros.camera.images import NOT_MEASURED
+from segfloor_ros.camera.model import (
+    ImuSample,
+    Measurement,
+    MeasurementLog,
+    WheelPose,
+    is_disparity,
+)
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
 from segfloor_ros.camera.sources.source import RawPair, StereoSource
 from segfloor_ros.errors import InputError, os_errors

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros import MAX_PIXELS
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.model import ImuSample, StereoCamera, WheelPose
+from segfloor_ros.camera.model import ImuSample, StereoCamera, WheelPose, is_disparity
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
 from segfloor_ros.geometry import Array, transform_from_quaternion
@@ -286,11 +286,6 @@ def rigid_motion(translation: Any, rotation: Any, name: str) -> Array:
 def xyz(vector: Any) -> Array:
     """Return the components (3,) of a vector or point."""
     return np.array([vector.x, vector.y, vector.z])
-
-
-def is_disparity(image: NDArray[np.generic]) -> bool:
-    """Whether what stands in place of a right image is a disparity."""
-    return image.dtype == np.float32
 
 
 def depth_calibration(left: EyeCalibration) -> StereoCalibration:

@@ -158,6 +158,11 @@ class StereoFrame:
     excluded: NDArray[np.uint8] | None = None
 
 
+def is_disparity(image: NDArray[np.generic]) -> bool:
+    """Whether what stands in place of a right image is a disparity."""
+    return image.dtype == np.float32
+
+
 @dataclass(frozen=True)
 class StereoCameraSettings(StageSettings):
     """Where images come from and how left and right are paired."""

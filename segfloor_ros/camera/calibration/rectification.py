@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.images import is_disparity
+from segfloor_ros.camera.model import is_disparity
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 

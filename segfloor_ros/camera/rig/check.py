@@ -20,8 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import is_disparity
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.camera.rig.estimates import (
     LEAST_NOISE_PX,
     MAX_HAMMING,

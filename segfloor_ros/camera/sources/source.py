@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.calibration.rectification import StereoRectifier
-from segfloor_ros.camera.images import EightBitScale, is_disparity
-from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame
+from segfloor_ros.camera.images import EightBitScale
+from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_mask
 from segfloor_ros.geometry import MAX_DISORDER_NS

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import SUBPIXEL, is_disparity, seen_from_right
-from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.images import SUBPIXEL, seen_from_right
+from segfloor_ros.camera.model import Mount, StereoCamera, is_disparity
 
 NOISE_PX = 0.5
 """Error of a disparity, one sigma."""

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import is_disparity, shrunk
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.camera.images import shrunk
+from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.moving.scene_flow import (
     MAX_MOVING_SHARE,

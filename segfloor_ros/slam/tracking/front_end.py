@@ -7,8 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from segfloor_ros.camera.images import is_disparity
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import StereoFrame, is_disparity
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.places.known_views import ALIKE_SHARE
 from segfloor_ros.slam.places.place_recognition import (

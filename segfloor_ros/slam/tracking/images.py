@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.images import blank_border, is_disparity
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.camera.images import blank_border
+from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array, make_transform, transform_points
 
 SIDE_PX = 11
