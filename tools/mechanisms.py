@@ -79,7 +79,7 @@ def _filled_whatever_stands(
 
 SLAM: dict[str, Mechanism] = {
     NOTHING: Mechanism(),
-    'deblocking': Mechanism({'camera.calibration.rectification.deblocked': _first}),
+    'deblocking': Mechanism({'camera.calibration.parameters.deblocked': _first}),
     'fusion of points': Mechanism({'slam.mapping.keyframe_mapping.fuse_duplicates': _none}),
     'place keyframes in the local map': Mechanism(
         {'slam.tracking.map_tracking.views_near': _no_rows}

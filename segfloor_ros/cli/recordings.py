@@ -24,7 +24,7 @@ from segfloor_ros.camera.calibration.chessboard import (
 from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.rig.check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import open_source
-from segfloor_ros.camera.sources.inspection import Inspection, Stream, inspect_recording
+from segfloor_ros.camera.sources.opening import Inspection, Stream, inspect_recording, size_mb
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.terminal import console, figure_table, value_table, within
@@ -51,14 +51,15 @@ def info(
     segfloor info result
     """
     name = options.input
-    known = _known_output(Path(name).expanduser())
+    path = Path(name).expanduser()
+    known = _known_output(path)
     if known and as_json:
         return terminal.print_json({'name': name, 'kind': known})
     if known:
         return console.print(f'{name}: {known}', soft_wrap=True)
     source = open_source(options.configuration(ignore=ignore, depth=depth).stereo_camera)
     with terminal.progress_bar('reading', source.frame_count) as progress:
-        found = inspect_recording(source, name, progress)
+        found = inspect_recording(source, path, progress)
     if as_json:
         return terminal.print_json(dataclasses.asdict(found))
     console.print(value_table('recording', _rows(found), found.name))
@@ -144,7 +145,7 @@ def record(
         else:
             settings = terminal.configuration(params, assignments, device).stereo_camera
             is_full = _record_device(out, open_source(settings), images, seconds, interrupt)
-    console.print(f'{_size_mb(out):.1f} MB: {out}')
+    console.print(f'{size_mb(out):.1f} MB: {out}')
     if is_full:
         raise InputError(f'{out}: the disk is almost full; what came until then is in the file')
 
@@ -195,11 +196,6 @@ def _record_device(
     rate = f' at {(pairs - 1) / elapsed_s:.1f} Hz' if elapsed_s else ''
     console.print(f'{pairs} pairs{rate}')
     return is_full
-
-
-def _size_mb(bag: Path) -> float:
-    """Return the size of a bag, a file or a folder."""
-    return sum(f.stat().st_size for f in [bag, *bag.rglob('*')] if f.is_file()) / 1e6
 
 
 @terminal.with_options
@@ -254,7 +250,7 @@ def convert(
     depth = open_source(dataclasses.replace(settings, depth=True)) if has_depth else None
     with terminal.progress_bar('converting', source.frame_count) as progress:
         pairs = write_bag(source, out, images, progress, depth)
-    console.print(f'{pairs} pairs, {_size_mb(out):.1f} MB: {out}')
+    console.print(f'{pairs} pairs, {size_mb(out):.1f} MB: {out}')
 
 
 def calibrate(

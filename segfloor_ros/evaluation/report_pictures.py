@@ -24,7 +24,7 @@ from segfloor_ros.camera.calibration.chessboard import (
     eight_bit,
     rectified_pixels,
 )
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cloud import FLOOR as FLOOR_POINT

@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import (
+    EyeCalibration,
+    StereoCalibration,
+    StereoRectifier,
+)
 from segfloor_ros.camera.images import (
     EightBitScale,
     depth_calibration,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, Imu
 
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.camera.images import imu_sample, measures_motion, wheel_pose, xyz
 from segfloor_ros.camera.model import Measurement, WheelPose
 from segfloor_ros.camera.sources.files import is_upright

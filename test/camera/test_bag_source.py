@@ -27,8 +27,11 @@ from camera_recordings import (
     write_rosbag2,
 )
 
-from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import (
+    EyeCalibration,
+    StereoCalibration,
+    StereoRectifier,
+)
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, find_topics
 from segfloor_ros.errors import CalibrationError, InputError
 

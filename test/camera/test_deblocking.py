@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from camera_recordings import calibration
 
-from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier, deblocked, is_blocky
+from segfloor_ros.camera.calibration.parameters import (
+    StereoCalibration,
+    StereoRectifier,
+    deblocked,
+    is_blocky,
+)
 
 
 def weak_texture(seed: int = 0) -> np.ndarray:

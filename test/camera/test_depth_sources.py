@@ -26,8 +26,7 @@ from camera_recordings import (
     write_rosbag2,
 )
 
-from segfloor_ros.camera.calibration.parameters import EyeCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoRectifier
 from segfloor_ros.camera.images import (
     VIRTUAL_BASELINE_M,
     depth_calibration,

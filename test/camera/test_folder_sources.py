@@ -28,7 +28,7 @@ from camera_recordings import (
 )
 
 from segfloor_ros.camera.calibration.files import write_ros_calibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import StereoSource, open_source
 from segfloor_ros.errors import CalibrationError, InputError

@@ -10,8 +10,11 @@ from camera_recordings import calibration, grey_pairs
 from numpy.typing import NDArray
 from test_stereo_calibration import COEFFICIENTS, T_RIGHT_LEFT, project, raw_eye
 
-from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import (
+    EyeCalibration,
+    StereoCalibration,
+    StereoRectifier,
+)
 from segfloor_ros.errors import CalibrationError
 
 

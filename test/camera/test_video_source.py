@@ -86,7 +86,7 @@ def test_a_device_that_is_not_there_is_named(
     ],
 )
 def test_devices_are_told_by_their_name(name: str, expected: bool) -> None:
-    assert is_device(name) == expected
+    assert is_device(Path(name)) == expected
 
 
 class Camera:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from floor_scenes import FLOORS, MOUNT, SMALL_CAMERA, Scene, floor_patch, wall
 
-from segfloor_ros.camera.calibration.rectification import deblocked
+from segfloor_ros.camera.calibration.parameters import deblocked
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve

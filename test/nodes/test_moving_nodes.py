@@ -7,7 +7,7 @@ from moving_drive import MovingDrive
 from node_messages import pose_message_at, publish
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.messages.arrays import (
     FEATURE_DTYPE,

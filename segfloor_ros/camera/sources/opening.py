@@ -1,5 +1,6 @@
-"""What kind of recording an input is; videos, whose frames show the left image beside the right
-one, and cameras that this machine has: one that does likewise, or two.
+"""What kind of recording an input is, what it holds, and whether it will do; videos, whose frames
+show the left image beside the right one, and cameras of this machine: one that does likewise, or
+two.
 
 Video4Linux by OpenCV. Two cameras without a common trigger are asked for their images one right
 after the other; where the robot turns fast, that is not at the same time.
@@ -8,14 +9,16 @@ after the other; where the robot turns fast, that is not at the same time.
 from __future__ import annotations
 
 import logging
+import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,9 +26,11 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.files import find_calibration
 from segfloor_ros.camera.images import to_grey
-from segfloor_ros.camera.model import StereoCameraSettings
+from segfloor_ros.camera.model import RecordedSensor, StereoCameraSettings
+from segfloor_ros.camera.rig.check import BURST, RigCheck
 from segfloor_ros.camera.sources.bag import open_bag
-from segfloor_ros.camera.sources.bag_file import is_bag
+from segfloor_ros.camera.sources.bag_file import is_bag, open_bag_file
+from segfloor_ros.camera.sources.files import rate_of
 from segfloor_ros.camera.sources.image_folders import (
     has_image_sides,
     is_euroc,
@@ -62,6 +67,12 @@ RETRY_S, PATIENCE_S = 0.5, 10.0
 """A camera that is unplugged is looked for so often, and opened again if it is back within the
 other."""
 
+BURSTS = 8
+"""Parts of the recording that are looked at."""
+
+PAUSE_S, PAUSE_FRAMES = 0.5, 5
+"""A camera moves far in so long a gap; a slow one is no gap where all of them are as long."""
+
 
 def open_source(settings: StereoCameraSettings) -> StereoSource:
     """Open the recording or device `settings.input`, whatever its kind.
@@ -72,7 +83,13 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
     if not settings.input:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
     try:
-        source = _open(settings)
+        path = Path(settings.input).expanduser()
+        if not (path.exists() or is_device(path)):
+            raise InputError(f'{path}: no such file or folder; give {KINDS}')
+        kind = _kind(path)
+        if kind is None:
+            raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
+        source = kind.open(path, settings)
         if settings.depth and not source.takes_depth:
             raise InputError(
                 f'{source.name}: no depth images can be read from it; leave out --depth'
@@ -87,27 +104,16 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
         ) from None
 
 
-def _open(settings: StereoCameraSettings) -> StereoSource:
-    path = Path(settings.input).expanduser()
-    if is_device(settings.input) and not path.is_dir():
-        return open_device(settings.input, settings)
-    if not path.exists():
-        raise InputError(f'{path}: no such file or folder; give {KINDS}')
-    for kind in FOLDERS if path.is_dir() else FILES:
-        if kind.recognises(path):
-            return kind.open(path, settings)
-    raise InputError(f'{path}: not a known kind of recording; give {KINDS}')
-
-
 def is_video(path: Path) -> bool:
     """Whether `path` is named like a video file."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def open_device(name: str, settings: StereoCameraSettings) -> StereoSource:
-    """Open a camera, or two, with the calibration of the settings or of the current folder. Raises
-    InputError or CalibrationError.
+def open_device(path: Path, settings: StereoCameraSettings) -> StereoSource:
+    """Open a camera, or two, by their numbers, with the calibration of the settings or of the
+    current folder. Raises InputError or CalibrationError.
     """
+    name = str(path)
     calibration = find_calibration(f'device {name}', (Path.cwd(),), settings)
     left = calibration.left
     device = StereoDevice(name, (left.width, left.height), settings.rate_hz, settings.exposure_s)
@@ -162,13 +168,9 @@ def _grey_pair(images: ColourPair) -> tuple[Grey, Grey]:
     return to_grey(images[0]), to_grey(images[1])
 
 
-def kind_of(name: str) -> str:
-    """Return what kind of recording an input is, in words."""
-    path = Path(name).expanduser()
-    if is_device(name) and not path.is_dir():
-        return 'camera device, side by side'
-    kinds = FOLDERS if path.is_dir() else FILES
-    return next((kind.words for kind in kinds if kind.recognises(path)), 'unknown')
+def is_device(path: Path) -> bool:
+    """Whether `path` is a camera, its number or /dev/video with its number, or two with a comma."""
+    return re.fullmatch(f'{DEVICE}(,{DEVICE})?', str(path)) is not None
 
 
 class Kind(NamedTuple):
@@ -187,14 +189,18 @@ FOLDERS = (
     BAG,
     Kind('folders of images', has_image_sides, open_image_folders),
 )
-FILES = (BAG, Kind('video, side by side', is_video, open_video))
+FILES = (
+    Kind('camera device, side by side', is_device, open_device),
+    BAG,
+    Kind('video, side by side', is_video, open_video),
+)
 
 VIDEO_SUFFIXES = {'.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.mpg', '.mpeg', '.mjpeg'}
 
 
-def is_device(name: str) -> bool:
-    """Whether `name` is a camera, its number or /dev/video with its number, or two with a comma."""
-    return re.fullmatch(f'{DEVICE}(,{DEVICE})?', name) is not None
+def _kind(path: Path) -> Kind | None:
+    kinds = FOLDERS if path.is_dir() else FILES
+    return next((kind for kind in kinds if kind.recognises(path)), None)
 
 
 class StereoDevice:
@@ -282,3 +288,153 @@ def halves(image: NDArray[np.uint8]) -> ColourPair:
 def _release(cameras: list[cv2.VideoCapture]) -> None:
     for camera in cameras:
         camera.release()
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Messages or files of one kind: where, what they are, how many, how many a second and their
+    longest gap; None where that is not known.
+    """
+
+    where: str
+    what: str
+    messages: int
+    rate_hz: float | None = None
+    longest_gap_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What there is to say of a recording. fov_deg: across and along the rectified image. rows_px:
+    by how much the same points stand in other rows, None where too little is seen. faults: as
+    `InputFault`. to_mend: what is wrong and what to do, in lines.
+    """
+
+    name: str
+    kind: str
+    size_mb: float
+    pairs: int
+    skipped: int
+    duration_s: float
+    rate_hz: float
+    image: str
+    distortion: str
+    is_rectified: bool
+    baseline_m: float | None
+    focal_px: float
+    fov_deg: tuple[float, float]
+    rows_px: float | None
+    streams: list[Stream]
+    faults: list[dict[str, Any]]
+    to_mend: list[str]
+
+
+def inspect_recording(
+    source: StereoSource, path: Path, on_progress: Callable[[int], None]
+) -> Inspection:
+    """Read an open recording once and look at some of its pairs. path: of the input. Raises
+    InputError or CalibrationError where it is inconsistent.
+    """
+    check = RigCheck(source.camera)
+    stamps = _look_through(source, check, on_progress)
+    faults = [*check.faults.values()]
+    camera, eye = source.camera, source.calibration.left
+    size_px = np.array([camera.width, camera.height])
+    across, along = 2 * np.degrees(np.arctan(size_px / 2 / (camera.fx, camera.fy)))
+    pairs = _stream('pairs', 'left with depth' if source.takes_depth else 'left and right', stamps)
+    sensors = [_sensor_stream(sensor) for sensor in source.sensors]
+    return Inspection(
+        name=source.name,
+        kind=kind.words if (kind := _kind(path)) else 'unknown',
+        size_mb=size_mb(path),
+        pairs=len(stamps),
+        skipped=source.skipped_frames,
+        duration_s=1e-9 * (stamps[-1] - stamps[0]) if stamps else 0.0,
+        rate_hz=source.rate_hz,
+        image=f'{camera.width}x{camera.height}',
+        distortion='none' if eye.is_straight else eye.distortion_model,
+        is_rectified=source.calibration.is_rectified,
+        baseline_m=None if source.takes_depth else camera.baseline_m,
+        focal_px=camera.fx,
+        fov_deg=(float(across), float(along)),
+        rows_px=None if math.isnan(check.rows_px) else check.rows_px,
+        streams=[pairs, *sensors, *_other_topics(path, sensors)],
+        faults=check.as_dicts(),
+        to_mend=[*(fault.line() for fault in faults), *_gaps(stamps, source)],
+    )
+
+
+def _look_through(
+    source: StereoSource, check: RigCheck, on_progress: Callable[[int], None]
+) -> list[int]:
+    """Return the stamps of all pairs; those of some bursts are looked at."""
+    count = source.frame_count or BURST * BURSTS
+    starts = np.unique(np.linspace(0, max(count - BURST, 0), BURSTS).astype(int)).tolist()
+    looked_at = {start + i for start in starts for i in range(BURST)}
+    stamps: list[int] = []
+    for number, entry in enumerate(source.entries()):
+        if number in starts and number - 1 not in looked_at:
+            check.jump()
+        stamps.append(entry.stamp_ns)
+        frame = source.frame(entry) if number in looked_at else None
+        if frame is not None:
+            check.see(frame)
+        on_progress(number + 1)
+        if source.frame_count is None and len(stamps) >= count:
+            break
+    return stamps
+
+
+def _stream(where: str, what: str, stamps_ns: Sequence[int]) -> Stream:
+    steps_s = 1e-9 * np.diff(stamps_ns)
+    if len(steps_s) == 0 or steps_s.max() <= 0:
+        return Stream(where, what, len(stamps_ns))
+    return Stream(where, what, len(stamps_ns), rate_of(stamps_ns), float(steps_s.max()))
+
+
+def _sensor_stream(sensor: RecordedSensor) -> Stream:
+    if not sensor.used:
+        return Stream(sensor.where, f'{sensor.name}, not used', sensor.messages)
+    stamps = sorted(m.stamp_ns for m in sensor.read())
+    if not stamps:
+        return Stream(sensor.where, sensor.name, sensor.messages)
+    return _stream(sensor.where, sensor.name, stamps)
+
+
+def _other_topics(path: Path, sensors: Sequence[Stream]) -> list[Stream]:
+    """Return the other topics of a bag."""
+    if not (path.exists() and is_bag(path)):
+        return []
+    known = {sensor.where for sensor in sensors}
+    with open_bag_file(path) as bag:
+        return [
+            Stream(name, topic.msgtype, topic.num_messages)
+            for name, topic in sorted(bag.topics.items())
+            if name not in known
+        ]
+
+
+def _gaps(stamps: Sequence[int], source: StereoSource) -> list[str]:
+    """Return in words what is missing among the pairs."""
+    found = []
+    steps_s = 1e-9 * np.diff(stamps)
+    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    pauses = np.flatnonzero(steps_s > max(PAUSE_S, PAUSE_FRAMES * usual_s))
+    if len(pauses):
+        longest = int(np.argmax(steps_s))
+        found.append(
+            f'{len(pauses)} pauses, the longest of {steps_s[longest]:.1f} s after '
+            f'{1e-9 * (stamps[longest] - stamps[0]):.1f} s; record to a faster disk, or expect '
+            'the camera to be lost there until it sees a known place again'
+        )
+    if source.skipped_frames:
+        found.append(
+            f'{source.skipped_frames} pairs cannot be read or came twice; record them again where '
+            'they matter'
+        )
+    return found
+
+
+def size_mb(path: Path) -> float:
+    """Return the size of a file, or of all in a folder."""
+    return sum(f.stat().st_size for f in [path, *path.rglob('*')] if f.is_file()) / 1e6

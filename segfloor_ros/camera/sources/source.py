@@ -18,8 +18,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.calibration.rectification import StereoRectifier
+from segfloor_ros.camera.calibration.parameters import StereoCalibration, StereoRectifier
 from segfloor_ros.camera.images import EightBitScale
 from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.errors import InputError

@@ -7,13 +7,7 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.files.results import from_bytes, to_bytes
-from segfloor_ros.geometry import invert
-from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
-from segfloor_ros.grid.map_file import FREE
-from segfloor_ros.map_files import (
+from segfloor_ros.cli.maps import (
     APPEARED_BGR,
     GONE_BGR,
     SavedMap,
@@ -22,6 +16,12 @@ from segfloor_ros.map_files import (
     merge,
     open_map,
 )
+from segfloor_ros.configuration import resolve
+from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.files.results import from_bytes, to_bytes
+from segfloor_ros.geometry import invert
+from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
+from segfloor_ros.grid.map_file import FREE
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.slam.saved_slam import loaded_map
 
