@@ -1,5 +1,5 @@
-"""`segfloor map`: what can be done with saved maps, the files of `--save-map`, without driving: look
-at them, compare them, make one of two.
+"""`segfloor map`: what can be done with saved maps, the files of `--save-map`, without driving:
+look at them, compare them, make one of two.
 """
 
 from __future__ import annotations
