@@ -8,6 +8,7 @@ SciPy is imported where it is used: it takes 20 MB of every process, and not all
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Any
@@ -127,20 +128,71 @@ def se3_logs(T: Array) -> Array:
 
 def quaternion_xyzw(R: Array) -> Array:
     """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
-    # SciPy 1.11 takes no array that is read-only.
-    from scipy.spatial.transform import Rotation
-
-    quaternion = Rotation.from_matrix(R.copy()).as_quat()
-    return -quaternion if quaternion[3] < 0 else quaternion
+    return quaternions_of(R[None])[0]
 
 
 def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
     """Return the (4, 4) transform of a translation (3,) and a quaternion (4,) in the order x, y,
     z, w.
     """
-    from scipy.spatial.transform import Rotation
+    return make_transform(rotations_of(quat_xyzw[None])[0], translation)
 
-    return make_transform(Rotation.from_quat(quat_xyzw.copy()).as_matrix(), translation)
+
+def rotations_of(quat_xyzw: Array) -> Array:
+    """Return rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
+    x, y, z, w = (quat_xyzw / np.linalg.norm(quat_xyzw, axis=1, keepdims=True)).T
+    rotations = np.empty((len(quat_xyzw), 3, 3))
+    rotations[:, 0] = np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1
+    )
+    rotations[:, 1] = np.stack(
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1
+    )
+    rotations[:, 2] = np.stack(
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1
+    )
+    return rotations
+
+
+def quaternions_of(rotations: Array) -> Array:
+    """Return quaternions (N, 4), x y z w with w >= 0, of rotations (N, 3, 3).
+
+    4 q qᵀ has the trace and the differences and sums of the entries for its own; its longest row is
+    the best conditioned (Shepperd, 1978).
+    """
+    R = rotations
+    squares = np.empty((len(R), 4, 4))
+    trace = np.trace(R, axis1=1, axis2=2)
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        squares[:, i, i] = 1 + 2 * R[:, i, i] - trace
+        squares[:, j, k] = squares[:, k, j] = R[:, j, k] + R[:, k, j]
+        squares[:, i, 3] = squares[:, 3, i] = R[:, k, j] - R[:, j, k]
+    squares[:, 3, 3] = 1 + trace
+    longest = np.argmax(np.diagonal(squares, axis1=1, axis2=2), axis=1)
+    found = squares[np.arange(len(R)), longest]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found * np.where(found[:, 3:] < 0, -1.0, 1.0)
+
+
+def rotation_from_angles(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Array:
+    """Return the rotation (3, 3) about z by yaw, then the new y by pitch, then the new x by roll
+    (REP 103).
+    """
+    angles = np.array([yaw_rad, pitch_rad, roll_rad])
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def angles_of_rotation(R: Array) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll in radians; the inverse of `rotation_from_angles`."""
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    return yaw, math.asin(max(-1.0, min(1.0, -R[2, 0]))), math.atan2(R[2, 1], R[2, 2])
 
 
 def planar(T: Array) -> NDArray[np.float64]:

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_table
-from segfloor_ros.geometry import Array, invert, quaternion_xyzw
+from segfloor_ros.geometry import Array, invert, quaternion_xyzw, rotations_of
 from segfloor_ros.slam.results import KeyframePath
 
 TUM_COLUMNS, KITTI_COLUMNS = 8, 12
@@ -125,7 +124,7 @@ def _from_tum(table: Array, path: Path) -> tuple[Array, Array]:
         row = int(np.argmax(np.abs(norms - 1))) + 1
         raise InputError(f'{path}, row {row}: the quaternion is not of unit length')
     poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    poses[:, :3, :3] = rotations_of(table[:, 4:])
     poses[:, :3, 3] = table[:, 1:4]
     return times, poses
 

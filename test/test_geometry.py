@@ -2,15 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.geometry import (
     R_ROS_OPTICAL,
+    angles_of_rotation,
     invert,
     make_transform,
     quaternion_xyzw,
     rotation_angle,
+    rotation_from_angles,
     se3_exp,
     se3_log,
     transform_from_quaternion,
@@ -28,6 +31,13 @@ def test_exp_of_a_quarter_turn_about_z_with_forward_motion_is_an_arc():
     # Radius 1: moving pi/2 along a circle that turns left ends at (1, 1).
     T = se3_exp(np.array([np.pi / 2, 0, 0, 0, 0, np.pi / 2]))
     np.testing.assert_allclose(T[:3, 3], [1, 1, 0], atol=1e-12)
+
+
+def test_angles_are_those_of_scipy():
+    for angles in np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [3.1, 1.5, 3.1]:
+        R = rotation_from_angles(*angles)
+        np.testing.assert_allclose(R, Rotation.from_euler('ZYX', angles).as_matrix(), atol=1e-15)
+        np.testing.assert_allclose(angles_of_rotation(R), angles, atol=1e-9)
 
 
 def test_exp_takes_stacks():

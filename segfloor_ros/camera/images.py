@@ -28,6 +28,9 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
 from segfloor_ros.geometry import Array, transform_from_quaternion
 
+Region = NDArray[np.uint8]
+"""A mask (H, W) uint8 of the left image, 255 where something is left out, e.g. moves."""
+
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
 # OpenCV names a Bayer pattern by the second pixel of the second row, ROS by the first of the first.
@@ -205,6 +208,13 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
         code = cv2.COLOR_RGBA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_RGB2GRAY
         return cv2.cvtColor(pixels, code)
     return to_grey(pixels)
+
+
+def union(a: Region | None, b: Region | None) -> Region | None:
+    """Return the region that is in either; None for none at all."""
+    if a is None or b is None:
+        return b if a is None else a
+    return np.maximum(a, b)
 
 
 def blank_border(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:

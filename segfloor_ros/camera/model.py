@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.errors import CalibrationError, SettingsError
-from segfloor_ros.geometry import R_ROS_OPTICAL, Array, make_transform
+from segfloor_ros.geometry import (
+    R_ROS_OPTICAL,
+    Array,
+    angles_of_rotation,
+    make_transform,
+    rotation_from_angles,
+)
 from segfloor_ros.settings import StageSettings, setting
 
 SENSORS = ('wheel_odometry', 'imu')
@@ -114,10 +120,7 @@ class Mount:
     @cached_property
     def T_base_left(self) -> Array:
         """The pose (4, 4) of the left optical frame in the base frame; not to be written to."""
-        angles = [self.yaw_rad, self.pitch_rad, self.roll_rad]
-        from scipy.spatial.transform import Rotation  # as in geometry.py
-
-        R_base_camera = Rotation.from_euler('ZYX', angles).as_matrix()
+        R_base_camera = rotation_from_angles(self.yaw_rad, self.pitch_rad, self.roll_rad)
         translation = np.array([self.forward_m, self.left_m, self.height_m])
         T_base_left = make_transform(R_base_camera @ R_ROS_OPTICAL, translation)
         T_base_left.flags.writeable = False
@@ -127,9 +130,7 @@ class Mount:
     def from_transform(cls, T_base_left: Array) -> Mount:
         """Return the mount of a (4, 4) pose of the left optical frame in the base frame."""
         R_base_camera = T_base_left[:3, :3] @ R_ROS_OPTICAL.T
-        from scipy.spatial.transform import Rotation
-
-        yaw, pitch, roll = (float(a) for a in Rotation.from_matrix(R_base_camera).as_euler('ZYX'))
+        yaw, pitch, roll = angles_of_rotation(R_base_camera)
         x, y, z = (float(value) for value in T_base_left[:3, 3])
         return cls(z, pitch, roll, x, y, yaw)
 

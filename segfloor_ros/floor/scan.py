@@ -12,7 +12,6 @@ import math
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import grey_closing, grey_opening
 
 from segfloor_ros.camera.images import SUBPIXEL, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera
@@ -129,8 +128,10 @@ class FloorScanner:
         seen = floor & (middle < limit[:, None])
         # A dip of a few bearings in which nothing stands up is a hole in the mask, a spike is floor
         # that has crept up a blank wall.
-        reached = grey_closing(self._reached(seen, seen_by_both), size=(_DIP_BEARINGS,))
-        reached = np.minimum(grey_opening(reached, size=(_DIP_BEARINGS,)), limit)
+        dips = np.ones((1, _DIP_BEARINGS), np.uint8)
+        reached = self._reached(seen, seen_by_both)[None]
+        reached = cv2.morphologyEx(reached, cv2.MORPH_CLOSE, dips)
+        reached = np.minimum(cv2.morphologyEx(reached, cv2.MORPH_OPEN, dips)[0], limit)
         near = np.maximum(self._gap_m, SAME_SURFACE_SHARE * upright_m)
         near = np.maximum(near, _CONTACT_ROWS * self._row_m(upright_m))
         with np.errstate(invalid='ignore'):
@@ -155,7 +156,13 @@ class FloorScanner:
         """
         near = 1 / np.where(np.isnan(upright_m), np.inf, upright_m)
         for bearings in _GAP_BEARINGS:
-            closed = grey_closing(near, size=(bearings,), mode='constant')
+            closed = cv2.morphologyEx(
+                near[None],
+                cv2.MORPH_CLOSE,
+                np.ones((1, bearings), np.uint8),
+                borderType=cv2.BORDER_CONSTANT,
+                borderValue=0,
+            )[0]
             near = np.where(closed * _NARROW_M >= bearings * self._step, closed, near)
         with np.errstate(divide='ignore'):
             limit: Array = 1 / near

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import blank_border
+from segfloor_ros.camera.images import blank_border, union
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
@@ -76,7 +76,6 @@ from segfloor_ros.floor.observation import (
 from segfloor_ros.floor.plane.plane import Fixture, expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.tracking.images import union
 from segfloor_ros.timing import NoTimes, StageTimes
 
 DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'

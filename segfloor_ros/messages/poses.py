@@ -25,7 +25,14 @@ from sensor_msgs.msg import Imu
 from segfloor_ros.camera.images import NOT_MEASURED
 from segfloor_ros.camera.model import ImuSample, WheelPose
 from segfloor_ros.errors import InputError
-from segfloor_ros.geometry import Array, invert, make_transform, se3_log
+from segfloor_ros.geometry import (
+    Array,
+    invert,
+    make_transform,
+    quaternions_of,
+    rotations_of,
+    se3_log,
+)
 from segfloor_ros.messages.topics import make_header, to_ns
 from segfloor_ros.slam.results import KeyframePath
 
@@ -181,42 +188,6 @@ def pose_numbers(T_a_b: Array) -> Array:
     """Return transforms (N, 4, 4) as numbers (N, 7): x y z qx qy qz qw, with qw >= 0."""
     quaternions = quaternions_of(T_a_b[:, :3, :3])
     return np.concatenate([T_a_b[:, :3, 3], quaternions], axis=1)
-
-
-def rotations_of(quat_xyzw: Array) -> Array:
-    """Return rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
-    x, y, z, w = (quat_xyzw / np.linalg.norm(quat_xyzw, axis=1, keepdims=True)).T
-    rotations = np.empty((len(quat_xyzw), 3, 3))
-    rotations[:, 0] = np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1
-    )
-    rotations[:, 1] = np.stack(
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1
-    )
-    rotations[:, 2] = np.stack(
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1
-    )
-    return rotations
-
-
-def quaternions_of(rotations: Array) -> Array:
-    """Return quaternions (N, 4), x y z w with w >= 0, of rotations (N, 3, 3).
-
-    4 q qᵀ has the trace and the differences and sums of the entries for its own; its longest row is
-    the best conditioned (Shepperd, 1978).
-    """
-    R = rotations
-    squares = np.empty((len(R), 4, 4))
-    trace = np.trace(R, axis1=1, axis2=2)
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        squares[:, i, i] = 1 + 2 * R[:, i, i] - trace
-        squares[:, j, k] = squares[:, k, j] = R[:, j, k] + R[:, k, j]
-        squares[:, i, 3] = squares[:, 3, i] = R[:, k, j] - R[:, j, k]
-    squares[:, 3, 3] = 1 + trace
-    longest = np.argmax(np.diagonal(squares, axis1=1, axis2=2), axis=1)
-    found = squares[np.arange(len(R)), longest]
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
-    return found * np.where(found[:, 3:] < 0, -1.0, 1.0)
 
 
 def _pose_messages(T_a_b: Array) -> list[Pose]:

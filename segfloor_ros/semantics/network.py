@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.images import union
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import silent_libraries
@@ -27,7 +28,6 @@ from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.semantics.outputs import KINDS, UNLABELLED, Segments
 from segfloor_ros.settings import suggestion
 from segfloor_ros.slam.moving.scene_flow import MAX_MOVING_SHARE
-from segfloor_ros.slam.tracking.images import union
 from segfloor_ros.timing import StageTimes
 
 Run = Callable[[NDArray[np.float32]], list[NDArray[Any]]]

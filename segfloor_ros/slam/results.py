@@ -22,10 +22,10 @@ from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.settings import StageSettings, setting
 
 if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
+    from segfloor_ros.camera.images import Region
     from segfloor_ros.slam.rig import Observations
     from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
     from segfloor_ros.slam.tracking.features import Features
-    from segfloor_ros.slam.tracking.images import Region
     from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 UNKNOWN_COVARIANCE = 1e6

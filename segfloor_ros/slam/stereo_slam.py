@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.camera.images import Region
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig.check import RigCheck
 from segfloor_ros.files.results import Arrays
@@ -36,7 +37,7 @@ from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.front_end import FrontEnd
-from segfloor_ros.slam.tracking.images import Images, Region, dilate, is_inside
+from segfloor_ros.slam.tracking.images import Images, dilate, is_inside
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState
 from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.messages.poses import quaternions_of, rotations_of
+from segfloor_ros.geometry import quaternions_of, rotations_of
 
 USE = """
 import sys
 import numpy as np
 import segfloor_ros.nodes.{node}
 from segfloor_ros.messages.poses import PathMessages, path_arrays, pose_array, pose_message
+from segfloor_ros.camera.model import Mount
 from segfloor_ros.slam.results import KeyframePath
+Mount.from_transform(Mount(0.3, 0.1).T_base_left)
 pose_array(pose_message(np.eye(4)))
 path_arrays(PathMessages('map').next(1, KeyframePath(np.array([1]), np.eye(4)[None])))
 packages = {{name.partition('.')[0] for name in sys.modules}}
@@ -24,7 +26,9 @@ print(sorted(packages & {{'scipy', 'matplotlib', 'rosbags'}}))
 """
 
 
-@pytest.mark.parametrize('node', ['stereo_camera', 'cloud_labelling', 'occupancy_grid'])
+@pytest.mark.parametrize(
+    'node', ['stereo_camera', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid']
+)
 def test_a_node_does_without_large_libraries_that_it_does_not_need(node) -> None:
     """SciPy takes 20 MB of every process that imports it."""
     command = [sys.executable, '-c', USE.format(node=node)]

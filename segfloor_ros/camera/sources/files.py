@@ -28,7 +28,7 @@ from segfloor_ros.camera.sources.source import (
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
-from segfloor_ros.geometry import Array
+from segfloor_ros.geometry import Array, rotations_of
 
 T = TypeVar('T')
 
@@ -284,10 +284,8 @@ def read_wheel_odometry(path: Path) -> list[WheelPose]:
             f'{path}, pose {bad[0] + 1}: the quaternion has length {norms[bad[0]]:.3g}, not 1; '
             f'expected {TUM_COLUMNS}'
         )
-    from scipy.spatial.transform import Rotation  # as in geometry.py
-
     poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(table[:, 3:7]).as_matrix()
+    poses[:, :3, :3] = rotations_of(table[:, 3:7])
     poses[:, :3, 3] = table[:, :3]
     return [WheelPose(int(stamp), pose) for stamp, pose in zip(stamps_ns, poses, strict=True)]
 

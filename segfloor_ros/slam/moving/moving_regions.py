@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import shrunk
+from segfloor_ros.camera.images import Region, shrunk
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.slam.moving.scene_flow import (
@@ -36,7 +36,6 @@ from segfloor_ros.slam.places.known_views import MIN_FRAMES
 from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
-from segfloor_ros.slam.tracking.images import Region
 from segfloor_ros.slam.tracking.pose import FLOOR_M
 
 DISPARITIES = 64

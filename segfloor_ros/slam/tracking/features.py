@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.images import Region
 from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.tracking.images import Region, is_inside
+from segfloor_ros.slam.tracking.images import is_inside
 from segfloor_ros.timing import timed
 
 OVERSAMPLING = 4

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from segfloor_ros.camera.images import Region, union
 from segfloor_ros.camera.model import StereoFrame, is_disparity
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.places.known_views import ALIKE_SHARE
@@ -33,12 +34,10 @@ from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
 from segfloor_ros.slam.tracking.images import (
     ImageRotation,
     Images,
-    Region,
     RepeatCheck,
     expected_shift,
     image_fault,
     is_inside,
-    union,
 )
 from segfloor_ros.slam.tracking.map_tracking import Follower, LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.camera.images import blank_border
+from segfloor_ros.camera.images import Region, blank_border, union
 from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array, make_transform, transform_points
 
@@ -37,9 +37,6 @@ LEVELS = 3
 SMALL_WIDTH_PX = 320
 """Width of a shrunk image: for optical flow; half of it shows what moves, a quarter turns."""
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
-
-Region = NDArray[np.uint8]
-"""A mask (H, W) uint8 of the left image, 255 where something moves."""
 
 SIGMA_FLOW_PX = 1.0
 """Error of a pixel that is followed."""
@@ -119,13 +116,6 @@ def follow_pixels(
     )
     uv = (np.asarray(found_uv, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     return uv, np.asarray(status).ravel() > 0
-
-
-def union(a: Region | None, b: Region | None) -> Region | None:
-    """Return the region that is in either; None for none at all."""
-    if a is None or b is None:
-        return b if a is None else a
-    return np.maximum(a, b)
 
 
 def dilate(region: Region, radius_px: int) -> Region:

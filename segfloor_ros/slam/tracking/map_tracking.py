@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.images import Region
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.places.known_views import (
     SEEN_BY_SEVERAL,
@@ -40,13 +41,7 @@ from segfloor_ros.slam.tracking.features import (
     match_unguided,
     spread,
 )
-from segfloor_ros.slam.tracking.images import (
-    SIGMA_FLOW_PX,
-    Images,
-    Region,
-    follow_pixels,
-    is_inside,
-)
+from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, Images, follow_pixels, is_inside
 from segfloor_ros.slam.tracking.patch_alignment import (
     MIN_SIGMA_PIXEL,
     align_patches,

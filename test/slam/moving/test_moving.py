@@ -8,10 +8,11 @@ import pytest
 from moving_drive import MovingDrive
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.camera.images import union
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking.images import dilate, is_inside, union
+from segfloor_ros.slam.tracking.images import dilate, is_inside
 
 FRAMES = 36
 
