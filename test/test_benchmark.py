@@ -22,7 +22,8 @@ from segfloor_ros.benchmark import (
     measure_map,
     run_apart,
 )
-from segfloor_ros.cli.commands import DRIVE, benchmark
+from segfloor_ros.cli.commands import DRIVE
+from segfloor_ros.cli.evaluate import benchmark
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.evaluation.maps import sample_states

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.commands import print_node_figures
+from segfloor_ros.cli.evaluate import print_node_figures
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import console
 from segfloor_ros.configuration import resolve

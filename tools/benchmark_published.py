@@ -25,7 +25,7 @@ from segfloor_ros.benchmark import (
     run_apart,
 )
 from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.commands import stage_table, workload_table
+from segfloor_ros.cli.evaluate import stage_table, workload_table
 from segfloor_ros.cli.main import run_command
 from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
 from segfloor_ros.configuration import Configuration, resolve

@@ -1,4 +1,4 @@
-"""The commands that map, make recordings and measure: run, replay, demo, simulate, benchmark."""
+"""The commands that map and make recordings: run, replay, demo, params, simulate, explore."""
 
 from __future__ import annotations
 
@@ -13,30 +13,12 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
-from rich.text import Text
 
-from segfloor_ros.benchmark import (
-    BenchmarkPlan,
-    Step,
-    Workload,
-    as_document,
-    parse_sizes,
-    profile_recording,
-    run_benchmark,
-)
-from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
-from segfloor_ros.cli.terminal import (
-    DriveOptions,
-    console,
-    figure_table,
-    print_json,
-    value_table,
-    within,
-)
+from segfloor_ros.cli.terminal import DriveOptions, console, within
 from segfloor_ros.cli.view import open_view
-from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings, resolve
+from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings
 from segfloor_ros.errors import MapError, SettingsError, about
 from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.evaluation.maps import load_truth
@@ -47,8 +29,6 @@ from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.results_folder import OutputFolder
 from segfloor_ros.semantics.network import Network
-
-DEFAULT = BenchmarkPlan()
 
 DRIVE = Path(str(resources.files('segfloor_ros.simulation') / 'demo'))
 """A drive through the shipped scene corridor1 with its truth, made by `segfloor simulate corridor1
@@ -148,13 +128,8 @@ def replay(
     segfloor replay drive.mcap --out result
     segfloor replay drive.mcap --rate 0 --view --out result
     """
-    try:
+    with terminal.needing_ros('replay'):
         from segfloor_ros.cli.replay_session import ReplaySession
-    except ImportError as error:
-        raise SettingsError(
-            f'replay needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
-            "pip install 'segfloor_ros[ros]'"
-        ) from None
     if options.save_masks is SaveMasks.all:
         raise SettingsError(
             '--save-masks all: the nodes segment keyframes only; take keyframes, or segfloor run'
@@ -282,21 +257,13 @@ def _list_scenes(is_asked: bool) -> None:
 
 
 def simulate(
-    scene: Annotated[
-        str,
-        typer.Argument(
-            help='Name of a shipped scene, a scene file, or a map_server map (YAML) to drive in.'
-        ),
-    ],
+    scene: terminal.Scene,
     out: terminal.Out,
     camera: Annotated[
         str | None,
         typer.Option(help='See through one of a kind: webcam, oak, realsense, zed, kinect.'),
     ] = None,
-    set_values: Annotated[
-        list[str] | None,
-        typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
-    ] = None,
+    set_values: terminal.SceneValues = None,
     floor_every: Annotated[
         int,
         typer.Option(callback=within(0), help='A true floor mask every so many frames; 0: none.'),
@@ -349,130 +316,45 @@ def simulate(
     console.print(f'{facts}: {out}')
 
 
-def benchmark(
-    recording: Annotated[
-        str | None,
-        typer.Argument(help='Print the share of each step of a frame and of a keyframe of this.'),
-    ] = None,
-    sizes: Annotated[
-        str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
-    ] = ','.join(map(str, DEFAULT.sizes)),
-    frames: Annotated[
-        int,
-        typer.Option(callback=within(2), help='Image pairs for all stages, generated or recorded.'),
-    ] = DEFAULT.frames,
-    seed: Annotated[
-        int, typer.Option(callback=within(0), help='Of the generated data.')
-    ] = DEFAULT.seed,
-    threads: Annotated[
-        int, typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.')
-    ] = DEFAULT.threads,
-    nodes: Annotated[
-        str | None,
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExploreOptions:
+    """What is explored, by which robot, and how far."""
+
+    scene: terminal.Scene
+    out: terminal.Out
+    robot: Annotated[str, typer.Option(help='The robot: turtlebot3_burger or husky.')] = (
+        'turtlebot3_burger'
+    )
+    goals: Annotated[int, typer.Option(min=0, help='Goals to draw at random and to drive to.')] = 5
+    seed: Annotated[int, typer.Option(min=0, help='Of the goals, the textures and the noise.')] = 1
+    goal: Annotated[
+        list[str] | None,
         typer.Option(
-            metavar='RECORDING',
-            help='Play this recording through the five node processes instead: latency from image '
-            'to map, CPU, memory and losses.',
+            help='Drive to this place and explore nothing: a name in goals.yaml of --start-in, or '
+            'X,Y in its map; repeatable.'
         ),
-    ] = None,
-    rate: Annotated[
-        float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
-    ] = 1.0,
-    as_json: terminal.Json = False,
-    params: terminal.Params = None,
-    assignments: terminal.Set = None,
-) -> None:
-    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload.
+    ] = None
+    start_in: Annotated[
+        Path | None, typer.Option(help='Start in the map of this earlier exploration, be found.')
+    ] = None
+    minutes: Annotated[
+        float, typer.Option(min=0.1, help="At most so long, in the robot's time.")
+    ] = 30.0
+    depth: terminal.Depth = False
+    set_values: terminal.SceneValues = None
+    params: terminal.Params = None
+
+
+@terminal.with_options
+def explore(options: ExploreOptions) -> None:
+    """Let a simulated robot explore a scene by the map that the nodes make, then drive to goals.
 
     \b
-    segfloor benchmark --json > figures.json
-    segfloor benchmark drive.mcap
-    segfloor benchmark --nodes drive.mcap
+    segfloor explore complex_room --out explored
+    segfloor explore office.yaml --out explored --robot husky --goals 20 --seed 3
+    segfloor explore complex_room --out again --start-in explored --goal goal_2
     """
-    if nodes is not None:
-        configuration = terminal.configuration(params, assignments, nodes)
-        return print_node_figures(configuration, rate, as_json=as_json)
-    plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
-    if recording is not None:
-        configuration = terminal.configuration(params, assignments, recording)
-        source = open_source(configuration.stereo_camera)
-        with terminal.progress_bar('measuring', frames) as progress:
-            steps = profile_recording(source, plan, configuration, progress)
-        if as_json:
-            return print_json({'steps': [dataclasses.asdict(step) for step in steps]})
-        return console.print(step_table(steps))
-    configuration = resolve(params, assignments or ())
-    with terminal.announcing() as announce:
-        workloads = run_benchmark(plan, configuration, announce)
-    if as_json:
-        return print_json(as_document(plan, workloads))
-    console.print(stage_table(workloads))
-    console.print(workload_table(workloads))
-
-
-def print_node_figures(
-    configuration: Configuration, rate: float, lossless: bool = False, as_json: bool = False
-) -> None:
-    """Play the recording of the configuration through the nodes and print what it cost. lossless:
-    lose no frame, as opposed to keeping to the clock.
-    """
-    try:
-        from segfloor_ros.cli.replay_session import figure_rows, measure_nodes
-    except ImportError as error:
-        raise SettingsError(f'to measure the nodes needs ROS 2 ({error})') from None
-    frames = open_source(configuration.stereo_camera).frame_count
-    with terminal.progress_bar('playing', frames) as progress:
-        figures = measure_nodes(configuration, rate, lossless, progress)
-    rows = figure_rows(figures)
-    if as_json:
-        return print_json(dict(rows))
-    console.print(value_table('figure', rows))
-
-
-def step_table(steps: list[Step]) -> Table:
-    """Return the share of each step as a table."""
-    table = figure_table('step', 'calls', 'ms / call', 'share %')
-    for step in steps:
-        name = Text('  ' * (len(step.path) - 1) + step.path[-1], '' if step.path[1:] else 'bold')
-        table.add_row(name, str(step.calls), f'{step.ms:.2f}', f'{100 * step.share:.1f}')
-    table.caption = (
-        'tracking: of each frame; moving: of each search for what moves; the others: of each '
-        'keyframe; steps are part of the step above; computed on one thread'
-    )
-    return table
-
-
-def stage_table(workloads: list[Workload]) -> Table:
-    """Return the time of every stage as a table."""
-    table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
-    for workload in workloads:
-        table.add_row(Text(workload.name, 'bold'))
-        for name, stage in workload.stages.items():
-            times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
-            ratio = f'{stage["p50_ratio"]:.3f}'
-            table.add_row(f'  {name}', str(stage['count']), *times, ratio)
-        table.add_row('  reference', '', f'{workload.reference_ms:.2f}', '', '', '1.000')
-        table.add_section()
-    table.caption = 'reference: ORB and semi-global matching of a fixed 640x480 pair, timed beside'
-    return table
-
-
-def workload_table(workloads: list[Workload]) -> Table:
-    """Return throughput, map updates and memory of every workload as a table."""
-    table = figure_table(
-        'workload', 'items/s', 's/update', 'p95 s', 'max s', 'peak MB', 'MB/update'
-    )
-    for workload in workloads:
-        updates = (f'{workload.update_s.get(key, 0.0):.4f}' for key in ('mean', 'p95', 'max'))
-        table.add_row(
-            workload.name,
-            f'{workload.items_per_s:.1f}',
-            *updates,
-            f'{workload.memory_mb["peak"]:.0f}',
-            f'{workload.memory_mb["slope_per_update"]:.3f}',
-        )
-    table.caption = (
-        'items: frames, or keyframes where there are no images; update: all that is done once per '
-        'keyframe, the map included; one thread; memory grows by the slope of the second half'
-    )
-    return table
+    # Imported here: simulator and pictures take time that other commands should not wait for.
+    with terminal.needing_ros('explore'):
+        from segfloor_ros.cli.explore_session import explore_scene
+    explore_scene(options)

@@ -1,4 +1,6 @@
-"""`segfloor evaluate`: scores of maps, trajectories and floor masks against the truth."""
+"""`segfloor evaluate`: scores of maps, trajectories and floor masks against the truth; and what the
+stages cost: `segfloor benchmark`.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,33 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
-from segfloor_ros.cli.terminal import Json, console, figure_table, print_json, value_table, within
+from segfloor_ros.benchmark import (
+    BenchmarkPlan,
+    Step,
+    Workload,
+    as_document,
+    parse_sizes,
+    profile_recording,
+    run_benchmark,
+)
+from segfloor_ros.camera.sources import open_source
+from segfloor_ros.cli import terminal
+from segfloor_ros.cli.terminal import (
+    Json,
+    Params,
+    Set,
+    announcing,
+    console,
+    figure_table,
+    needing_ros,
+    print_json,
+    progress_bar,
+    value_table,
+    within,
+)
+from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import (
@@ -34,6 +61,8 @@ from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number, read_table
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
+
+DEFAULT = BenchmarkPlan()
 
 app = typer.Typer(help='Score a map, a trajectory or floor masks against the truth.')
 
@@ -257,3 +286,130 @@ def _with_drive(
 
 def _percent(spread: Spread) -> str:
     return f'{100 * spread.mean:.2f} ± {100 * spread.std:.2f}'
+
+
+def benchmark(
+    recording: Annotated[
+        str | None,
+        typer.Argument(help='Print the share of each step of a frame and of a keyframe of this.'),
+    ] = None,
+    sizes: Annotated[
+        str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
+    ] = ','.join(map(str, DEFAULT.sizes)),
+    frames: Annotated[
+        int,
+        typer.Option(callback=within(2), help='Image pairs for all stages, generated or recorded.'),
+    ] = DEFAULT.frames,
+    seed: Annotated[
+        int, typer.Option(callback=within(0), help='Of the generated data.')
+    ] = DEFAULT.seed,
+    threads: Annotated[
+        int, typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.')
+    ] = DEFAULT.threads,
+    nodes: Annotated[
+        str | None,
+        typer.Option(
+            metavar='RECORDING',
+            help='Play this recording through the five node processes instead: latency from image '
+            'to map, CPU, memory and losses.',
+        ),
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
+    ] = 1.0,
+    as_json: Json = False,
+    params: Params = None,
+    assignments: Set = None,
+) -> None:
+    """Time, memory and throughput of the stages, also as multiples of a fixed OpenCV workload.
+
+    \b
+    segfloor benchmark --json > figures.json
+    segfloor benchmark drive.mcap
+    segfloor benchmark --nodes drive.mcap
+    """
+    if nodes is not None:
+        configuration = terminal.configuration(params, assignments, nodes)
+        return print_node_figures(configuration, rate, as_json=as_json)
+    plan = BenchmarkPlan(parse_sizes(sizes), frames, seed, threads)
+    if recording is not None:
+        configuration = terminal.configuration(params, assignments, recording)
+        source = open_source(configuration.stereo_camera)
+        with progress_bar('measuring', frames) as progress:
+            steps = profile_recording(source, plan, configuration, progress)
+        if as_json:
+            return print_json({'steps': [dataclasses.asdict(step) for step in steps]})
+        return console.print(step_table(steps))
+    configuration = resolve(params, assignments or ())
+    with announcing() as announce:
+        workloads = run_benchmark(plan, configuration, announce)
+    if as_json:
+        return print_json(as_document(plan, workloads))
+    console.print(stage_table(workloads))
+    console.print(workload_table(workloads))
+
+
+def print_node_figures(
+    configuration: Configuration, rate: float, lossless: bool = False, as_json: bool = False
+) -> None:
+    """Play the recording of the configuration through the nodes and print what it cost. lossless:
+    lose no frame, as opposed to keeping to the clock.
+    """
+    with needing_ros('to measure the nodes'):
+        from segfloor_ros.cli.replay_session import figure_rows, measure_nodes
+    frames = open_source(configuration.stereo_camera).frame_count
+    with progress_bar('playing', frames) as progress:
+        figures = measure_nodes(configuration, rate, lossless, progress)
+    rows = figure_rows(figures)
+    if as_json:
+        return print_json(dict(rows))
+    console.print(value_table('figure', rows))
+
+
+def step_table(steps: list[Step]) -> Table:
+    """Return the share of each step as a table."""
+    table = figure_table('step', 'calls', 'ms / call', 'share %')
+    for step in steps:
+        name = Text('  ' * (len(step.path) - 1) + step.path[-1], '' if step.path[1:] else 'bold')
+        table.add_row(name, str(step.calls), f'{step.ms:.2f}', f'{100 * step.share:.1f}')
+    table.caption = (
+        'tracking: of each frame; moving: of each search for what moves; the others: of each '
+        'keyframe; steps are part of the step above; computed on one thread'
+    )
+    return table
+
+
+def stage_table(workloads: list[Workload]) -> Table:
+    """Return the time of every stage as a table."""
+    table = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms', 'median / reference')
+    for workload in workloads:
+        table.add_row(Text(workload.name, 'bold'))
+        for name, stage in workload.stages.items():
+            times = (f'{stage[key]:.2f}' for key in ('p50_ms', 'p95_ms', 'max_ms'))
+            ratio = f'{stage["p50_ratio"]:.3f}'
+            table.add_row(f'  {name}', str(stage['count']), *times, ratio)
+        table.add_row('  reference', '', f'{workload.reference_ms:.2f}', '', '', '1.000')
+        table.add_section()
+    table.caption = 'reference: ORB and semi-global matching of a fixed 640x480 pair, timed beside'
+    return table
+
+
+def workload_table(workloads: list[Workload]) -> Table:
+    """Return throughput, map updates and memory of every workload as a table."""
+    table = figure_table(
+        'workload', 'items/s', 's/update', 'p95 s', 'max s', 'peak MB', 'MB/update'
+    )
+    for workload in workloads:
+        updates = (f'{workload.update_s.get(key, 0.0):.4f}' for key in ('mean', 'p95', 'max'))
+        table.add_row(
+            workload.name,
+            f'{workload.items_per_s:.1f}',
+            *updates,
+            f'{workload.memory_mb["peak"]:.0f}',
+            f'{workload.memory_mb["slope_per_update"]:.3f}',
+        )
+    table.caption = (
+        'items: frames, or keyframes where there are no images; update: all that is done once per '
+        'keyframe, the map included; one thread; memory grows by the slope of the second half'
+    )
+    return table

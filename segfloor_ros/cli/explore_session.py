@@ -1,27 +1,45 @@
-"""An exploration: the simulated robot and the nodes behind its camera, each a process of its own,
-and the planner that drives it by what they publish, in step with the robot's time.
+"""`segfloor explore`: a simulated robot maps a scene by itself and drives to goals on its map.
+
+The robot and the nodes behind its camera are processes of their own, and the planner drives it by
+what they publish, in step with the robot's time.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shlex
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
+import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3
 from std_srvs.srv import SetBool, Trigger
 
+from segfloor_ros.cli.commands import ExploreOptions
 from segfloor_ros.cli.replay_nodes import STALL_S, NodeGraph, ReplayError, running_nodes
 from segfloor_ros.cli.replay_session import cpu_s
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.evaluation.exploration import Exploration
+from segfloor_ros.cli.terminal import console, progress_bar, value_table
+from segfloor_ros.configuration import Configuration, resolve
+from segfloor_ros.errors import MapError, SettingsError, about, os_errors
+from segfloor_ros.evaluation.exploration import (
+    Exploration,
+    figures,
+    mapped_share,
+    picture,
+    reachable_floor,
+    write_film,
+)
+from segfloor_ros.files.results import check_target, folder_in_the_making, move_into_place
+from segfloor_ros.files.whole import read_json, read_yaml
 from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import OccupancyGrid
+from segfloor_ros.geometry import Array, planar
+from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.messages.arrays import MAP_POINT_DTYPE, cloud_array, grid_of, scan_arrays
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import (
@@ -36,9 +54,23 @@ from segfloor_ros.messages.topics import (
     stamp_of,
     to_ns,
 )
-from segfloor_ros.navigation import Explorer
-from segfloor_ros.processes import Interrupt
+from segfloor_ros.navigation import Body, Explorer, Goal
+from segfloor_ros.processes import Interrupt, first_interrupt_noted
+from segfloor_ros.simulation.robot import DrivenRobot, open_robot
+from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import UNKNOWN_COVARIANCE
+from segfloor_ros.trajectory import Trajectory, write_tum
+
+GOALS, SAVED = 'goals.yaml', 'saved.map'
+FILES = (GOALS, SAVED, 'map.pgm', 'map.yaml', 'true_map.pgm', 'true_map.yaml', 'trajectory.txt',
+         'ground_truth.txt', 'summary.json', 'explored.png', 'explored.gif')  # fmt: skip
+
+CRUISE_M_S, TURN_RAD_S = 0.4, 0.6
+"""No faster, whatever the robot can: SLAM follows these surely."""
+
+GIVEN = ('height_m', 'pitch_rad', 'roll_rad', 'forward_m', 'left_m')
+"""Of the mount of the camera: what SLAM is given."""
 
 OnMap = Callable[[float, OccupancyGrid, str], None]
 """Told the time of the robot, the map and the phase."""
@@ -197,3 +229,110 @@ class Pilot:
 
     def _take_contact(self, message: Any) -> None:
         self.found.bumps_ns.append(stamp_of(message))
+
+
+def explore_scene(options: ExploreOptions) -> None:
+    """Explore as the options say, write what came of it and print its figures. Raises SegfloorError
+    where nothing can come of it, typer.Exit after an interrupt.
+    """
+    check_target(options.out, FILES)
+    robot, of_camera = open_robot(options.robot)
+    values = [f'seed={options.seed}', *(options.set_values or ())]
+    scene = open_scene(options.scene, [*of_camera, *values])
+    with about(options.scene):
+        driven = DrivenRobot(scene, robot)
+        x, y, yaw = planar(driven.T_world_base(0.0)).tolist()
+        truth = true_map(scene, obstacles(scene), floors(scene), np.array([x, y]))
+    found = Exploration((x, y, yaw))
+    slam: dict[str, Any] = {f'camera_{n}': v for n, v in asdict(driven.mount).items() if n in GIVEN}
+    named: dict[str, Any] = {}
+    if options.start_in is not None:
+        slam['load_map'] = str((options.start_in / SAVED).absolute())
+        named = read_yaml(options.start_in / GOALS, 'names and places')
+        summary = read_json(options.start_in / 'summary.json', 'an exploration')
+        found.start = tuple(summary['map_in_scene'])
+    floor = reachable_floor(truth, robot.radius_m, found.start)
+    speeds = min(robot.speed_m_s, CRUISE_M_S), min(robot.turn_rate_rad_s, TURN_RAD_S)
+    body = Body(robot.radius_m, driven.nearest_floor_m(scene), *speeds)
+    explorer = Explorer(body, options.goals, options.seed)
+    if options.goal:
+        wanted = [Goal(_place(text, named), text) for text in options.goal]
+        explorer = Explorer(body, wanted, options.seed, phase='driving')
+    with (
+        folder_in_the_making(options.out) as made,
+        first_interrupt_noted() as interrupt,
+        progress_bar('exploring', 100) as progress,
+    ):
+
+        def show(time_s: float, grid: OccupancyGrid, phase: str) -> None:
+            share = mapped_share(grid, truth, floor, found.start)
+            ended = f', {len(explorer.ended)} of {options.goals} goals' * (phase == 'driving')
+            progress(round(100 * share), note=f'of the floor mapped at {time_s:.0f} s{ended}')
+
+        session = ExploreSession(
+            resolve(options.params, ()),
+            options.params,
+            {
+                'scene': options.scene,
+                'scene_values': shlex.join(values),
+                'robot': options.robot,
+                'depth': options.depth,
+            },
+            slam,
+            explorer,
+            found,
+            60 * options.minutes,
+            made / SAVED,
+            show,
+            interrupt,
+        )
+        session.execute()
+        if not found.maps:
+            raise MapError(f'{options.scene}: no map came of {len(found.true_poses)} frames')
+        summary = {
+            **figures(found, truth, robot.radius_m),
+            'goals_total': len(options.goal) if options.goal else options.goals,
+            'scene': options.scene,
+            'robot': options.robot,
+            'seed': options.seed,
+            'map_in_scene': found.start,
+        }
+        with os_errors(f'{options.out}: cannot be written'):
+            _write(made, found, truth, summary, named)
+            move_into_place(made, options.out)
+    rows = [(name, str(value)) for name, value in summary.items() if name != 'cpu_s']
+    console.print(value_table('exploration', rows, options.scene))
+    console.print(str(options.out / 'explored.png'), highlight=False, soft_wrap=True)
+    if interrupt.status:
+        raise typer.Exit(interrupt.status)
+
+
+def _write(
+    folder: Path,
+    found: Exploration,
+    truth: OccupancyGrid,
+    summary: dict[str, Any],
+    named: dict[str, Any],
+) -> None:
+    """Write what an exploration came to. named: goals of earlier ones by name."""
+    save_map(found.maps[-1][1], folder / 'map.yaml')
+    save_map(truth, folder / 'true_map.yaml')
+    for name, poses in (('trajectory', found.poses), ('ground_truth', found.true_poses)):
+        stamps = sorted(poses)
+        path = np.array([poses[stamp_ns] for stamp_ns in stamps]).reshape(-1, 4, 4)
+        write_tum(folder / f'{name}.txt', Trajectory(np.array(stamps), path))
+    places = {goal.name: goal.point.round(3).tolist() for goal, _ in found.goals}
+    (folder / GOALS).write_text(yaml.safe_dump({**named, **places}))
+    (folder / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n')
+    (folder / 'explored.png').write_bytes(picture(found, truth))
+    write_film(folder / 'explored.gif', found, truth)
+
+
+def _place(text: str, named: dict[str, Any]) -> Array:
+    """Return the place (2,) of a name, or of `x,y`. Raises SettingsError."""
+    try:
+        x, y = named.get(text) or text.split(',')
+        return np.array([float(x), float(y)])
+    except (TypeError, ValueError):
+        known = ', '.join(named) or 'none is known without --start-in'
+        raise SettingsError(f'--goal {text}: expected X,Y or a name ({known})') from None

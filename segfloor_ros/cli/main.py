@@ -11,9 +11,9 @@ import typer
 
 import segfloor_ros
 from segfloor_ros.cli.check import check_suite
-from segfloor_ros.cli.commands import benchmark, demo, params, replay, run, simulate
+from segfloor_ros.cli.commands import demo, explore, params, replay, run, simulate
 from segfloor_ros.cli.evaluate import app as evaluate
-from segfloor_ros.cli.explore import explore
+from segfloor_ros.cli.evaluate import benchmark
 from segfloor_ros.cli.maps import app as maps
 from segfloor_ros.cli.recordings import calibrate, convert, info, record, view
 from segfloor_ros.cli.terminal import print_error

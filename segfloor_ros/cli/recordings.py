@@ -219,10 +219,8 @@ def view(
     with open_view(str(out or '')) as shown:
         assert shown is not None
         if live:
-            try:
+            with terminal.needing_ros('--live'):
                 from segfloor_ros.cli.replay_recorder import watch
-            except ImportError as error:
-                raise SettingsError(f'--live needs ROS 2 ({error})') from None
             watch(shown, options.input)
         elif (folder / 'summary.json').is_file():
             shown.results(folder)

@@ -181,6 +181,28 @@ def within(
     return check
 
 
+@contextmanager
+def needing_ros(what: str) -> Iterator[None]:
+    """Say in one line what cannot be imported without ROS 2. Raises SettingsError."""
+    try:
+        yield
+    except ImportError as error:
+        raise SettingsError(
+            f'{what} needs ROS 2 ({error}); source a ROS 2 installation or install the extra: '
+            "pip install 'segfloor_ros[ros]'"
+        ) from None
+
+
+Scene = Annotated[
+    str,
+    typer.Argument(
+        help='Name of a shipped scene, a scene file, or a map_server map (YAML) to drive in.'
+    ),
+]
+SceneValues = Annotated[
+    list[str] | None,
+    typer.Option('--set', help='One value of the scene, e.g. camera.height_m=0.4; repeatable.'),
+]
 Input = Annotated[
     str, typer.Argument(help='Recording: folder (KITTI, EuRoC, images), bag, video or device.')
 ]
