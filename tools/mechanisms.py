@@ -92,12 +92,7 @@ SLAM: dict[str, Mechanism] = {
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
     'keyframes where few points are found': Mechanism({'slam.places.known_views.MAJORITY': 0.0}),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
-    'relocalisation by two frames': Mechanism(
-        {
-            'slam.places.place_recognition.TIMES_SURE': 1,
-            'slam.places.place_recognition.MIN_AGREEMENT': 0.0,
-        }
-    ),
+    'relocalisation by several frames': Mechanism({'slam.places.place_recognition.PROOF': 1}),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(
         {'slam.tracking.pose.differ': lambda a, b: False, 'slam.tracking.pose.KNOWN_NOISE': 1e9}

@@ -202,8 +202,9 @@ def _recover(
     T_map_left = slam.mount.T_base_left
     start = int(np.searchsorted(times, times[cut] + cut_s))
     for k in range(start, len(frames)):
-        result = slam.process(frames[k])[-1]
-        if result.tracked:
+        results = slam.process(frames[k])  # none of a submap, until it is merged
+        if results and results[-1].tracked:
+            result = results[-1]
             T_world_left = invert(T_map_left) @ result.T_map_odom @ result.T_odom_base @ T_map_left
             wrong_m = float(np.linalg.norm((invert(truth[k]) @ T_world_left)[:3, 3]))
             return float(times[k] - times[start]), wrong_m

@@ -40,7 +40,7 @@ from segfloor_ros.semantics.label_map import LabelMap, numbered
 from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.slam.results import KeyframePath
 
-IMAGE, KEYFRAME, INFO = 'left/image_raw', *KEYFRAME_PARTS[:2]
+IMAGE, (KEYFRAME, INFO, *_) = 'left/image_raw', KEYFRAME_PARTS
 DISPARITY, MASK, SCAN = 'keyframe/disparity', 'keyframe/floor_mask', 'keyframe/floor_scan'
 FEATURES, PATH = 'keyframe/features', 'keyframe/path'
 SEEN = (DISPARITY, MASK, SCAN, FEATURES, PATH)

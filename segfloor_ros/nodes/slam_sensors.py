@@ -25,19 +25,15 @@ from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.messages.arrays import grey8_image
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import FRESH_S, IMAGES, PATIENCE_S, SENSORS, best_effort, to_ns
-from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
+from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S
 from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
+from segfloor_ros.slam.rig import GATE, chi2_limit
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'
-MAX_LATE_S = 0.05
-"""So long an image waits for what sensors measured up to its time."""
-
-SIGMAS = 3.0
-
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.5, 0.26
 """Nobody points more exactly than RViz says by itself: half a metre and 15 degrees."""
 
@@ -114,13 +110,13 @@ class SensorInput:
             self._waiting[name] = deque(in_order[count:], SENSORS.depth)
 
     def is_behind(self, stamp_ns: int, lag_ns: int = 0) -> bool:
-        """Whether a sensor is about to tell what it measured up to the time of an image; lag_ns: by
-        how much later its stamps are.
+        """Whether a sensor is about to tell what it measured up to the time of an image, and may
+        still be waited for; lag_ns: by how much later its stamps are.
         """
         now_s = self._clock_s()
         if self._asked[0] != stamp_ns:
             self._asked = stamp_ns, now_s
-        if now_s > self._asked[1] + MAX_LATE_S:
+        if now_s > self._asked[1] + LOOK_S:
             return False
         self._look_at_tf(now_s)
         return any(
@@ -258,8 +254,9 @@ class InitialPose:
             return
         T_map_base = pose_array(message.pose.pose)
         sigma = np.sqrt(np.maximum(np.diag(np.reshape(message.pose.covariance, (6, 6))), 0.0))
-        reach_m = SIGMAS * max(float(sigma[:3].max()), LEAST_SIGMA_M)
-        reach_rad = SIGMAS * max(float(sigma[3:].max()), LEAST_SIGMA_RAD)
+        sigmas = float(np.sqrt(chi2_limit(1, GATE)))
+        reach_m = sigmas * max(float(sigma[:3].max()), LEAST_SIGMA_M)
+        reach_rad = sigmas * max(float(sigma[3:].max()), LEAST_SIGMA_RAD)
         self._given = T_map_base, reach_m, reach_rad
         x, y = T_map_base[:2, 3].tolist()
         self._node.get_logger().info(f'looks within {reach_m:.1f} m around x {x:.2f}, y {y:.2f}')

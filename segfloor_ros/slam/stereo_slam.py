@@ -33,8 +33,9 @@ from segfloor_ros.slam.results import (
     in_merged_map,
     take_snapshot,
 )
-from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
+from segfloor_ros.slam.sensors.gyroscope import STEP_NS
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Images, dilate, is_inside
@@ -42,19 +43,12 @@ from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState
 from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes
 
-START_NS, LOST_NS = 1_000_000_000, 1_500_000_000
-"""For how long the camera is looked for in the map: of a new drive in the map that was loaded, and
-of one that got lost or was broken off. After that it maps on its own."""
-
-LOOK_NS = 500_000_000
-"""While the mount is not known the floor is looked at so often where no keyframe comes."""
+LOST_NS = 1_500_000_000
+"""For so long the camera is looked for in the map; after that it maps on its own."""
 
 HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
 ORB-SLAM2, 2017, does the same)."""
-
-LATE_KEYFRAMES = 10
-"""A network that is slower than so many keyframes is of no use."""
 
 REPEATED = 'tracking: the image is the one before; the motion is taken to go on'
 NOTHING_SEEN = 'too few known points in view'
@@ -104,7 +98,6 @@ class StereoSlam:
         self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
         self._looked_ns = 0
-        self._patience_ns = LOST_NS
         self._began_unsure: tuple[Array, Array] | None = None
         self._late: list[tuple[KeyframeRecord, Region]] = []
 
@@ -159,7 +152,7 @@ class StereoSlam:
                 self.front_end.track(frame, images) if self.map.keyframes and not fault else None
             )
             if track is not None:
-                self._lost_ns, self._patience_ns = None, LOST_NS
+                self._lost_ns = None
                 if not self.back_end.submap.is_beside:
                     self.back_end.submap, self._began_unsure = Submap.KNOWN, None
             elif self.map.keyframes:
@@ -197,7 +190,7 @@ class StereoSlam:
         says that comes later, something moves (255); with the next frame. A stamp of no keyframe
         says nothing.
         """
-        recent = self.map.keyframes[-LATE_KEYFRAMES:]
+        recent = self.map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
         keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
         if keyframe is not None and not self.front_end.is_fixed:
             self._late.append((keyframe, dilate(mask, self._settings.mask_dilation_px)))
@@ -237,7 +230,7 @@ class StereoSlam:
         self.back_end.from_arrays(arrays)
         self.rig.mount, self.front_end.is_fixed = mount, localize
         if last is None:
-            self.back_end.submap, self._patience_ns = Submap.LOADED, START_NS
+            self.back_end.submap = Submap.LOADED
             self.front_end.reset()
         else:
             self.front_end.resume(last)
@@ -266,7 +259,7 @@ class StereoSlam:
             self._lost_ns = None
             return
         self._lost_ns = frame.stamp_ns if self._lost_ns is None else self._lost_ns
-        is_long = frame.stamp_ns - self._lost_ns >= self._patience_ns
+        is_long = frame.stamp_ns - self._lost_ns >= LOST_NS
         if self.back_end.submap is Submap.LOST:
             features = front_end.extractor.extract(frame.left, images.excluded)
             if is_long or self.back_end.sees_known(images, features, frame.stamp_ns):
@@ -351,7 +344,7 @@ class StereoSlam:
         """Look for the floor at a keyframe; at other frames now and then: a camera that stands may
         see it better than in its first image, or know by now where up is.
         """
-        is_due = is_new_view or frame.stamp_ns - self._looked_ns >= LOOK_NS
+        is_due = is_new_view or frame.stamp_ns - self._looked_ns >= STEP_NS
         if self.mount is None and self._mount_meter is not None and is_due:
             self._looked_ns = frame.stamp_ns
             T_world_camera = invert(self.front_end.motion.T_camera_world)

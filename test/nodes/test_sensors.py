@@ -22,7 +22,8 @@ from segfloor_ros.messages.topics import KEYFRAMES, to_ns
 from segfloor_ros.nodes import slam_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
-from segfloor_ros.nodes.slam_sensors import MAX_LATE_S, SensorInput
+from segfloor_ros.nodes.shared.inputs import LOOK_S
+from segfloor_ros.nodes.slam_sensors import SensorInput
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
@@ -217,7 +218,7 @@ def test_an_image_waits_for_a_sensor_that_is_late_and_not_for_long(sensors, now_
     assert not sensors.is_behind(60 * MS)
     assert not sensors.is_behind(60 * MS, lag_ns=2 * MS)  # what comes next would tell little more
     assert sensors.is_behind(70 * MS)
-    now_s[0] += 1.1 * MAX_LATE_S
+    now_s[0] += 1.1 * LOOK_S
     assert not sensors.is_behind(70 * MS)
     now_s[0] += 1.0  # the sensor has fallen silent
     assert not sensors.is_behind(90 * MS)

@@ -34,18 +34,10 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
     solve_global,
 )
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
-from segfloor_ros.slam.places.known_views import views_near
-from segfloor_ros.slam.places.loops import (
-    LoopChecks,
-    LoopDetector,
-    Sightings,
-    drift,
-    match_of,
-    median_depth_m,
-)
-from segfloor_ros.slam.places.place_recognition import TIMES_SURE, PlaceRecognition, Relocaliser
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, OffsetEstimate, Rig, chi2_limit
+from segfloor_ros.slam.places.loops import LoopDetector, PlaceMatcher, drift
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
+from segfloor_ros.slam.results import NO_POINT, PROOF
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.sparse_map import (
     LINK_SIGMA,
@@ -60,6 +52,11 @@ from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
 
 STEPS = 20
+
+TIMES_SURE = 2
+"""Where nothing limits where a place can be, so many times the evidence of a loop is asked for:
+walls with the same paper, and shelves that stand twice in a building, are taken for one now and
+then."""
 
 OFFSET = 'disparity_offset'
 """What a map knows of the disparity offset, by name."""
@@ -249,37 +246,23 @@ class KnownMap:
         self._places = PlaceRecognition(self._map)
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
-        self._checks = LoopChecks(own, self._map)
-        self._sightings = Sightings(own, TIMES_SURE)
+        self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
 
     def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
-        match = self._look(keyframe, images)
+        anywhere = np.ones(len(self._map.keyframes), bool)
+        match = self._matcher.look(keyframe, images, anywhere, ~anywhere)
         is_possible = match is not None and self._is_possible(keyframe, match)
-        return self._sightings.add(match if is_possible else None)
+        return self._matcher.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
-        if self._of_drive and not self._checks.is_within_reach(match):
+        if self._of_drive and not self._matcher.is_within_reach(match):
             return False
-        return not self._checks.objection(keyframe, match)
+        return not self._matcher.objection(keyframe, match)
 
     def is_seen(self, images: Pixels, features: Features, stamp_ns: int) -> bool:
         """Whether enough frames in a row see the known map, this one the last of them."""
-        found = self._relocaliser.find_surely(images, features, stamp_ns)
-        return found is not None
-
-    def _look(self, keyframe: KeyframeRecord, images: Pixels) -> Match | None:
-        """Look for the view where the keyframes before saw it, else in the whole known map."""
-        features = keyframe.features
-        if self._sightings.matches:
-            pose = keyframe.T_camera_world @ drift(self._own, self._sightings.matches[-1])
-            depth_m = median_depth_m(self._own, keyframe)
-            around = self._map.points_of(views_near(self._map, pose, depth_m, NEIGHBOURS))
-            track = self._places.confirm(images, features, around, pose)
-        else:
-            track = self._relocaliser.find(images, features)
-        anywhere = np.ones(len(self._map.keyframes), bool)
-        return None if track is None else match_of(self._map, keyframe, track, anywhere)
+        return self._relocaliser.find(images, features, stamp_ns) is not None
 
     def _own_ids(self, match: Match) -> NDArray[np.int32]:
         """Return the stable ids (N,) that the points of a match have in the drive's own map, -1
@@ -295,7 +278,7 @@ class KnownMap:
         """Merge the drive's own map into the known one, with the same ids and stamps. Returns the
         words of all keyframes.
         """
-        matches = self._sightings.matches
+        matches = self._matcher.matches
         latest, own_ids = matches[-1], [self._own_ids(match) for match in matches]
         T_known_own = invert(drift(self._own, latest))
         before = len(self._map.keyframes)

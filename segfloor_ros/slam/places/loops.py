@@ -1,8 +1,9 @@
-"""Loops: a place of the map that is seen again after the path has drifted.
+"""Places that keyframes see again: of their own map after the path has drifted, a loop, or of a
+known one.
 
 Precision comes first: a loop that is missed costs drift, a false one costs the map. The place must
-lie where drift can have put it, several keyframes in a row must see it, each on its own, and they
-must agree on drift and floor, and see the same space from both sides.
+lie where drift can have put it, several keyframes must see it, each on its own, and they must agree
+on drift and floor, and see the same space from both sides.
 """
 
 from __future__ import annotations
@@ -17,18 +18,16 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.ground_views import motion_between, seen_ahead_m
-from segfloor_ros.slam.places.known_views import ALIKE_SHARE, views_near
+from segfloor_ros.slam.places.known_views import ALIKE_SHARE, novelty, views_near
 from segfloor_ros.slam.places.place_recognition import (
-    BEST_GROUPS,
     PlaceRecognition,
+    Sightings,
     greatest_speed_mps,
 )
-from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME, Track
-from segfloor_ros.slam.rig import MIN_DEPTH_M, NEIGHBOURS, SAME_PX, in_view
+from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME
+from segfloor_ros.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
 from segfloor_ros.slam.sparse_map import LINK_SIGMA, LOOP_FACTOR, KeyframeRecord, Match, SparseMap
-from segfloor_ros.slam.tracking.map_tracking import Pixels
-
-MAX_MISSES = 1
+from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 
 DRIFT_PER_M = 0.04, 0.01
 """Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
@@ -40,22 +39,11 @@ MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
 """Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
 as before: floors slope, and carts shake."""
 
-SAME_WAY = 0.7
-"""Cosine between two views up to which the same points are seen; beyond, the floor is."""
-
 IN_FRONT_SHARE = 0.1
 """A point is in front of another on its ray where its disparity is larger by this share."""
 
 MAX_SEEN_THROUGH = 0.2
 """Share of points that the other side may see through: edges hide what is behind by a few pixels.
-"""
-
-MIN_MOTION = 0.2, 0.2
-"""So far, in m or rad, the camera must have moved while it saw the place: what is alike from one
-place differs from the next."""
-
-AGREE = 0.05, 0.02
-"""Keyframes in a row must show the same drift up to this, in m and rad, at the depth of the view.
 """
 
 
@@ -79,74 +67,52 @@ class LoopDetector:
         self.candidates: list[Candidate] = []
         self._map = sparse_map
         self._places = places
-        self._checks = LoopChecks(sparse_map)
-        self.reset()
+        self._matcher = PlaceMatcher(sparse_map, sparse_map, places, PROOF)
 
     def reset(self) -> None:
         """Believe in no loop."""
-        self._sightings = Sightings(self._map)
+        self._matcher.reset()
 
     def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
         """Return the keyframes that see a place again, once there are enough of them, else none."""
         lengths = path_lengths(self._map, keyframe.index)
-        near, far = self._sides(keyframe, lengths)
-        known = self._map.points_of(np.flatnonzero(near))
-        look = self._follow if self._sightings.matches else self._find
-        match = look(keyframe, images, far, known) if far.any() else None
-        match = match or self._from_above(keyframe, ~near, lengths)
-        if match is None and not far.any():
-            self.reset()
+        near = self._linked(keyframe)
+        (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
+        reach_m, reach_rad = free_m + per_m * lengths, free_rad + rad_per_m * lengths
+        shown = self._places.shown_from(keyframe.T_world_camera, reach_m, reach_rad)
+        match = self._matcher.look(keyframe, images, ~near & shown, near)
+        match = match or self._from_above(keyframe, ~near, reach_m)
+        if match is not None:
+            reach = float(reach_m[match.place]), float(reach_rad[match.place])
+            objection = objection_to_drift(keyframe, match, reach)
+            objection = objection or self._matcher.objection(keyframe, match)
+            self._note(match, objection or 'seen')
+            match = None if objection else match
+        if not self._matcher.add(match):
             return []
-        is_sound = match is not None and self._is_sound(keyframe, match, lengths)
-        if not self._sightings.add(match if is_sound else None):
-            return []
-        matches = self._sightings.matches
+        matches = self._matcher.matches
         self._note(matches[-1], 'closed')
         self.reset()
         return matches
-
-    def _is_sound(self, keyframe: KeyframeRecord, match: Match, lengths: Array) -> bool:
-        length_m = float(lengths[match.place])
-        objection = self._checks.objection_to_drift(keyframe, match, length_m)
-        objection = objection or self._checks.objection(keyframe, match)
-        self._note(match, objection or 'seen')
-        return not objection
 
     def _note(self, match: Match, verdict: str) -> None:
         place = self._map.keyframes[match.place]
         T_keyframe_place = match.T_camera_world @ place.T_world_camera
         self.candidates.append(Candidate(match.keyframe, match.place, T_keyframe_place, verdict))
 
-    def _sides(
-        self, keyframe: KeyframeRecord, lengths: Array
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which keyframes (K,) a view is linked to already, and which of the others it may
-        have come back to.
-        """
-        keyframes = self._map.keyframes
+    def _linked(self, keyframe: KeyframeRecord) -> NDArray[np.bool_]:
+        """Return which keyframes (K,) a view is linked to already."""
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         linked, shared = self._map.covisible(own)
-        near = np.arange(len(keyframes)) > keyframe.index - NEIGHBOURS
+        near = np.arange(len(self._map.keyframes)) > keyframe.index - NEIGHBOURS
         near[linked[shared > max(ENOUGH, ALIKE_SHARE * len(own))]] = True
-        retired = np.array([k.retired is not None for k in keyframes])
-        return near, ~near & ~retired & self._within_drift(keyframe, lengths)
-
-    def _within_drift(self, keyframe: KeyframeRecord, lengths: Array) -> NDArray[np.bool_]:
-        """Return whether each keyframe (K,) stands so near that the path between may have drifted
-        by as much, and looks about the same way.
-        """
-        poses = invert(np.stack([k.T_camera_world for k in self._map.keyframes]))
-        distance = np.linalg.norm(poses[:, :3, 3] - keyframe.T_world_camera[:3, 3], axis=1)
-        cosine = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2]
-        reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths
-        # A view shows a place also from some way before and behind it.
-        return (distance < reach + 1.0) & (cosine > SAME_WAY)
+        return near
 
     def _from_above(
-        self, keyframe: KeyframeRecord, others: NDArray[np.bool_], lengths: Array
+        self, keyframe: KeyframeRecord, others: NDArray[np.bool_], reach_m: Array
     ) -> Match | None:
-        """Look for the floor of other keyframes (K,) that look another way; None where they do not
-        agree.
+        """Look for the floor of other keyframes (K,), within reach (K,), that look another way;
+        None where they do not agree.
         """
         mount, keyframes = self._map.rig.mount, self._map.keyframes
         if mount is None or not len(keyframe.ground.xy_m):
@@ -155,10 +121,9 @@ class LoopDetector:
         middle = T_left_base @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
         poses = invert(np.stack([k.T_camera_world for k in keyframes]))
         distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
-        turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= SAME_WAY
-        reach = FREE_DRIFT[0] + DRIFT_PER_M[0] * lengths + seen_ahead_m(mount)
+        turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= MIN_VIEW_COSINE
         shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
-        near = np.flatnonzero(others & turned & shown & (distance < reach))
+        near = np.flatnonzero(others & turned & shown & (distance < reach_m + seen_ahead_m(mount)))
         found: list[Match] = []
         nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
         for place in near[np.argsort(distance[near])][:PROOF].tolist():
@@ -168,44 +133,8 @@ class LoopDetector:
                 T_camera_place = T_left_base @ T_base_place @ mount.T_base_left
                 pose = T_camera_place @ keyframes[place].T_camera_world
                 found.append(Match(keyframe.index, place, pose, *nothing))
-        if not found:
-            return None
-        back = invert(found[0].T_camera_world)
-        agree = all(is_within(match.T_camera_world @ back, AGREE) for match in found[1:])
+        agree = found and all(self._matcher.agree(match, found[0]) for match in found[1:])
         return found[0] if agree else None
-
-    def _find(
-        self,
-        keyframe: KeyframeRecord,
-        images: Pixels,
-        far: NDArray[np.bool_],
-        known: NDArray[np.int32],
-    ) -> Match | None:
-        """Look for a place by its look."""
-        score = self._places.score(keyframe.features) * far
-        for group in self._places.groups(score, BEST_GROUPS):
-            ids = np.setdiff1d(self._map.points_of(group), known).astype(np.int32)
-            track = self._places.locate(images, keyframe.features, ids)
-            if track is not None:
-                return match_of(self._map, keyframe, track, far)
-        return None
-
-    def _follow(
-        self,
-        keyframe: KeyframeRecord,
-        images: Pixels,
-        far: NDArray[np.bool_],
-        known: NDArray[np.int32],
-    ) -> Match | None:
-        """Look for the place where the keyframes before saw it."""
-        pose = keyframe.T_camera_world @ drift(self._map, self._sightings.matches[-1])
-        around = views_near(
-            self._map, pose, median_depth_m(self._map, keyframe), len(self._map.keyframes)
-        )
-        around = around[far[around]][:NEIGHBOURS]
-        ids = np.setdiff1d(self._map.points_of(around), known).astype(np.int32)
-        track = self._places.confirm(images, keyframe.features, ids, pose)
-        return None if track is None else match_of(self._map, keyframe, track, far)
 
 
 def path_lengths(sparse_map: SparseMap, index: int) -> Array:
@@ -222,25 +151,86 @@ def path_lengths(sparse_map: SparseMap, index: int) -> Array:
     return np.asarray(dijkstra(graph, directed=False, indices=[index]))[0]
 
 
-class LoopChecks:
-    """Judges whether a keyframe can see a place: of its own map again, or of another, known one."""
+def objection_to_drift(keyframe: KeyframeRecord, match: Match, reach: tuple[float, float]) -> str:
+    """Return what speaks against a match in the same map: the path cannot have drifted so far, in m
+    and rad, or has not drifted; '' for nothing.
+    """
+    moved = match.T_camera_world @ keyframe.T_world_camera
+    if is_within(moved, (LOOP_FACTOR * LINK_SIGMA[0], LOOP_FACTOR * LINK_SIGMA[1])):
+        return 'no drift'
+    return '' if is_within(moved, reach) else 'more than drift'
 
-    def __init__(self, sparse_map: SparseMap, known: SparseMap | None = None) -> None:
-        self._map = sparse_map
-        self._camera = sparse_map.rig.camera
-        self._known = known or sparse_map
 
-    def objection_to_drift(self, keyframe: KeyframeRecord, match: Match, length_m: float) -> str:
-        """Return what speaks against a match in the same map: a way of length_m cannot have drifted
-        so far, or has not drifted; '' for nothing.
+class PlaceMatcher:
+    """Matches keyframes with the places of a known map, which may be their own, until enough of
+    them agree. needed: how many that are.
+    """
+
+    def __init__(
+        self, own: SparseMap, known: SparseMap, places: PlaceRecognition, needed: int
+    ) -> None:
+        self._map = own
+        self._camera = own.rig.camera
+        self._known = known
+        self._places = places
+        self._needed = needed
+        self._sightings: Sightings[Match] = Sightings(needed, self.agree)
+
+    def reset(self) -> None:
+        """Believe in no place."""
+        self._sightings.reset()
+
+    @property
+    def matches(self) -> list[Match]:
+        """The keyframes that see the place, the latest last."""
+        return self._sightings.views
+
+    def look(
+        self,
+        keyframe: KeyframeRecord,
+        images: Pixels,
+        may_show: NDArray[np.bool_],
+        near: NDArray[np.bool_],
+    ) -> Match | None:
+        """Look for the place where the keyframes before saw it, else by its look. may_show, near:
+        which keyframes (K,) of the known map may be of the place, and which are of the view itself.
         """
-        moved = match.T_camera_world @ keyframe.T_world_camera
-        sigma_m, sigma_rad = LINK_SIGMA
-        if is_within(moved, (LOOP_FACTOR * sigma_m, LOOP_FACTOR * sigma_rad)):
-            return 'no drift'
-        (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
-        reach = free_m + per_m * length_m, free_rad + rad_per_m * length_m
-        return '' if is_within(moved, reach) else 'more than drift'
+        own_ids, track = self._known.points_of(np.flatnonzero(near)), None
+        if self.matches:
+            pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
+            depth_m = median_depth_m(self._map, keyframe)
+            around = views_near(self._known, pose, depth_m, len(may_show))
+            ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
+            track = self._places.confirm(images, keyframe.features, ids, pose)
+        if track is None:
+            track = self._places.find(images, keyframe.features, may_show, own_ids)
+        if track is None:
+            return None
+        assert track.observed is not None
+        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
+        ids = track.observed.point_id[rows]
+        order, _ = self._known.covisible(ids)
+        place = int(order[may_show[order]][0])
+        stable_ids = self._known.stable_id[ids]
+        return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids)
+
+    def add(self, match: Match | None) -> bool:
+        """Take in what the next keyframe sees of the place; returns whether enough of them agree,
+        over a motion that makes each of so many views a new one.
+        """
+        if not self._sightings.add(match):
+            return False
+        first, latest = self.matches[0], self.matches[-1]
+        depth_m = median_depth_m(self._map, self._map.keyframes[latest.keyframe])
+        motion = latest.T_camera_world @ invert(first.T_camera_world)
+        return bool(novelty(motion, depth_m) >= self._needed - 1)
+
+    def agree(self, before: Match, latest: Match) -> bool:
+        """Whether two keyframes show the same drift, up to what two loops err."""
+        now = self._map.keyframes[latest.keyframe].T_camera_world
+        gap = now @ drift(self._map, before) @ invert(latest.T_camera_world)
+        sigmas = np.sqrt(2 * chi2_limit(6, GATE)) * LOOP_FACTOR
+        return is_within(gap, (sigmas * LINK_SIGMA[0], sigmas * LINK_SIGMA[1]))
 
     def is_within_reach(self, match: Match) -> bool:
         """Whether the robot can have come there while it was lost: from the last keyframe of the
@@ -326,60 +316,6 @@ class LoopChecks:
         behind = uvd_seen[np.asarray(near)[beside], 2]
         margin = np.maximum(SAME_PX, IN_FRONT_SHARE * behind)
         return float((uvd[beside, 2] - behind > margin).mean())
-
-
-def match_of(
-    known: SparseMap, keyframe: KeyframeRecord, track: Track, may_be: NDArray[np.bool_]
-) -> Match | None:
-    """Return what a keyframe that was found in a map sees of it. may_be: which keyframes of the map
-    (K,) may be the place; None where none of them sees the same.
-    """
-    assert track.observed is not None
-    rows = np.flatnonzero(track.observed.point_id != NO_POINT)
-    ids = track.observed.point_id[rows]
-    order, _ = known.covisible(ids)
-    order = order[may_be[order]]
-    if len(order) == 0:
-        return None
-    stable_ids = known.stable_id[ids]
-    return Match(keyframe.index, int(order[0]), track.T_camera_world, rows, ids, stable_ids)
-
-
-class Sightings:
-    """Keyframes in a row, all but `MAX_MISSES`, that see a place. times: as many of them, over as
-    long a motion, are asked for as for a loop.
-    """
-
-    def __init__(self, sparse_map: SparseMap, times: int = 1) -> None:
-        self.matches: list[Match] = []
-        self._map = sparse_map
-        self._times = times
-        self._misses = 0
-
-    def add(self, match: Match | None) -> bool:
-        """Take in what the next keyframe sees of the place; returns whether enough of them agree,
-        over enough of a motion.
-        """
-        self._misses = self._misses + 1 if match is None else 0
-        if match is not None:
-            self.matches.append(match)
-        elif self._misses > MAX_MISSES:
-            self.matches = []
-        return self._are_certain()
-
-    def _are_certain(self) -> bool:
-        if len(self.matches) < self._times * PROOF:
-            return False
-        latest = self.matches[-1]
-        motion = latest.T_camera_world @ invert(self.matches[0].T_camera_world)
-        if is_within(motion, (self._times * MIN_MOTION[0], self._times * MIN_MOTION[1])):
-            return False
-        keyframe = self._map.keyframes[latest.keyframe]
-        reach = AGREE[0] + AGREE[1] * median_depth_m(self._map, keyframe), AGREE[1]
-        # Both drifts, at the latest keyframe.
-        back = invert(latest.T_camera_world)
-        gaps = (keyframe.T_camera_world @ drift(self._map, m) @ back for m in self.matches[:-1])
-        return all(is_within(gap, reach) for gap in gaps)
 
 
 def drift(sparse_map: SparseMap, match: Match) -> Array:

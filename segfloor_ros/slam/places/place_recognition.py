@@ -1,4 +1,5 @@
-"""Place recognition: which keyframes look like a view, and whether it truly is the same place.
+"""Place recognition: which keyframes look like a view, whether it truly is the same place, and
+whether several views agree that it is.
 
 Candidates come from binary words, grouped by covisibility (Mur-Artal and Tardos, Fast
 Relocalisation and Loop Closing in Keyframe-Based SLAM, ICRA 2014). Buildings repeat themselves:
@@ -21,6 +22,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Sequence
 from importlib import resources
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +31,11 @@ from scipy.spatial import cKDTree
 from segfloor_ros.files.results import Arrays, joined, split
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.known_views import COLUMNS, ROWS
-from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, SAME, Track
+from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.features import Features, hamming
-from segfloor_ros.slam.tracking.map_tracking import Pixels, Tracker
+from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 
 FILE = 'vocabulary.npy'
 BRANCHES, LEVELS = 30, 3
@@ -47,22 +49,11 @@ carried at a walking pace.
 BEST_GROUPS = 2
 """Places tried with every frame; one more is tried in turn: words alone are not sure."""
 
-TIMES_SURE = 2
-"""Where nothing limits where a place can be, so many times the evidence is asked for: walls with
-the same paper, and shelves that stand twice in a building, are taken for one now and then. Of the
-frames of a camera that is lost, away from where it was lost, each as far from where the one before
-found it as it can have moved since; of keyframes that see a known map, as many times those of a
-loop."""
-
-MIN_AGREEMENT = 0.7
-"""Share of the parts of the image that must show what is expected in each of these frames."""
-
 NARROW_SEARCHES = 100
 """Frames for which only the neighbourhood of a given pose is searched: it may be wrong."""
 
-VIEW_REACH = 2.0, 1.0
-"""A view shows a place also from so far, in m, before or behind where a keyframe stands, and turned
-by so many radians."""
+VIEW_REACH_M = 2.0
+"""A view shows a place also from so far before or behind where a keyframe stands."""
 
 
 class PlaceRecognition:
@@ -75,6 +66,7 @@ class PlaceRecognition:
         self._vocabulary = Vocabulary.load()
         self._index = PlaceIndex()
         self._latest: tuple[Features, NDArray[np.int32]] | None = None
+        self._turn = 0
 
     def add(self, keyframe: KeyframeRecord) -> None:
         """Take in a keyframe."""
@@ -134,6 +126,52 @@ class PlaceRecognition:
         others = others[score[others] > 0][: LOCAL_KEYFRAMES - 1]
         return np.append(index, others).astype(np.intp)
 
+    def shown_from(
+        self, T_world_camera: Array, reach_m: Array | float, reach_rad: Array | float
+    ) -> NDArray[np.bool_]:
+        """Return which keyframes (K,) may show what a camera sees that stands within reach of a
+        pose (4, 4).
+        """
+        poses = invert(np.stack([k.T_camera_world for k in self._map.keyframes]))
+        distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
+        alike = turned < reach_rad + np.arccos(MIN_VIEW_COSINE)
+        return np.asarray((distance < reach_m + VIEW_REACH_M) & alike)
+
+    def find(
+        self,
+        images: Pixels,
+        features: Features,
+        may_show: NDArray[np.bool_],
+        own_ids: NDArray[np.int32] | tuple[()] = (),
+        is_possible: Callable[[Array], bool] = lambda T_camera_world: True,
+    ) -> Track | None:
+        """Return a view with its pose; None where no place is seen, or two that look alike.
+
+        may_show: which keyframes (K,) may be of the place. own_ids: points (N,) that are none of
+        the place's. is_possible: whether the camera can be at a pose T_camera_world (4, 4).
+        """
+        groups = self.groups(self.score(features) * may_show, LOCAL_KEYFRAMES)
+        chosen, others = groups[:BEST_GROUPS], groups[BEST_GROUPS:]
+        if others:
+            chosen.append(others[self._turn % len(others)])
+            self._turn += 1
+        found = []
+        for group in chosen:
+            track = self.locate(images, features, self.points_of(group, own_ids))
+            if track is not None and is_possible(track.T_camera_world):
+                found.append(track)
+        if not found or any(_differ(found[0], other) for other in found[1:]):
+            return None
+        return max(found, key=lambda track: len(track.point_ids))
+
+    def points_of(
+        self, keyframes: NDArray[np.intp], own_ids: NDArray[np.int32] | tuple[()]
+    ) -> NDArray[np.int32]:
+        """Return the points of keyframes without some (N,)."""
+        ids = self._map.points_of(keyframes)
+        return ids[~np.isin(ids, own_ids)]
+
     def locate(self, images: Pixels, features: Features, ids: NDArray[np.int32]) -> Track | None:
         """Find a camera among points `ids` (N,); None unless it sees them."""
         observations = self._tracker.pixel_observations(features)
@@ -153,23 +191,19 @@ class PlaceRecognition:
         return track if track is not None and self.is_same_place(track) else None
 
     def is_same_place(self, track: Track) -> bool:
-        """Whether a frame shows enough of what it should, all over the image."""
+        """Whether a frame shows enough of what it should, and in most parts of the image more of it
+        than by chance.
+        """
         found, expected = len(track.point_ids), len(track.visible_ids)
         if found < ENOUGH or found < CHANCE_SHARE * expected:
             return False
-        return self.agreement(track) >= MOST
-
-    def agreement(self, track: Track) -> float:
-        """Return the share of the parts of the image that show what is expected there, by more than
-        chance; 0 where no part expects enough.
-        """
         seen, there = (
             self._per_cell(self._map.xyz_world[ids], track.T_camera_world)
             for ids in (track.point_ids, track.visible_ids)
         )
         full = there >= ENOUGH // 2
         agree = seen - np.sqrt(seen) >= 0.5 * CHANCE_SHARE * there
-        return float(agree[full].mean()) if full.any() else 0.0
+        return bool(full.any() and agree[full].mean() >= MOST)
 
     def _per_cell(self, xyz_world: Array, T_camera_world: Array) -> NDArray[np.intp]:
         """Return how many of points (N, 3) lie in each part (COLUMNS * ROWS,) of the image."""
@@ -261,21 +295,49 @@ def greatest_speed_mps(keyframes: Sequence[KeyframeRecord]) -> float:
     return SPEED_FACTOR * float(speeds.max(initial=LEAST_SPEED_MPS))
 
 
+View = TypeVar('View')
+
+
+class Sightings(Generic[View]):
+    """Views that see a place and agree with the latest of them where that is. `needed` of them are
+    proof; a view that does not see the place takes the oldest away. agree: of an earlier view and
+    the latest.
+    """
+
+    def __init__(self, needed: int, agree: Callable[[View, View], bool]) -> None:
+        self._needed = needed
+        self._agree = agree
+        self.reset()
+
+    def reset(self) -> None:
+        """Know of no view."""
+        self.views: list[View] = []
+
+    def add(self, view: View | None) -> bool:
+        """Take in the next view, None for one that does not see the place; returns whether it is
+        proven.
+        """
+        if view is None:
+            self.views = self.views[1:]
+            return False
+        self.views = [*(before for before in self.views if self._agree(before, view)), view]
+        return len(self.views) >= self._needed
+
+
 class Relocaliser:
-    """Looks for a view in the map, some places per frame."""
+    """Looks for a camera that does not know where it is in the whole map."""
 
     def __init__(self, sparse_map: SparseMap, places: PlaceRecognition) -> None:
         self._map = sparse_map
         self._places = places
-        self._turn = 0
+        self._sightings = Sightings(PROOF, self._can_have_moved)
         self.reset()
 
     def reset(self) -> None:
         """Search the whole map, and forget what was found in it."""
         self._near: tuple[Array, tuple[float, float]] | None = None
         self._searches_left = 0
-        self._last_found: tuple[int, Array] | None = None
-        self._in_a_row = 0
+        self._sightings.reset()
 
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look around a pose (4, 4) alone, for some time or until the camera is found."""
@@ -287,80 +349,43 @@ class Relocaliser:
         """Whether only the neighbourhood of a given pose is searched."""
         return self._near is not None and self._searches_left > 0
 
-    def find_surely(
+    def find(
         self,
         images: Pixels,
         features: Features,
         stamp_ns: int,
-        is_possible: Callable[[Array], bool] | None = None,
+        is_possible: Callable[[Array], bool] = lambda T_camera_world: True,
         lost_at: Array | None = None,
     ) -> Track | None:
-        """Return a frame with its pose as `find` does; None until enough frames in a row are found
-        there, or one around a given pose or where the camera was lost (T_camera_world, (4, 4)).
+        """Return a frame with its pose; None until several agree, or one is found around a given
+        pose or where the camera was lost (T_camera_world, (4, 4)).
         """
-        given = self.is_narrow
-        found = self.find(images, features, is_possible)
-        expected = found is not None and (given or _follows(found, lost_at, SAME[0]))
-        if found is None or not (expected or self._places.agreement(found) >= MIN_AGREEMENT):
-            self._last_found, self._in_a_row = None, 0
+        given = self._near if self.is_narrow else None
+        may_show = np.ones(len(self._map.keyframes), bool)
+        if given is not None:
+            self._searches_left -= 1
+            may_show = self._places.shown_from(given[0], *given[1])
+
+        def may_be(pose: Array) -> bool:
+            return is_possible(pose) and (given is None or is_within(pose @ given[0], given[1]))
+
+        found = self._places.find(images, features, may_show, is_possible=may_be)
+        if found is None:
+            self._sightings.add(None)
             return None
-        before_ns, last = self._last_found or (stamp_ns, None)
-        way_m = greatest_speed_mps(self._map.keyframes) * 1e-9 * (stamp_ns - before_ns)
-        self._in_a_row = self._in_a_row + 1 if _follows(found, last, SAME[0] + way_m) else 1
-        self._last_found = stamp_ns, found.T_camera_world
-        if self._in_a_row < TIMES_SURE and not expected:
+        pose = found.T_camera_world
+        is_proven = self._sightings.add((stamp_ns, pose))
+        is_expected = lost_at is not None and is_within(pose @ invert(lost_at), SAME)
+        if not (is_proven or is_expected or given is not None):
             return None
-        self._last_found, self._near = None, None
+        self.reset()
         return found
 
-    def find(
-        self, images: Pixels, features: Features, is_possible: Callable[[Array], bool] | None = None
-    ) -> Track | None:
-        """Return a frame with its pose; None where no place of the map is seen, or two that look
-        alike. is_possible: whether the camera can be at a pose T_camera_world (4, 4).
-        """
-        score = self._places.score(features) * self._allowed()
-        groups = self._places.groups(score, LOCAL_KEYFRAMES)
-        chosen, others = groups[:BEST_GROUPS], groups[BEST_GROUPS:]
-        if others:
-            chosen.append(others[self._turn % len(others)])
-            self._turn += 1
-        found = []
-        for group in chosen:
-            ids = self._map.points_of(group)
-            track = self._places.locate(images, features, ids)
-            if track is None or not self._is_near(track):
-                continue
-            if is_possible is None or is_possible(track.T_camera_world):
-                found.append(track)
-        if not found or any(_differ(found[0], other) for other in found[1:]):
-            return None
-        return max(found, key=lambda track: len(track.point_ids))
-
-    def _allowed(self) -> NDArray[np.bool_]:
-        """Return the keyframes (K,) that may show where the camera is."""
-        keyframes = self._map.keyframes
-        if self._near is None or self._searches_left == 0:
-            return np.ones(len(keyframes), bool)
-        self._searches_left -= 1
-        T_world_camera, (reach_m, reach_rad) = self._near
-        poses = np.stack([k.T_world_camera for k in keyframes])
-        distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
-        turned = np.arccos(np.clip(poses[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
-        return (distance < reach_m + VIEW_REACH[0]) & (turned < reach_rad + VIEW_REACH[1])
-
-    def _is_near(self, track: Track) -> bool:
-        if self._near is None or self._searches_left == 0:
-            return True
-        T_world_camera, reach = self._near
-        return is_within(track.T_camera_world @ T_world_camera, reach)
-
-
-def _follows(found: Track, T_camera_world: Array | None, reach_m: float) -> bool:
-    """Whether a frame is within reach of where a camera was before (4, 4), if that is known."""
-    if T_camera_world is None:
-        return False
-    return is_within(found.T_camera_world @ invert(T_camera_world), (reach_m, 2 * SAME[1]))
+    def _can_have_moved(self, before: tuple[int, Array], now: tuple[int, Array]) -> bool:
+        """Whether a camera can have come from one pose, with its stamp, to another."""
+        seconds = 1e-9 * (now[0] - before[0])
+        way = greatest_speed_mps(self._map.keyframes) * seconds
+        return is_within(now[1] @ invert(before[1]), (SAME[0] + way, SAME[1] + way))
 
 
 def _differ(a: Track, b: Track) -> bool:

@@ -25,6 +25,10 @@ MOMENT_NS = 1_000_000_000
 """What lies further back belongs to another situation: stamps that jump back by more begin a new
 recording, and wheels that slipped are believed again."""
 
+STEP_NS = 500_000_000
+"""Between two looks at what changes slowly: three poses so far apart show where up is, for errors
+of millimetres in their place are little then. Wheels are asked for a pose as often at least."""
+
 KEPT_NS = 40 * MOMENT_NS
 """How long samples are kept."""
 

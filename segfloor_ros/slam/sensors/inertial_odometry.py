@@ -19,7 +19,7 @@ from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import Array, rotation_angle
 from segfloor_ros.slam.results import PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.slam.rig import is_gated
-from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, STEP_NS, Gyroscope
 
 SIGMA_SEEN_M = 0.003
 """Error of the place of a frame as the images show it."""
@@ -33,10 +33,6 @@ SIGMA_INTEGRATED = 0.01
 
 FIRST_ERROR_SIGMA_M_S2, ERROR_DRIFT = 0.1, 0.01
 """Error of the acceleration freed of gravity, m/s², and its drift, m/s² per root second."""
-
-STEP_NS = 500_000_000
-"""Time between two of the poses: errors of millimetres in their place are little then, and little
-is lost where the images fail."""
 
 MAX_TURN_RAD = 0.5
 """Turn between two of the poses: in a fast one the IMU measures its own circle."""

@@ -10,17 +10,14 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.geometry import Array, between, invert, make_transform
 from segfloor_ros.slam.rig import GATE, chi2_limit
-from segfloor_ros.slam.sensors.gyroscope import LATE_NS, TimedSeries, is_late, lag_in_words
-
-MAX_GAP_NS = 500_000_000
-"""Time between two poses: drivers publish two a second at least."""
+from segfloor_ros.slam.sensors.gyroscope import LATE_NS, STEP_NS, TimedSeries, is_late, lag_in_words
 
 
 class WheelOdometry:
     """The latest poses that the wheels measured."""
 
     def __init__(self) -> None:
-        self._poses: TimedSeries[WheelPose] = TimedSeries(MAX_GAP_NS)
+        self._poses: TimedSeries[WheelPose] = TimedSeries(STEP_NS)
 
     def add(self, pose: WheelPose) -> None:
         """Take in a pose."""

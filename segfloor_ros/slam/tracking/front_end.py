@@ -45,14 +45,11 @@ from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_no
 from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
 from segfloor_ros.timing import timed
 
-FEW_POINTS = 50
-"""Wheels measure the pose better than fewer points, spread over the image, that do not slide along
-edges, and an IMU alone better than half as many."""
-
 PLENTY = 100
 """With so many points in view the place is certain enough, whatever they are, also where the
 sensors have the camera somewhere else: wheels slip. A view that begins anew needs twice as many: it
-may be of another place."""
+may be of another place. Wheels measure the pose better than fewer than half of them, spread over
+the image, that do not slide along edges, and an IMU alone better than fewer than a quarter."""
 
 
 class FrontEnd:
@@ -165,7 +162,7 @@ class FrontEnd:
             return motion.is_heading_possible(pose, stamp_ns)
         measured = motion.measured(stamp_ns)
         by_imu = measured is not None and measured.source == 'IMU'
-        few = FEW_POINTS if motion.prior(stamp_ns) else FEW_POINTS // 2 if by_imu else 0
+        few = PLENTY // 2 if motion.prior(stamp_ns) else PLENTY // 4 if by_imu else 0
         if few and count_firm(images.left, track.uv_px) < few:
             return False
         if motion.is_consistent(pose, track.covariance, stamp_ns):
@@ -255,7 +252,7 @@ class FrontEnd:
         is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
         lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
         lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
-        found = self._relocaliser.find_surely(images, features, stamp_ns, is_possible, lost_at)
+        found = self._relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
         if found is None:
             return None
         pose = found.T_camera_world

@@ -12,7 +12,7 @@ from segfloor_ros.floor.plane.mount import MAX_KEYFRAMES, MountEstimator, disagr
 from segfloor_ros.floor.plane.plane import mean_climb
 from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.stereo_slam import LOOK_NS
+from segfloor_ros.slam.sensors.gyroscope import STEP_NS
 
 
 def estimate(scene: Scene, **known) -> Mount | None:
@@ -282,7 +282,7 @@ def test_a_camera_that_stands_has_a_mount_too():
     results = []
     for i in range(MAX_KEYFRAMES):
         left, right, _, _ = replace(scene, seed=i).render()
-        results += slam.process(StereoFrame(i, i * LOOK_NS, left, right))
+        results += slam.process(StereoFrame(i, i * STEP_NS, left, right))
     assert len(slam.map.keyframes) == 1
     assert slam.mount is not None
     assert slam.mount.height_m == pytest.approx(0.3, rel=0.03)

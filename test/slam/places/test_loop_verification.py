@@ -8,8 +8,9 @@ from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.places.loops import LoopChecks, Sightings
-from segfloor_ros.slam.results import NO_POINT
+from segfloor_ros.slam.places.loops import DRIFT_PER_M, FREE_DRIFT, PlaceMatcher, objection_to_drift
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition
+from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.sparse_map import Match, SparseMap
 
@@ -17,6 +18,12 @@ MOUNT = Mount(0.4, 0.15)
 POINTS = SCENES['wall']
 ROWS = np.arange(len(POINTS))
 NONE = np.zeros(0, np.int32)
+REACH = tuple(free + 5.0 * per_m for free, per_m in zip(FREE_DRIFT, DRIFT_PER_M, strict=True))
+"""How far a way of 5 m can have drifted."""
+
+
+def matcher(sparse_map):
+    return PlaceMatcher(sparse_map, sparse_map, PlaceRecognition(sparse_map), PROOF)
 
 
 def objection(centre, drift, own=ROWS, farther=0.0):
@@ -36,8 +43,7 @@ def objection(centre, drift, own=ROWS, farther=0.0):
     pose = make_transform(np.eye(3), -centre)
     match = Match(1, 0, pose, ROWS, ROWS.astype(np.int32), ROWS.astype(np.int32))
     sparse_map.xyz_world[ROWS] *= 1.0 - farther
-    checks = LoopChecks(sparse_map)
-    return checks.objection_to_drift(now, match, 5.0) or checks.objection(now, match)
+    return objection_to_drift(now, match, REACH) or matcher(sparse_map).objection(now, match)
 
 
 def test_a_place_seen_again_after_a_drift_is_sound():
@@ -79,7 +85,7 @@ def test_free_space_does_not_run_through_what_stands_there():
 )
 def test_three_keyframes_on_the_move_must_show_the_same_drift(views, drifts_m, expected):
     sparse_map = row_of_views(26, list(range(10)), 0.1)
-    sightings = Sightings(sparse_map)
+    sightings = matcher(sparse_map)
     for index, drift_m in zip(views, drifts_m, strict=True):
         drift = se3_exp(np.array([drift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
         pose = sparse_map.keyframes[index].T_camera_world @ drift

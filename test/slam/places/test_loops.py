@@ -10,8 +10,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import plan_closing
-from segfloor_ros.slam.places.loops import LoopChecks
-from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.slam.places.loops import PlaceMatcher
+from segfloor_ros.slam.results import PROOF, StereoSlamSettings
 from segfloor_ros.slam.sparse_map import Match
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
@@ -91,7 +91,8 @@ def test_a_robot_that_is_back_stands_on_the_same_floor(closed, up_m, tilt_rad, e
     none = np.zeros(0, np.int32)
     pose = invert(T_place_now) @ place.T_camera_world
     match = Match(1, 0, pose, none, none, none)
-    assert LoopChecks(slam.map).is_level(match) is expected
+    matcher = PlaceMatcher(slam.map, slam.map, slam.back_end.places, PROOF)
+    assert matcher.is_level(match) is expected
 
 
 def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
