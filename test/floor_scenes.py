@@ -79,15 +79,20 @@ class Scene:
                 np.array(side) for side in (patch.first, patch.second, patch.corner)
             )
 
-            def along_rays(direction: np.ndarray) -> np.ndarray:
-                """Return the products of a direction with the rays of all pixels."""
+            seen = self._pixels(patch, origin, x, y)
+            x_seen, y_seen = x[:, seen[1]], y[seen[0]]
+
+            def along_rays(
+                direction: np.ndarray, x: np.ndarray = x_seen, y: np.ndarray = y_seen
+            ) -> np.ndarray:
+                """Return the products of a direction with the rays of the pixels."""
                 a, b, c = (direction @ T[:3, :3]).astype(np.float32)
                 return a * x + (b * y + c)
 
             normal = np.cross(first, second)
             with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
                 depth = np.float32(normal @ (corner - origin)) / along_rays(normal)
-                inside = (depth > 0.05) & (depth < nearest)
+                inside = (depth > 0.05) & (depth < nearest[seen])
                 sides = []
                 for side in (first / (first @ first), second / (second @ second)):
                     share = depth * along_rays(side) + np.float32(side @ (origin - corner))
@@ -95,14 +100,31 @@ class Scene:
                     sides.append(share)
             s, t = (share[inside] for share in sides)
             texture = self._texture(patch, s * np.linalg.norm(first), t * np.linalg.norm(second))
-            grey[inside] = patch.grey + patch.contrast * texture
-            floor[inside], nearest[inside] = patch.is_floor, depth[inside]
+            grey[seen][inside] = patch.grey + patch.contrast * texture
+            floor[seen][inside], nearest[seen][inside] = patch.is_floor, depth[inside]
         if self.reflectance:
             standing = [patch.below() for patch in self.patches if not patch.is_floor]
             below = replace(self, patches=standing, reflectance=0.0)._cast(offset_m)[0]
             grey[floor] += self.reflectance * (below - grey)[floor]
         middle = np.s_[n // 2 :: n, n // 2 :: n]
         return grey, floor[middle], nearest[middle].astype(np.float64)
+
+    def _pixels(
+        self, patch: Patch, origin: np.ndarray, x: np.ndarray, y: np.ndarray
+    ) -> tuple[slice, slice]:
+        """Return the rows and columns around a patch: all where it comes close to the camera."""
+        sides = np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) @ np.array([patch.first, patch.second])
+        corners = (patch.corner + sides - origin) @ self.mount.T_base_left[:3, :3]
+        if corners[:, 2].min() < 0.05:
+            return slice(None), slice(None)
+        u, v = (corners[:, :2] / corners[:, 2:]).T
+        rows, columns = (
+            slice(
+                max(0, np.searchsorted(at, range_.min()) - 1), np.searchsorted(at, range_.max()) + 1
+            )
+            for at, range_ in ((y.ravel(), v), (x.ravel(), u))
+        )
+        return rows, columns
 
     def _texture(self, patch: Patch, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         scale = TILE_PX / self.texture_m / 2
