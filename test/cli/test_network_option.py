@@ -86,6 +86,7 @@ def test_a_file_that_is_no_network_ends_run_and_replay_in_one_line(tmp_path, dri
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.slow
 def test_replay_runs_the_network_beside_the_five_nodes(tmp_path, drive):
     pytest.importorskip('rclpy')
     roles = {'moves': ['person'], 'floor': ['floor']}

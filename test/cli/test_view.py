@@ -58,6 +58,7 @@ def values(path, entity: str, component: str) -> list:
     return columns[-1].to_pylist()[-1]
 
 
+@pytest.mark.slow
 def test_a_view_changes_no_result(recording, run, tmp_path):
     done = segfloor_process('run', recording, '--out', tmp_path / 'alone')
     assert done.returncode == 0, done.stderr

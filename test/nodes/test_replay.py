@@ -139,6 +139,7 @@ def test_a_path_alone_is_that_of_the_run(drive, tmp_path) -> None:
     assert (run['map'], run['camera_height_m'], run['tracked_frames']) == (None, None, FRAMES)
 
 
+@pytest.mark.slow
 def test_eyes_that_are_exchanged_are_said_also_where_no_map_comes_of_it(tmp_path) -> None:
     frames = [replace(f, left=f.right, right=f.left) for f in room_drive(5)[0]]
     drive = write_kitti(tmp_path / 'exchanged', frames)
@@ -227,6 +228,7 @@ def test_an_interrupt_leaves_nothing_behind(drive, tmp_path, stop) -> None:
 
 
 @pytest.mark.parametrize('stop', STOPS)
+@pytest.mark.slow
 def test_an_interrupt_while_mapping_keeps_the_map(drive, tmp_path, stop) -> None:
     out = tmp_path / 'out'
     replay = start('replay', drive, '--out', out, '--rate', 0.2)

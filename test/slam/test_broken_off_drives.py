@@ -109,6 +109,7 @@ def test_wheels_tell_the_way_that_nobody_saw(frames):
         assert sigma_m(result) < 0.1
 
 
+@pytest.mark.slow
 def test_what_is_mapped_elsewhere_merges_when_the_map_is_recognised(frames):
     """The robot turned while nobody saw it; then it turns back to what is known."""
     slam, _ = broken_off(frames[:FRAMES])

@@ -186,6 +186,7 @@ def test_a_search_around_a_pose_finds_the_camera_there_alone(mapped):
     assert not slam.process(ROOM.frame(5, here))[0].tracked
 
 
+@pytest.mark.slow
 def test_a_drive_that_starts_elsewhere_joins_the_map_once_it_recognises_it(mapped):
     slam = loaded(mapped, localize=False)
     # It looks at the wall behind, then turns to what is known.

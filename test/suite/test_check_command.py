@@ -220,6 +220,7 @@ def test_a_recording_is_not_taken_for_its_results(room, tmp_path, monkeypatch):
     assert (tmp_path / 'out' / 'aisle' / 'floor_masks' / 'mine').read_text() == 'mine'
 
 
+@pytest.mark.slow
 def test_a_recording_that_fails_keeps_the_results_of_last_time(room, tmp_path):
     out = tmp_path / 'out'
     recording = tmp_path / 'good'

@@ -131,6 +131,7 @@ def test_a_killed_check_leaves_nothing(room, tmp_path, number, jobs):
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_fails_its_recording_alone(room, tmp_path):
     options = '--out', str(tmp_path / 'out'), '--jobs', '2'
     check = start_check(room, tmp_path, *options, names=NAMES[:2])

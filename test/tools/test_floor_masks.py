@@ -60,6 +60,7 @@ def test_scenes_can_be_opened(name):
     assert np.degrees(mount.roll_rad) == pytest.approx(scene.camera.roll_deg)
 
 
+@pytest.mark.slow
 def test_a_low_box_is_not_floor(tmp_path):
     scene, started = open_scene('low_box'), []
 

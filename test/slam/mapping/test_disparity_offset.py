@@ -17,7 +17,10 @@ from segfloor_ros.slam.rig import EXPECTED_SIGMA_PX, DisparityOffset, OffsetEsti
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 FRAMES, TURNED_FRAMES = 40, 21
-BENT = {'textured': (0, 60.0, 0.25), 'weaker texture, bent the other way': (5, 35.0, -0.25)}
+BENT = [
+    pytest.param(0, 60.0, 0.25, id='textured'),
+    pytest.param(5, 35.0, -0.25, id='weaker texture, bent the other way', marks=pytest.mark.slow),
+]
 """Seed and contrast of a room, and the offset of the rig in it."""
 
 
@@ -115,7 +118,7 @@ def length(results):
     return float(np.linalg.norm(last[:3, 3]))
 
 
-@pytest.mark.parametrize(('seed', 'contrast', 'offset_px'), BENT.values(), ids=BENT)
+@pytest.mark.parametrize(('seed', 'contrast', 'offset_px'), BENT)
 def test_a_bent_rig_is_found_and_its_distances_put_right(seed, contrast, offset_px):
     room = {'seed': seed, 'contrast': contrast}
     slam, results = room_drive(offset_px, **room)
@@ -131,6 +134,7 @@ def test_an_exact_rig_stays_exact():
     assert length(results) == pytest.approx(1.95, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_turn_on_the_spot_shows_little_and_changes_little():
     offsets = []
     for step in np.radians([1.5, 2.0, 2.5]):

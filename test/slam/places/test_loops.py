@@ -71,6 +71,7 @@ def test_both_ends_become_one_map(closed):
     assert shared[order < 8].max(initial=0) > 50
 
 
+@pytest.mark.slow
 def test_more_drift_than_a_path_can_have_is_no_loop():
     slam, _ = drive(np.array([0.8, 0.0, 0.6, 0.0, 0.0, 0.0]))
     assert slam.back_end.loop_count == 0

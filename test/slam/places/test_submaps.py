@@ -85,7 +85,9 @@ def test_the_odometry_goes_on_where_the_camera_got_lost(merged):
     assert np.linalg.norm(np.diff(odom[:, :3, 3], axis=0), axis=1).max() < 0.1
 
 
-@pytest.mark.parametrize('waited_s, is_there', [(0, False), (10, True)])
+@pytest.mark.parametrize(
+    'waited_s, is_there', [pytest.param(0, False, marks=pytest.mark.slow), (10, True)]
+)
 def test_a_submap_is_merged_only_where_the_robot_can_have_driven(waited_s, is_there):
     """What it sees 1.6 s after it got lost looks like a place 4 m away."""
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)

@@ -134,6 +134,7 @@ def test_wheels_that_slip_while_the_camera_sees_are_found_out_and_cost_nothing(f
     assert slam.sensors.slips >= 2
 
 
+@pytest.mark.slow
 def test_a_wrong_scale_is_said_and_taken_into_account():
     # Left and right in turn: on a single arc the scale looks like a camera beside the middle.
     path = [planar_pose(0, 0, 0)]
