@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 
+Pose2d = tuple[float, float, float]
+"""x and y in metres, yaw in radians."""
+
 R_ROS_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Maps optical axes to ROS axes: (x, y, z)_ros = (z, -x, -y)_optical."""
 

@@ -17,9 +17,9 @@ from rich.text import Text
 from segfloor_ros.cli.terminal import View, console, figure_table, print_error, within
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.errors import InputError, SettingsError, os_errors
-from segfloor_ros.evaluation.maps import Pose2d
 from segfloor_ros.files.results import add_files, check_target, check_writable
 from segfloor_ros.files.whole import read_json, read_text
+from segfloor_ros.geometry import Pose2d
 from segfloor_ros.results_folder import OUTPUT_NAMES
 from segfloor_ros.suite.description import Suite, read_suite
 from segfloor_ros.suite.job import LOG, SAVED_MAP, Job, Outcome, outcomes, package_digest

@@ -51,7 +51,6 @@ from segfloor_ros.evaluation.map_score import (
 )
 from segfloor_ros.evaluation.maps import (
     MapTruth,
-    Pose2d,
     find_alignment,
     from_frame,
     load_truth,
@@ -59,6 +58,7 @@ from segfloor_ros.evaluation.maps import (
 )
 from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number, read_table
+from segfloor_ros.geometry import Pose2d
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
 

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_cells
-from segfloor_ros.evaluation.maps import MapTruth, Mask, Pose2d, from_frame, resample
-from segfloor_ros.geometry import Array
+from segfloor_ros.evaluation.maps import MapTruth, Mask, from_frame, resample
+from segfloor_ros.geometry import Array, Pose2d
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
 from segfloor_ros.navigation import ARRIVED_M, Goal
 

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.evaluation.maps import SAME_PLACE_M, MapTruth, Mask, Pose2d, observable, resample
+from segfloor_ros.evaluation.maps import SAME_PLACE_M, MapTruth, Mask, observable, resample
 from segfloor_ros.files.images import png_bytes
+from segfloor_ros.geometry import Pose2d
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN_PIXEL, Cells, OccupancyGrid, enlarged
 
 DEFAULT_RANGE_M = 5.0

@@ -20,12 +20,9 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_table, read_yaml
-from segfloor_ros.geometry import Array, planar
+from segfloor_ros.geometry import Array, Pose2d, planar
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map
 from segfloor_ros.trajectory import read_trajectory
-
-Pose2d = tuple[float, float, float]
-"""x and y in metres, yaw in radians."""
 
 BEARINGS = 361
 SAME_PLACE_M, SAME_HEADING_RAD = 0.1, 0.05

@@ -20,7 +20,7 @@ from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.errors import MapError
 from segfloor_ros.files.results import Arrays, check_lengths
 from segfloor_ros.floor.observation import CELL_M, FloorScan
-from segfloor_ros.geometry import Array, planar
+from segfloor_ros.geometry import Array, Pose2d, planar
 from segfloor_ros.grid.keyframe_evidence import (
     SUBPIXEL_BITS,
     Fan,
@@ -61,8 +61,6 @@ _MAX_STRIDE_M = 2.0
 """Between keyframes farther apart than this the base's way is not known."""
 
 
-Pose2d = tuple[float, float, float]
-"""x and y in metres, yaw in radians."""
 BEHIND_M = 0.1
 """Nothing is free so close behind a face: walls are no thinner."""
 

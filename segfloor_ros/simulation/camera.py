@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros import MAX_PIXELS
 from segfloor_ros.camera.calibration.parameters import FISHEYE_RESOLUTION, EyeCalibration
 from segfloor_ros.camera.images import SAME_SURFACE_SHARE
 from segfloor_ros.camera.model import StereoCamera
@@ -28,8 +29,6 @@ RAW_CENTRE_OFFSET_PX = ((3.2, -2.7), (-4.1, 1.6))
 Picture = NDArray[np.float32]
 
 UNDISTORT_ITERATIONS = 60
-
-MAX_HALF_PX = 2000
 
 WHITE, MIDDLE_GREY = 255, 118
 """The latter is what 18 % of white, which automatic exposures aim at, is in sRGB."""
@@ -92,7 +91,7 @@ def plan_imaging(scene: Scene) -> ImagingPlan:
         return ImagingPlan(camera.width, camera.height, camera.fx, raw, None)
     rays = [_rays(side, camera.width, camera.height) * camera.fx for side in raw]
     half = np.ceil(np.max([np.abs(side).max(axis=(0, 1)) for side in rays], axis=0)).astype(int) + 2
-    if (half > MAX_HALF_PX).any():
+    if 4 * int(half.prod()) > MAX_PIXELS:
         raise InputError('the distortion folds the image over; the lens cannot be simulated')
     left, right = ((side + half - 0.5).astype(np.float32) for side in rays)
     return ImagingPlan(2 * int(half[0]), 2 * int(half[1]), camera.fx, raw, (left, right))

@@ -22,7 +22,6 @@ MIN_SPEED_M_S = 0.02
 LONGEST_M, MOST_FRAMES = 1e5, 10**6
 """Of a drive: a day of a robot."""
 
-WHEELBASE_M = 0.3
 GRAVITY_M_S2 = 9.81
 SMOOTH_RATE_HZ = 1000.0
 ODOMETRY_START = (2.0, -1.0, 0.7)
@@ -140,9 +139,10 @@ class RigMotion:
     def T_world_base(self, time_s: float) -> Array:
         """Return the pose (4, 4) of the base, on the floor, at a time."""
         x, y, yaw = self.drive.at(np.array([time_s]))[0]
-        along = np.array([np.cos(yaw), np.sin(yaw)]) * WHEELBASE_M / 2
+        wheels_m = self.scene.sensors.wheel_odometry.track_m  # as far behind one another
+        along = np.array([np.cos(yaw), np.sin(yaw)]) * wheels_m / 2
         rear, front = floor_height_m(self.floors, np.array([x, y]) + np.array([-along, along]))
-        pitch = -np.arctan2(front - rear, WHEELBASE_M)
+        pitch = -np.arctan2(front - rear, wheels_m)
         rotation = Rotation.from_euler('ZY', [yaw, pitch]).as_matrix()
         return make_transform(rotation, np.array([x, y, (rear + front) / 2]))
 

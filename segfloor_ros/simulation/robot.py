@@ -22,8 +22,8 @@ from segfloor_ros.simulation.camera import rectified_camera
 from segfloor_ros.simulation.motion import plan_drive
 from segfloor_ros.simulation.scene import Imu, Scene
 from segfloor_ros.simulation.scene_file import EXPECTED, shipped
-from segfloor_ros.simulation.simulation import import_mujoco
 from segfloor_ros.simulation.solids import Prism, floor_height_m, floors, obstacles, place
+from segfloor_ros.simulation.world import import_mujoco
 
 STEPS_PER_S, MEASUREMENTS_PER_S = 500, 100
 """Of the physics; of wheels and IMU, whose measurements are means over their steps."""
@@ -39,9 +39,6 @@ BREAK_S = 1.0
 
 ACCELERATION_M_S2 = 1.0
 """At which the motors' controller lets a wheel take up another speed."""
-
-SERVO_S = 0.002
-"""Within which a wheel follows its controller where nothing holds it."""
 
 TYRE_FRICTION, WALL_FRICTION = 0.9, 0.3
 """Coulomb friction of rubber on a dry floor, of plastic on plaster."""
@@ -292,9 +289,10 @@ def _load(robot: Robot) -> float:
 
 
 def _motors(robot: Robot) -> str:
-    """Return a motor for each wheel that follows a speed."""
+    """Return a motor for each wheel that follows a speed, within a step where nothing holds it."""
     return ''.join(
-        f'<velocity joint="{name}" kv="{_load(robot) / SERVO_S}"/>' for name, _, _ in _wheels(robot)
+        f'<velocity joint="{name}" kv="{_load(robot) * STEPS_PER_S}"/>'
+        for name, _, _ in _wheels(robot)
     )
 
 

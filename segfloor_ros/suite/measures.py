@@ -14,10 +14,11 @@ import numpy as np
 from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
-from segfloor_ros.evaluation.maps import Pose2d, load_truth, resample
+from segfloor_ros.evaluation.maps import load_truth, resample
 from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number as finite_number
 from segfloor_ros.files.whole import read_json
+from segfloor_ros.geometry import Pose2d
 from segfloor_ros.grid.map_file import UNKNOWN, OccupancyGrid, load_map
 from segfloor_ros.results_folder import read_summary
 from segfloor_ros.trajectory import read_trajectory

@@ -10,8 +10,9 @@ from small_network import FittedNetwork
 from segfloor_ros.grid.map_file import OCCUPIED, load_map
 from segfloor_ros.semantics.network import Network
 from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import RecordingOptions, RenderingError, Simulation, record
+from segfloor_ros.simulation.simulation import RecordingOptions, Simulation, record
 from segfloor_ros.simulation.solids import CLASSES
+from segfloor_ros.simulation.world import RenderingError
 
 CAMERA = ['camera.width=320', 'camera.height=240']
 STANDS_AT = (0.1, -2.2)

@@ -15,7 +15,7 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.cli.commands import DRIVE, demo
 from segfloor_ros.cli.commands import simulate as simulate_command
 from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.simulation.simulation import RenderingError
+from segfloor_ros.simulation.world import RenderingError
 
 app = typer.Typer()
 app.command('demo')(demo)

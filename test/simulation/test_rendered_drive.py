@@ -16,7 +16,8 @@ from segfloor_ros.evaluation.maps import load_truth
 from segfloor_ros.geometry import transform_points
 from segfloor_ros.grid.map_file import OCCUPIED
 from segfloor_ros.simulation.scene_file import scene_from_mapping
-from segfloor_ros.simulation.simulation import RecordingOptions, RenderingError, Simulation, record
+from segfloor_ros.simulation.simulation import RecordingOptions, Simulation, record
+from segfloor_ros.simulation.world import RenderingError
 from segfloor_ros.trajectory import read_trajectory
 
 REPOSITORY = Path(__file__).resolve().parents[2]

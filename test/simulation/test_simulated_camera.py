@@ -7,7 +7,8 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.simulation.camera import depth_reading_mm, develop, moments_s, plan_imaging
 from segfloor_ros.simulation.scene import CameraRig, DepthSensor, Route, Scene, Sensors
 from segfloor_ros.simulation.scene_file import open_scene, scene_from_mapping, shipped
-from segfloor_ros.simulation.simulation import RenderingError, Simulation
+from segfloor_ros.simulation.simulation import Simulation
+from segfloor_ros.simulation.world import RenderingError
 
 WIDTH, HEIGHT = 160, 120
 U, V = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))

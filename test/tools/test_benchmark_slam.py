@@ -19,7 +19,7 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError
 from segfloor_ros.geometry import invert
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.simulation.simulation import RenderingError
+from segfloor_ros.simulation.world import RenderingError
 from segfloor_ros.trajectory import read_trajectory
 from tools.benchmark_slam import benchmark_slam, drives_table, soak_table
 from tools.endless_drive import write_endless_drive

@@ -9,7 +9,8 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoCameraSettings
 from segfloor_ros.camera.sources import open_source
 from segfloor_ros.configuration import resolve
 from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import FrameTruth, RenderingError
+from segfloor_ros.simulation.simulation import FrameTruth
+from segfloor_ros.simulation.world import RenderingError
 from tools.floor_masks import (
     SCENES,
     count,
