@@ -8,12 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from segfloor_ros.camera.model import Up
-from segfloor_ros.floor.plane.mount import PlaneSearch, level_prior
+from segfloor_ros.camera.model import StereoCamera, Up
+from segfloor_ros.floor.disparity.matching import BLOCK_PX
+from segfloor_ros.floor.plane.mount import MountViewer, PlaneSearch, level_prior
 from segfloor_ros.floor.plane.plane import Samples, plane_of, refine
+from segfloor_ros.geometry import se3_exp
 
 UNKNOWN = np.full(3, np.nan)
 DISPARITY_M = 40.0
+CAMERA = StereoCamera(320, 240, 160.0, 160.0, 159.5, 119.5, 0.25)
+VGA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.25)
 TRUE = np.array([0.3, 0.0, 0.5])
 """Pitch, roll and height of the camera."""
 
@@ -138,3 +142,49 @@ def test_a_plane_below_which_much_is_seen_is_no_floor(share_below: float, is_kno
     assert fit.angles_height == pytest.approx(TRUE, abs=0.01)
     assert fit.violations == pytest.approx(share_below, abs=0.01)
     assert search.is_known() is is_known
+
+
+def rows_of(samples: Samples, camera: StereoCamera = CAMERA) -> np.ndarray:
+    """Return the rows (N,) at which a level camera at the origin took samples."""
+    return samples.rays[:, 1] * camera.fy + camera.cy
+
+
+def test_a_disparity_belongs_where_the_texture_of_its_block_is() -> None:
+    stripe = 150
+    image = np.full((CAMERA.height, CAMERA.width), 100, np.uint8)
+    image[stripe - 1 : stripe + 2] = np.random.default_rng(0).choice([0, 255], 80).repeat(4)
+    disparity = np.full(image.shape, 12.0, np.float32)
+    samples = MountViewer(CAMERA).surfaces(image, disparity, 2.0, np.eye(4))
+    rows = rows_of(samples)[samples.weight > 0.1]
+    assert len(rows) > 100
+    # Blocks that reach it are centred farther away.
+    assert np.abs(rows - stripe).max() < 3 < BLOCK_PX
+
+
+def test_samples_lie_on_even_and_odd_rows_alike() -> None:
+    image = np.zeros((480, 640), np.uint8)
+    disparity = np.full(image.shape, 12.0, np.float32)
+    samples = MountViewer(VGA).surfaces(image, disparity, None, np.eye(4))
+    assert np.mean(np.rint(rows_of(samples, VGA)) % 2) == pytest.approx(0.5, abs=0.05)
+
+
+def test_disparities_of_a_floor_rise_also_for_a_camera_upside_down() -> None:
+    """Of a floor by its plane in the world, which hangs upside down in it."""
+    T_world_left = se3_exp(np.array([0.2, 0.1, -0.3, 0.0, 0.0, np.pi]))
+    plane = plane_of(TRUE)
+    uv_px = np.random.default_rng(1).uniform((60, 130), (260, 230), (50, 2))
+
+    def disparity_of(uv_px: np.ndarray) -> np.ndarray:
+        """Points of the plane are those X with plane @ X = -1."""
+        rays = CAMERA.back_project(uv_px, np.ones(len(uv_px))) @ T_world_left[:3, :3].T
+        return -CAMERA.disparity_times_depth * rays @ plane / (1 + plane @ T_world_left[:3, 3])
+
+    half = np.array([0, 0.5])
+    rise = disparity_of(uv_px + half) - disparity_of(uv_px - half)
+    assert np.abs(rise).min() > 0.01
+    floor, board = (
+        Samples.of(CAMERA, uv_px, disparity_of(uv_px), np.ones(50), T_world_left, of)
+        for of in (rise, np.zeros(50))
+    )
+    assert (floor.weight_on(plane) == 1).all()
+    assert (board.weight_on(plane) < 0.5).all()
