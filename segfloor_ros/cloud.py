@@ -32,17 +32,17 @@ _MAX_HEIGHT_LOG_ODDS = 2.0
 _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
 
-_COLUMNS: dict[str, tuple[type, float]] = {
-    'mask_log_odds': (np.float32, 0),
-    'looks': (np.int32, 0),
-    'floor_z_m': (np.float32, 0),
-    'distance_m': (np.float32, 0),
-    'belief': (np.uint8, 0),
-    'judged_z_m': (np.float32, np.nan),
-    'label': (np.uint8, 0),
-    'confidence': (np.float32, 0),
+_COLUMNS = {
+    'mask_log_odds': np.float32,
+    'looks': np.int32,
+    'floor_z_m': np.float32,
+    'distance_m': np.float32,
+    'belief': np.uint8,
+    'judged_z_m': np.float32,
+    'label': np.uint8,
+    'confidence': np.float32,
 }
-"""Type and first value. belief: what the evidence says, with hysteresis; label, confidence: what
+"""All begin with 0. belief: what the evidence says, with hysteresis; label, confidence: what
 is told of it. judged_z_m: where the point was when that was decided, in frame `map`.
 """
 
@@ -200,7 +200,7 @@ class PointTable:
     def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take in what `to_arrays` returned."""
         self.point_id = arrays['point_id']
-        self._columns = {name: arrays[name].astype(kind) for name, (kind, _) in _COLUMNS.items()}
+        self._columns = {name: arrays[name].astype(kind) for name, kind in _COLUMNS.items()}
 
     def follow(self, point_id: NDArray[np.int32]) -> None:
         """Make the rows those of the ids (N,), ascending. What is known of a cloud waits for its
@@ -257,7 +257,7 @@ class PointTable:
 
 
 def _empty(count: int) -> dict[str, NDArray[Any]]:
-    return {name: np.full(count, first, kind) for name, (kind, first) in _COLUMNS.items()}
+    return {name: np.zeros(count, kind) for name, kind in _COLUMNS.items()}
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,9 @@ TURN_ON_SPOT_RAD = np.radians(50)
 
 ARRIVED_M = 0.15
 
-LOOK_S = 2.0
-"""What stays unknown after the robot has faced it for so long cannot be seen."""
+LOOK_S = 3.0
+"""So long the robot stands and looks: what stays unknown then cannot be seen, and where it does not
+know where it is, it turns back to where it came from, where the map is."""
 
 FACED_RAD = np.radians(10)
 
@@ -43,9 +44,6 @@ PATIENCE_S, MOST_TRIES = 8.0, 3
 
 OBSTACLE_REACH_M = 3.0
 """As `raytrace_max_range` of params/nav2.yaml."""
-
-REVERSE_S = 3.0
-"""Lost for so long, the robot turns back to where it came from, where the map is."""
 
 
 def graph_of(places: Mask, cell_m: float, weight: Array) -> csr_array:
@@ -277,7 +275,7 @@ class Explorer:
         """Stand still, then turn back: SLAM knows what it has seen before."""
         if self._lost_since_s is None:
             self._lost_since_s, self._turn_back = time_s, -self._turned
-        if self.grid is None or time_s < self._lost_since_s + REVERSE_S:
+        if self.grid is None or time_s < self._lost_since_s + LOOK_S:
             return STOP
         return 0.0, self._turn_back * self.body.turn_rad_s / 2
 

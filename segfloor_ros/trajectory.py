@@ -19,7 +19,7 @@ from segfloor_ros.files.whole import read_table
 from segfloor_ros.geometry import Array, invert, quaternion_xyzw, rotations_of
 from segfloor_ros.slam.results import KeyframePath
 
-TUM_COLUMNS, KITTI_COLUMNS = 8, 12
+TUM_COLUMNS = ['t', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
 FARTHEST = 1e10
 """Times in seconds and positions in metres are not beyond this."""
 
@@ -98,9 +98,9 @@ def read_trajectory(path: Path) -> tuple[Array, Array]:
     KITTI poses take their times from times.txt in the same folder. Raises InputError.
     """
     table = read_table(path)
-    if table.shape[1] == TUM_COLUMNS:
+    if table.shape[1] == len(TUM_COLUMNS):
         return _checked(*_from_tum(table, path), path)
-    if table.shape[1] == KITTI_COLUMNS:
+    if table.shape[1] == 3 * 4:
         return _checked(_times_beside(path, len(table)), _from_kitti(table, path), path)
     raise InputError(
         f'{path}: has {table.shape[1]} columns; a TUM trajectory has 8 (t x y z qx qy qz qw), '

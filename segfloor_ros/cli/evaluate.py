@@ -275,7 +275,7 @@ def _with_drive(
     """Return the truth with the drive and field of view of the command line, where given."""
     if trajectory is not None:
         poses = read_base_poses(trajectory)
-        if read_table(trajectory).shape[1] == TUM_COLUMNS:
+        if read_table(trajectory).shape[1] == len(TUM_COLUMNS):
             poses[:, :2] = from_frame(poses[:, :2], pose)
             poses[:, 2] += pose[2]
         truth = dataclasses.replace(truth, base_poses=poses)

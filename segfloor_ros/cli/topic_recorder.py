@@ -24,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from segfloor_ros.camera.bag_writer import IMU, ODOMETRY, TF, NewBag
 from segfloor_ros.camera.sources.bag_file import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.messages.ros_bag import message_class
-from segfloor_ros.messages.topics import prepare_middleware
+from segfloor_ros.messages.topics import PATIENCE_S, prepare_middleware
 from segfloor_ros.processes import Interrupt
 
 RECORDED = (IMAGE, COMPRESSED, CAMERA_INFO, IMU, ODOMETRY, TF)
@@ -33,9 +33,6 @@ RECORDED = (IMAGE, COMPRESSED, CAMERA_INFO, IMU, ODOMETRY, TF)
 PICTURES = (IMAGE, COMPRESSED)
 LOOK_S = 0.5
 """So often for new topics, and at the space that is left."""
-
-DRAIN_S = 5.0
-"""So long at most for what waits in the queues at the end."""
 
 FRAMES_APART = 1.5
 """Images whose stamps are farther apart than this many usual steps lack one between them."""
@@ -172,7 +169,7 @@ def record_topics(
 
 def _drain(executor: SingleThreadedExecutor, records: dict[str, TopicRecord]) -> None:
     """Take what has come before the end."""
-    end_s, idle = time.monotonic() + DRAIN_S, 0
+    end_s, idle = time.monotonic() + PATIENCE_S, 0
     while idle < len(records) + 1 and time.monotonic() < end_s:
         before = sum(record.messages for record in records.values())
         executor.spin_once(timeout_sec=0.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import cv2
@@ -24,8 +25,6 @@ from segfloor_ros.slam.results import KeyframeFeatures
 
 _LEAST_DEEP_M = 0.03
 """What stands on the floor is at least this deep behind the face that is seen."""
-QUARTILE = 0.675
-"""Quartiles of a normal distribution lie this many sigmas from its mean."""
 
 
 _SURE_SHARE = 0.4
@@ -133,10 +132,10 @@ def free_range_m(scan: FloorScan, settings: OccupancyGridSettings) -> float:
 
 
 def ray_length_limit(lengths_m: Array) -> float:
-    """Return the length above which a ray of this keyframe is an outlier: Q3 + 1.5 IQR with
-    Q1, Q3 = mean -/+ 0.675 sigma (Segfloor, 2022).
+    """Return the length above which a ray of this keyframe is an outlier: Q3 + 1.5 IQR with the
+    quartiles of a normal distribution (Segfloor, 2022).
     """
-    quarter = QUARTILE * float(lengths_m.std())
+    quarter = NormalDist().inv_cdf(0.75) * float(lengths_m.std())
     return float(lengths_m.mean()) + quarter + 1.5 * 2 * quarter
 
 

@@ -28,7 +28,6 @@ HIGHER, LOWER, NEITHER = 'higher', 'lower', 'neither'
 PATHS = ('.txt', '.csv')
 """Of files with a true path."""
 
-FORMAT = 1
 Baseline = Mapping[str, Mapping[str, float]]
 """Measures by recording."""
 
@@ -335,7 +334,7 @@ def check(outcome: Outcome, bounds: Iterable[Bound]) -> Checked:
 def write_baseline(result: SuiteResult, path: Path) -> None:
     """Write the measures of all recordings that have a map."""
     measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
-    document = {'version': FORMAT, 'recordings': measures}
+    document = {'recordings': measures}
     write_file(path, (json.dumps(document, indent=2) + '\n').encode())
 
 

@@ -32,7 +32,7 @@ from segfloor_ros import __version__
 from segfloor_ros.errors import InputError, printable, without_credentials
 from segfloor_ros.files.images import png_bytes, read_mask
 from segfloor_ros.files.results import folder_in_the_making, move_into_place, scratch_folder
-from segfloor_ros.files.whole import read_bytes, read_json
+from segfloor_ros.files.whole import read_json
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
 from segfloor_ros.results_folder import REPORT
 from segfloor_ros.suite.measures import (
@@ -46,8 +46,6 @@ from segfloor_ros.suite.measures import (
 
 MEASURED = 'measured.json'
 ARCHIVE = 'results.tar'
-
-MAX_ARCHIVE = 1 << 32
 
 WILDCARDS = '*?['
 
@@ -97,8 +95,8 @@ class Cache:
         entry = self._folder / key
         try:
             measured = known_measures(read_json(entry / MEASURED, 'measures'))
-            return measured, read_bytes(entry / ARCHIVE, at_most=MAX_ARCHIVE)
-        except (InputError, ValueError):
+            return measured, (entry / ARCHIVE).read_bytes()
+        except (InputError, OSError, ValueError):
             return None
 
     def put(self, key: str, measured: dict[str, float], archive: bytes) -> None:

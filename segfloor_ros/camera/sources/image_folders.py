@@ -42,12 +42,12 @@ from segfloor_ros.camera.sources.files import (
 from segfloor_ros.camera.sources.source import Stamped, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
-from segfloor_ros.files.whole import nanoseconds, whole_nanoseconds
+from segfloor_ros.files.whole import END_NS, nanoseconds, whole_nanoseconds
 from segfloor_ros.geometry import Array, invert, make_transform
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
-NANOSECOND_DIGITS = 16
-"""A name that is a number of so many digits is taken for a stamp in ns."""
+NANOSECOND_DIGITS = len(str(END_NS))
+"""Names that are numbers of so many digits are stamps in ns: those of this century have as many."""
 
 EUROC_CAMERAS = ('cam0', 'cam1')
 IMU_FOLDER = 'imu0'
