@@ -306,9 +306,7 @@ class LockstepRun:
     def _say_faults(self) -> None:
         faults = self._pipeline.slam.rig_check.faults
         lines = {name: fault.line() for name, fault in faults.items()}
-        fixture = self._pipeline.keyframe_stages.floor.fixture
-        if fixture.problem is not None:
-            lines['fixture'] = fixture.problem
+        lines |= self._pipeline.keyframe_stages.floor.remarks
         for name in sorted(lines.keys() - self._faults_said):
             self._faults_said.add(name)
             logger.warning('%s: %s', self._configuration.stereo_camera.input, lines[name])

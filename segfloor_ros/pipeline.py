@@ -75,7 +75,10 @@ class KeyframeStages:
         if labeller is not None:
             height_m = configuration.floor_segmentation.robot_height_m
             self._label_map = LabelMap(camera, len(labeller.classes), height_m)
-        self.floor = FloorSegmentation(camera, configuration.floor_segmentation)
+        has_mount = configuration.stereo_slam.has_mount
+        self.floor = FloorSegmentation(
+            camera, configuration.floor_segmentation, checks_mount=has_mount
+        )
         self._labelling = CloudLabelling(configuration.cloud_labelling)
         self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
 
@@ -121,8 +124,7 @@ class KeyframeStages:
     def remarks(self) -> list[str]:
         """What is wrong with what the network sees, and with the mount, in words."""
         of_network = self._labeller.remarks if self._labeller is not None else []
-        of_floor = self.floor.network.remark, self.floor.fixture.problem
-        return [*of_network, *filter(None, of_floor)]
+        return [*of_network, *self.floor.remarks.values()]
 
     def labels(self, grid: OccupancyGrid | None, path: KeyframePath) -> Labels | None:
         """Return the labels of the map, with its keyframes where they lie now; None where no

@@ -83,6 +83,7 @@ class DriveNotes:
         self.updated: set[int] = set()
         self.failed: dict[int, Status] = {}
         self.health: dict[str, Status] = {}
+        self._remarks: dict[str, list[str]] = {}
         self.done_s: dict[str, dict[int, float]] = {node: {} for node in NODES}
         """When a node said first that it was done with a stamp."""
         self.last_sign_s = time.monotonic()
@@ -106,6 +107,9 @@ class DriveNotes:
             self.times.add(status.node, 1e-3 * float(status.values['processing_ms']))
         if status.level is Level.OK and status.node in NODES:
             self.done_s[status.node].setdefault(status.stamp_ns, self.last_sign_s)
+        if 'remarks' in status.values:
+            said = status.values['remarks']
+            self._remarks[status.node] = said.split(diagnostics.REMARKS_APART) if said else []
         if status.node == CAMERA:
             self.frame_index[status.stamp_ns] = int(status.values['frame_index'])
         elif status.node == SLAM:
@@ -159,9 +163,8 @@ class DriveNotes:
 
     @property
     def remarks(self) -> list[str]:
-        """What seems wrong with sensors, in words."""
-        text = self._last_value('remarks')
-        return text.split(diagnostics.REMARKS_APART) if text else []
+        """What seems wrong with sensors and mount, in words."""
+        return [words for node in NODES for words in self._remarks.get(node, [])]
 
     @property
     def input_faults(self) -> list[dict[str, Any]]:

@@ -73,6 +73,7 @@ from segfloor_ros.floor.observation import (
     FloorSegmentationSettings,
     VDisparity,
 )
+from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.plane.plane import Fixture, expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
@@ -102,7 +103,8 @@ MASK_COLOURS = {
 
 class FloorSegmentation:
     """Finds the floor in rectified stereo pairs of one camera. times: told what each step takes.
-    network: how far what a network says of the floor can be believed.
+    checks_mount: whether the mount in use is compared with what the floor shows. network: how far
+    what a network says of the floor can be believed.
     """
 
     def __init__(
@@ -110,8 +112,11 @@ class FloorSegmentation:
         camera: StereoCamera,
         settings: FloorSegmentationSettings,
         times: StageTimes | None = None,
+        checks_mount: bool = False,
     ) -> None:
         self._times = times or NoTimes()
+        self._checks_mount = checks_mount
+        self._mount_check: MountCheck | None = None
         self._camera = camera
         self._settings = settings
         self.network = NetworkFloor()
@@ -208,7 +213,16 @@ class FloorSegmentation:
             if below_said is not None:
                 feet_xy = np.hstack([feet_xy, _barriers(view, profile, below_said)])
             scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy)
+        if self._mount_check is not None and T_map_base is not None:
+            self._mount_check.add(left, right if measured is None else measured, T_map_base)
         return self._observation(view, profile, disparity, mask, scan, counted)
+
+    @property
+    def remarks(self) -> dict[str, str]:
+        """What is wrong with the mount and with what a network says, in words, by what it is."""
+        mount = self._mount_check.problem if self._mount_check else None
+        said = ('mount', mount), ('fixture', self.fixture.problem), ('network', self.network.remark)
+        return {about: words for about, words in said if words}
 
     def _heights(
         self, view: FloorView, profile: FloorProfile, below: NDArray[np.float32], measured: bool
@@ -250,6 +264,7 @@ class FloorSegmentation:
             return
         self._make_tools(mount)
         self._mount, self.fixture = mount, Fixture()
+        self._mount_check = MountCheck(self._camera, mount) if self._checks_mount else None
 
     def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)

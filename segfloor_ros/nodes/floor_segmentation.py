@@ -13,7 +13,6 @@ from segfloor_ros.camera.calibration.parameters import StereoCalibration
 from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.configuration import FloorSegmentationNodeSettings
-from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
 from segfloor_ros.messages.arrays import (
     disparity_message,
@@ -23,6 +22,7 @@ from segfloor_ros.messages.arrays import (
     right_image,
     scan_message,
 )
+from segfloor_ros.messages.diagnostics import REMARKS_APART
 from segfloor_ros.messages.poses import pose_array, transform_array
 from segfloor_ros.messages.topics import (
     FRAME_PARTS,
@@ -113,7 +113,6 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         self._free_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
-        self._mount_check: MountCheck | None = None
 
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings, and with what is remembered."""
@@ -148,8 +147,9 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         moving = grey8_image(parts[MOVING_MASK], MOVING_MASK) if MOVING_MASK in parts else None
         said = grey8_image(parts[SEMANTIC_MASK], SEMANTIC_MASK) if SEMANTIC_MASK in parts else None
         floor = stage.process(left, right, self.mount, T_map_base, moving, said)
-        if stage.fixture.problem is not None:
-            self.reporter.diagnose('fixture', stage.fixture.problem, lasts_s=float('inf'))
+        remarks = stage.remarks
+        for about, words in remarks.items():
+            self.reporter.diagnose(about, words, lasts_s=float('inf'))
         out, at = self.outputs, (stamp_ns, frame_id)
         out.publish('keyframe/floor_mask', image_message(*at, floor.mask))
         scan = scan_message(stamp_ns, self._base_frame, floor.scan)
@@ -162,33 +162,18 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         if out.listeners('keyframe/v_disparity'):
             picture = v_disparity_picture(floor)
             out.publish('keyframe/v_disparity', image_message(*at, picture, 'bgr8'))
-        if self._mount_check is not None and not self._mount_check.is_done:
-            self._compare_mounts(self._mount_check.add(left, right, T_map_base))
-        return {}
-
-    def _compare_mounts(self, words: str | None) -> None:
-        if words is not None:
-            self.reporter.diagnose(
-                'mount',
-                f'{words}; correct the tf from {self._base_frame} to the camera, or the parameters '
-                'camera_height_m, camera_pitch_rad and camera_roll_rad of stereo_slam',
-                lasts_s=float('inf'),
-            )
+        return {'remarks': REMARKS_APART.join(remarks.values())}
 
     def find_problems(self) -> None:
         """Say what the keyframes wait for."""
         if self._keyframes.waiting_count:
             text = 'no message on camera_mount; is stereo_slam running?'
             self.reporter.diagnose('camera_mount', text)
-        if self._stage is not None and self._stage.network.remark:
-            self.reporter.diagnose('network', self._stage.network.remark)
 
     def _stage_for(self, camera: StereoCamera) -> FloorSegmentation:
         if self._stage is None or camera != self._camera:
             self._camera = camera
-            self._stage = FloorSegmentation(camera, self.settings)
-            assert self.mount is not None
-            self._mount_check = self._mount_check or MountCheck(camera, self.mount)
+            self._stage = FloorSegmentation(camera, self.settings, checks_mount=True)
         return self._stage
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.rig.estimates import MAX_OFFSET_PX
 from segfloor_ros.geometry import Array
 
 EXPECTED_SIGMA_PX = 0.1
@@ -37,9 +38,6 @@ WINDOW_SIGMA_PX = 0.03
 
 MEMORY_SIGMA_PX = 0.01
 """The estimate never counts as better known than this, so that it can follow the rig, px."""
-
-MAX_OFFSET_PX = 0.5
-"""More is not an imperfect rectification but a wrong calibration, px."""
 
 FITTING = 0.95
 """Probability with which a measurement that is right is taken for one."""

@@ -187,6 +187,20 @@ def test_a_wrong_focal_length_is_not_said_of_a_straight_drive() -> None:
     assert faults(straight, replace(CAMERA, fx=1.2 * CAMERA.fx, fy=1.2 * CAMERA.fy)) == {}
 
 
+@pytest.mark.parametrize('offset_px', [5, -5, 2])
+@pytest.mark.parametrize('turn_deg', [0.0, 1.0])
+def test_a_principal_point_that_is_off_in_one_eye_shows_in_any_motion(turn_deg, offset_px) -> None:
+    room = StereoRoom(seed=5)
+    poses = [planar_pose(0.03 * i, 0.0, np.radians(turn_deg) * i) for i in range(SETTLED_FRAMES)]
+    drive = [room.frame(i, pose) for i, pose in enumerate(poses)]
+    found = faults([replace(f, right=np.roll(f.right, -offset_px, axis=1)) for f in drive])
+    assert set(found) == {'principal_points'}
+    fault = found['principal_points']
+    assert fault.value == pytest.approx(offset_px, abs=0.3)
+    assert f'{fault.value:+.1f} px' in fault.line()
+    assert 'calibrate' in fault.remedy
+
+
 def test_an_eye_that_is_rolled_and_zoomed_is_mended(frames) -> None:
     centre = (CAMERA.cx, CAMERA.cy)
     M = cv2.getRotationMatrix2D(centre, 2.0, 1.03)  # degrees, and 3 % larger

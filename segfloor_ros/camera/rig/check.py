@@ -28,8 +28,8 @@ from segfloor_ros.camera.rig.estimates import (
     ROWS_PX,
     SURE,
     WINDOW_PX,
+    CalibrationCheck,
     DepthCheck,
-    FocalCheck,
     Matches,
     follow,
 )
@@ -131,6 +131,13 @@ FAULTS = {
         'take the calibration of this lens at this resolution, or calibrate again '
         '(segfloor calibrate)',
     ),
+    'principal_points': (
+        'px',
+        'have other principal points than their calibration: motion shows that all disparities are '
+        '{value:+.1f} px off',
+        'take the calibration of this camera, the right eye of which has a principal point of its '
+        'own, or calibrate again (segfloor calibrate)',
+    ),
     'blurred': (
         'px',
         'are blurred: their sharpest edges are {value:.1f} px wide',
@@ -154,6 +161,9 @@ FAULTS = {
 }
 """Of each fault its unit, what was found, and what to do."""
 
+BENT = {'rows_apart', 'eyes_swapped', 'same_image', 'different_views', 'not_simultaneous'}
+"""Images with these faults show a world that is bent, whatever the calibration."""
+
 
 class RigCheck:
     """Looks at some frames of a stereo camera; `faults` is what was found so far, by name. Within
@@ -176,7 +186,7 @@ class RigCheck:
         self._frame_s = 0.0
         self._moving_looks = self._watched = 0
         self._depth = DepthCheck()
-        self._focal = FocalCheck(camera)
+        self._calibration = CalibrationCheck(camera)
 
     @timed
     def watch(self, frame: StereoFrame) -> None:
@@ -199,9 +209,9 @@ class RigCheck:
                 self._pictures.append(_picture([frame.left]))
                 self._judge_depth(frame)
                 self._judge_pictures()
-        elif is_look or (self.frames % EVERY == EVERY // 2 and not self._focal.is_done):
+        elif is_look or (self.frames % EVERY == EVERY // 2 and not self._calibration.is_done):
             matches = self._match(frame.left, frame.right)
-            self._focal.look(frame.left, matches)
+            self._calibration.look(frame.left, matches)
             if is_look:
                 self._looks.append(self._look(frame, matches))
                 self._points.append(self._point_count)
@@ -218,7 +228,7 @@ class RigCheck:
         at, and what follows until the next jump.
         """
         self.frames += EVERY - 1 - self.frames % EVERY
-        self._focal.reset_view()
+        self._calibration.reset_view()
 
     def corrected(self, frame: StereoFrame) -> StereoFrame:
         """Return a frame with its right image moved, rolled and scaled by what its rows were found
@@ -310,7 +320,8 @@ class RigCheck:
         lag_s = self._lag_s(followed)
         seen = followed if lag_s else seen
         apart = seen[:, 2:4] - lag_s * np.nan_to_num(seen[:, 4:6])
-        negative = float(np.mean(apart[:, 0] < -ROWS_PX))
+        offset_px = self._calibration.offset_px()
+        negative = float(np.mean(apart[:, 0] - (offset_px or 0.0) < -ROWS_PX))
         centre = np.array([self._camera.cx, self._camera.cy])
         right_px = seen[:, :2] - seen[:, 2:4] - centre
         A = np.column_stack([np.ones(len(seen)), right_px])
@@ -328,6 +339,7 @@ class RigCheck:
             self._mend = None
             rows_px = abs(float(np.median(apart[:, 1])))  # its rest, where speeds vary, has no sign
             self._found_lag(lag_s, self._frame_s, 'right', 'left')
+        self.faults.pop('eyes_swapped', None)
         if negative > 0.5:
             self._found('eyes_swapped', 100 * negative)
         if rows_px > ROWS_PX and (lag_s or 'not_simultaneous' not in self.faults):
@@ -340,12 +352,16 @@ class RigCheck:
         ratio = float(np.exp(np.median(seen[:, 6])))
         if ratio > EYES_RATIO:
             self._found('eyes_differ', ratio)
-        factor, fx = self._focal.factor(), self._camera.fx
-        if self.faults.keys() - {'focal_length'}:  # images with another fault bend the world, too
+        factor, fx = self._calibration.factor(), self._camera.fx
+        if self.faults.keys() & BENT:
             self.faults.pop('focal_length', None)
-        elif factor is not None:
+            self.faults.pop('principal_points', None)
+            return
+        if factor is not None:
             too_long = 100 / factor - 100
             self._found('focal_length', too_long, seen_px=factor * fx, given_px=fx)
+        if offset_px is not None:
+            self._found('principal_points', offset_px)
 
     def _judge_pictures(self) -> None:
         if len(self._pictures) < RECENT:

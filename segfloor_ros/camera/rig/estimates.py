@@ -1,16 +1,18 @@
-"""What images say of two calibrations: that of a depth camera, and the focal length.
+"""What images say of two calibrations: that of a depth camera, and that of two eyes.
 
 Whether measured depth belongs to its image, by edges: things end in the depth where they end in
 the image. The edges of the depth are laid over those of the image, shifted, larger or smaller, and
 moved as the image moved within a lag: where they fit best is how depth and image lie to each other,
 in space and in time.
 
-Whether the focal length of the calibration is that of the images, by how a turn looks. Depth is the
-focal length times the baseline by the disparity, the place across it is not: with a wrong focal
-length the world is stretched along the axis of the camera. A camera that moves straight ahead sees
-no more of it; one that turns sees a stretched world bend. Two looks of a turn are fitted by a
-motion and the factor of the focal length (self-calibration by rotation: Hartley, 1994; here with
-both eyes).
+Whether focal length and principal points of the calibration are those of the images, by how motion
+looks. Depth is the focal length times the baseline by the disparity, the place across it is not:
+with a wrong focal length the world is stretched along the axis of the camera. A camera that moves
+straight ahead sees no more of it; one that turns sees a stretched world bend. Where the principal
+points of the eyes are not as far apart as calibrated, all disparities are off by as much, and near
+things seem to move by more, or less, than far ones in any motion. Two looks are fitted by a motion,
+the factor of the focal length and that offset (self-calibration: Hartley, 1994; here with both
+eyes). Wrong in both eyes alike a principal point looks like a camera that is mounted askew.
 """
 
 from __future__ import annotations
@@ -73,6 +75,10 @@ SURE = 4.0
 PAIR_SIGMA = 0.02
 """What is wrong in all points of a pair is in no covariance: by so much, as a share, pairs of good
 recordings differ."""
+
+MAX_OFFSET_PX = 0.5
+"""An error of all disparities that is larger is not an imperfect rectification but a wrong
+calibration, px."""
 
 FOCAL_SHARE = 0.03
 """Depths that are wrong by less do not matter to a map; real calibrations are not better known."""
@@ -203,19 +209,21 @@ class Matches(NamedTuple):
         return Matches(*(values[chosen] for values in self))
 
 
-class FocalCheck:
-    """Collects what turns say of the focal length."""
+class CalibrationCheck:
+    """Collects what motion says of the focal length and of an offset of all disparities."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._before: tuple[NDArray[np.uint8], Matches] | None = None
-        self._logs: list[tuple[float, float]] = []
+        self._logs: list[Measured] = []
+        self._offsets: list[Measured] = []
 
     @property
     def is_done(self) -> bool:
-        """Whether no more turns are needed: the focal length is known."""
-        return SURE * self._estimate()[1] < FOCAL_SHARE
+        """Whether no more motion is needed: both are known."""
+        log, offset = self._log(), self._offset()
+        return SURE * log.sigma < FOCAL_SHARE and SURE * offset.sigma < MAX_OFFSET_PX
 
     def reset_view(self) -> None:
         """The next look is not at what the last one showed."""
@@ -227,7 +235,7 @@ class FocalCheck:
             return
         apart = matches.left_px - matches.right_px
         rows = np.abs(apart[:, 1] - np.median(apart[:, 1])) if len(apart) else apart[:, 1]
-        matches = matches.those((apart[:, 0] > ROWS_PX) & (rows < ROWS_PX))
+        matches = matches.those(rows < ROWS_PX)
         before, self._before = self._before, (left, matches)
         if before is None or min(len(before[1].words), len(matches.words)) < MIN_MATCHES:
             return
@@ -241,52 +249,86 @@ class FocalCheck:
         uvd_then = np.column_stack([then.left_px, (then.left_px - then.right_px)[:, 0]])
         uvd_now = np.column_stack([now_px, (now.left_px - now.right_px)[:, 0]])
         if np.count_nonzero(is_found) >= MIN_MATCHES:
-            log = _log_factor(self._camera, uvd_then[is_found], uvd_now[is_found])
-            self._logs.extend([log] if log is not None else [])
+            self._learn(uvd_then[is_found], uvd_now[is_found])
+
+    def _learn(self, then: Array, now: Array) -> None:
+        T, x, covariance, noise_px = _fit_motion(self._camera, then, now)
+        if noise_px < RETURN_PX:
+            self._offsets.append(Measured(float(x[1]), float(covariance[1, 1]) ** 0.5))
+            if _turn_rad(T) > MIN_TURN_RAD:
+                self._logs.append(Measured(float(x[0]), float(covariance[0, 0]) ** 0.5))
 
     def factor(self) -> float | None:
         """Return the focal length that turns show, as a share of that of the calibration, where it
         is sure that it is another one.
         """
-        log, sigma = self._estimate()
-        return float(np.exp(log)) if abs(log) - SURE * sigma > FOCAL_SHARE else None
+        log = self._log()
+        return float(np.exp(log.value)) if log.is_beyond(FOCAL_SHARE) else None
 
-    def _estimate(self) -> tuple[float, float]:
-        """Return the logarithm of the factor, and its standard deviation."""
-        if not self._logs:
-            return 0.0, np.inf
-        logs, information = np.array(self._logs).T
-        weight = 1 / (1 / information + PAIR_SIGMA**2)
-        log = float(logs @ weight / weight.sum())
-        spread = float(np.sqrt(np.square(weight * (logs - log)).sum())) / weight.sum()
-        return log, max(spread, float(weight.sum() ** -0.5))
+    def offset_px(self) -> float | None:
+        """Return by how much all disparities are too large, where it is sure that they are not as
+        calibrated.
+        """
+        offset = self._offset()
+        return offset.value if offset.is_beyond(MAX_OFFSET_PX) else None
+
+    def _log(self) -> Measured:
+        return Measured.mean(self._logs, PAIR_SIGMA)
+
+    def _offset(self) -> Measured:
+        return Measured.mean(self._offsets, LEAST_NOISE_PX)
 
 
-def _log_factor(camera: StereoCamera, then: Array, now: Array) -> tuple[float, float] | None:
-    """Return the logarithm of the factor of the focal length, and its information, that fits points
-    (N, 3) = (u, v, disparity) before and after a motion; None where that was no turn of a rigid
-    scene.
+class Measured(NamedTuple):
+    """A value and its standard deviation."""
+
+    value: float
+    sigma: float
+
+    @classmethod
+    def mean(cls, found: list[Measured], shared_sigma: float) -> Measured:
+        """Return the mean of what pairs of looks say. shared_sigma: of what is wrong in all points
+        of a pair.
+        """
+        if not found:
+            return cls(0.0, np.inf)
+        values, sigmas = np.array(found).T
+        weight = 1 / (sigmas**2 + shared_sigma**2)
+        value = float(values @ weight / weight.sum())
+        spread = float(np.sqrt(np.square(weight * (values - value)).sum())) / weight.sum()
+        return cls(value, max(spread, float(weight.sum() ** -0.5)))
+
+    def is_beyond(self, limit: float) -> bool:
+        """Whether the value is surely farther from zero than a limit."""
+        return abs(self.value) - SURE * self.sigma > limit
+
+
+def _fit_motion(camera: StereoCamera, then: Array, now: Array) -> tuple[Array, Array, Array, float]:
+    """Return what fits points (N, 3) = (u, v, disparity) before and after a motion best: the motion
+    (4, 4); the logarithm of the factor of the focal length, and the offset of the disparities, (2,)
+    with covariance (2, 2); and the noise, px.
     """
     then, now = then.astype(np.float64), now.astype(np.float64)
-    x, T = 0.0, np.eye(4)
-    information = 0.0
+    # All is in front of the camera.
+    x, T = np.array([0.0, min(0.0, float(then[:, 2].min()) - ROWS_PX)]), np.eye(4)
+    information, noise_px = np.zeros((2, 2)), LEAST_NOISE_PX
     for step in range(STEPS):
-        if step == MOTION_STEPS and _turn_rad(T) < MIN_TURN_RAD:
-            return None
         error, J = _residuals(camera, then, now, x, T)
         noise_px = max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE_PX)
         weight = (1.0 + np.square(error).sum(axis=1) / (2 * noise_px) ** 2) ** -2 / noise_px**2
         H = np.einsum('nij,nik,n->jk', J, J, weight)
         g = np.einsum('nij,ni,n->j', J, error, weight)
         H[6, 6] += PRIOR_SIGMA**-2
-        g[6] -= x * PRIOR_SIGMA**-2
-        size = 6 if step < MOTION_STEPS else 7
-        change = np.zeros(7)
+        g[6] -= x[0] * PRIOR_SIGMA**-2
+        H[7, 7] += WINDOW_PX**-2
+        g[7] -= x[1] * WINDOW_PX**-2
+        size = 6 if step < MOTION_STEPS else 8
+        change = np.zeros(8)
         change[:size] = np.linalg.lstsq(H[:size, :size], g[:size], rcond=None)[0]
-        T, x = se3_exp(change[:6]) @ T, x + float(np.clip(change[6], -PRIOR_SIGMA, PRIOR_SIGMA))
-        information = float(H[6, 6] - H[6, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6])
-    is_known = noise_px < RETURN_PX and _turn_rad(T) > MIN_TURN_RAD
-    return (x, information) if is_known else None
+        T = se3_exp(change[:6]) @ T
+        x = x + np.clip(change[6:], (-PRIOR_SIGMA, -WINDOW_PX), (PRIOR_SIGMA, WINDOW_PX))
+        information = H[6:, 6:] - H[6:, :6] @ np.linalg.pinv(H[:6, :6]) @ H[:6, 6:]
+    return T, x, np.linalg.inv(information), noise_px
 
 
 def _turn_rad(T_now_then: Array) -> float:
@@ -294,26 +336,32 @@ def _turn_rad(T_now_then: Array) -> float:
 
 
 def _residuals(
-    camera: StereoCamera, then: Array, now: Array, log_factor: float, T_now_then: Array
+    camera: StereoCamera, then: Array, now: Array, x: Array, T_now_then: Array
 ) -> tuple[Array, Array]:
     """Return where points (N, 3) are now against where they should be, (N, 3), and the derivatives
-    (N, 3, 7) of the latter by a motion and by the logarithm of the factor.
+    (N, 3, 8) of the latter by a motion and by x (2,): the logarithm of the factor of the focal
+    length, and the offset of the disparities.
     """
+    log_factor, offset_px = x
     f = np.array([camera.fx, camera.fy]) * np.exp(log_factor)
-    across = camera.baseline_m * camera.fx / then[:, 2]
+    disparity = np.maximum(then[:, 2] - offset_px, LEAST_NOISE_PX)
+    across = camera.baseline_m * camera.fx / disparity
     rays = (then[:, :2] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     depth = across * np.exp(log_factor)
-    points = transform_points(T_now_then, np.column_stack([rays * across[:, None], depth]))
-    x, y, z = points.T
+    points_then = np.column_stack([rays * across[:, None], depth])
+    points = transform_points(T_now_then, points_then)
+    x_m, y_m, z = points.T
     z = np.maximum(z, 1e-3)
-    seen = np.column_stack([f[0] * x / z, f[1] * y / z, f[0] * camera.baseline_m / z])
+    seen = np.column_stack([f[0] * x_m / z, f[1] * y_m / z, f[0] * camera.baseline_m / z])
     J_point = np.zeros((len(then), 3, 3))
     J_point[:, 0, 0], J_point[:, 1, 1] = f[0] / z, f[1] / z
     J_point[:, :, 2] = -seen / z[:, None]
-    J = np.empty((len(then), 3, 7))
+    J = np.empty((len(then), 3, 8))
     J[:, :, :3], J[:, :, 3:6] = J_point, -J_point @ skew(points)
     J[:, :, 6] = seen + J_point @ T_now_then[:3, 2] * depth[:, None]
-    return now - (camera.cx, camera.cy, 0.0) - seen, J
+    grown = points_then @ T_now_then[:3, :3].T / disparity[:, None]
+    J[:, :, 7] = (J_point @ grown[:, :, None])[:, :, 0] + (0.0, 0.0, 1.0)
+    return now - (camera.cx, camera.cy, offset_px) - seen, J
 
 
 def follow(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -131,7 +132,7 @@ class MountEstimator:
     def add(
         self,
         left: NDArray[np.uint8],
-        right: NDArray[np.uint8],
+        right: NDArray[Any],
         T_world_left: Array,
         up_world: Up | None = None,
         is_new_view: bool = True,
@@ -284,33 +285,40 @@ def disagreement(used: Mount, seen: Mount) -> str | None:
         measured = math.degrees(getattr(seen, f'{name}_rad'))
         if abs(given - measured) > _TILT_TOLERANCE_DEG:
             parts.append(f'{name} {given:.1f} deg, the floor shows {measured:.1f} deg')
-    return 'camera mount: ' + '; '.join(parts) if parts else None
+    if not parts:
+        return None
+    return (
+        'camera mount: ' + '; '.join(parts) + '; correct the tf to the camera, or the parameters '
+        'camera_height_m, camera_pitch_rad and camera_roll_rad of stereo_slam; or where these are '
+        'right, the baseline and the focal length of the calibration'
+    )
 
 
 class MountCheck:
-    """Measures the mount beside its use, once. A wrong one tilts the map or shifts its heights."""
+    """Measures the mount beside its use, once. A wrong one tilts the map or shifts its heights.
+    problem: in words, with the numbers, how both differ, once that is known.
+    """
 
     def __init__(self, camera: StereoCamera, mount: Mount) -> None:
         self._mount = mount
         self._estimator = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m)
         self._T_first_map: Array | None = None
         self._keyframes = 0
-        self.is_done = False
+        self.problem: str | None = None
 
-    def add(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], T_map_base: Array
-    ) -> str | None:
-        """Use a keyframe: rectified images (H, W) and the base's pose (4, 4). Returns in words how
-        both mounts differ, with the numbers, once that is known.
+    def add(self, left: NDArray[np.uint8], right: NDArray[Any], T_map_base: Array) -> None:
+        """Use a keyframe: rectified images (H, W), or of a depth camera its disparity in place of
+        the right one, and the base's pose (4, 4).
         """
+        if self._estimator.mount is not None or self._keyframes >= MAX_KEYFRAMES:
+            return
         T_map_left = T_map_base @ self._mount.T_base_left
         if self._T_first_map is None:
             self._T_first_map = invert(T_map_left)
         self._estimator.add(left, right, self._T_first_map @ T_map_left)
         self._keyframes += 1
         seen = self._estimator.mount
-        self.is_done = seen is not None or self._keyframes >= MAX_KEYFRAMES
-        return None if seen is None else disagreement(self._mount, seen)
+        self.problem = None if seen is None else disagreement(self._mount, seen)
 
 
 class MountViewer:
