@@ -22,6 +22,7 @@ from segfloor_ros.evaluation.maps import resample
 from segfloor_ros.files.images import png_bytes
 from segfloor_ros.files.results import Arrays, MapFile, read_map_file, write_file, write_map_file
 from segfloor_ros.geometry import planar
+from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
 from segfloor_ros.grid.map_file import (
     FREE,
     OCCUPIED,
@@ -321,7 +322,9 @@ def _labels(cloud: SparseCloud, files: Sequence[MapFile]) -> Arrays:
 
 def _evidence(path: KeyframePath, files: Sequence[MapFile]) -> Arrays:
     """Return the evidence of keyframes that were merged of those of files."""
-    arrays = _joined([file.parts['grid'] for file in files])
+    parts = [file.parts['grid'] for file in files]
+    # Those of an earlier release get all arrays.
+    arrays = _joined([p | evidence_to_arrays(evidence_from_arrays(p)) for p in parts])
     row = np.searchsorted(path.stamp_ns, arrays['stamp_ns'])
     return arrays | {'pose': planar(path.T_map_base[row])}
 

@@ -31,7 +31,9 @@ class FloorScan:
     in front, NaN where the image shows nothing about that bearing. obstacle_m: (N,) float32,
     distance at which the nearest upright thing was measured on that bearing, NaN where none
     was; None from a source that does not tell. range_max_m: the range whose error, one sigma, is
-    `RANGE_MAX_ERROR_M`; errors grow with the square of the range.
+    `RANGE_MAX_ERROR_M`; errors grow with the square of the range. movable_m: (N,) float32, as
+    obstacle_m, of what a network says to be of a class that moves: it does not end the floor. None
+    without a network.
     """
 
     angle_min_rad: float
@@ -39,6 +41,7 @@ class FloorScan:
     ranges_m: NDArray[np.float32]
     obstacle_m: NDArray[np.float32] | None = None
     range_max_m: float = math.inf
+    movable_m: NDArray[np.float32] | None = None
 
     @property
     def bearings_rad(self) -> NDArray[np.float64]:
@@ -66,7 +69,8 @@ class VDisparity:
 @dataclass(frozen=True)
 class FloorObservation:
     """The floor seen in one rectified stereo pair.
-    disparity_px: (H, W) float32, 0 where there is no match. mask: (H, W) uint8 of `FLOOR`,
+    disparity_px: (H, W) float32, 0 where there is no match, and where something moves, unless a
+    network knows it. mask: (H, W) uint8 of `FLOOR`,
     `NO_EVIDENCE` and `NOT_FLOOR`. profile_px: (H,) float64, the floor's disparity at each image row
     in the de-rolled image (NaN above the horizon). scan: the compact free-space scan.
     v_disparity: what the profile was fitted to.

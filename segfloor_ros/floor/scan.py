@@ -106,9 +106,11 @@ class FloorScanner:
         upright_xy: NDArray[np.float32],
         feet_xy: NDArray[np.float32],
         density: float,
+        movable_xy: NDArray[np.float32] | None = None,
     ) -> FloorScan:
         """Return the scan of floor, (N,) at `cells_xy`, of points that stand up, (2, M) in the
-        base's x-y plane, and of the feet of what is blank, (2, F).
+        base's x-y plane, of the feet of what is blank, (2, F), and of points of what is of a class
+        that moves, (2, P): nothing is free behind it, nor is it told to stand there.
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
         what is tolerated, and never beyond the last floor that both cameras saw: at the image's
@@ -118,13 +120,14 @@ class FloorScanner:
         """
         shape = (self._count, len(self._middle))
         floor, seen_by_both = floor.reshape(shape), (floor & shared).reshape(shape)
-        upright_m = self._upright(self._polar_counts(upright_xy), density)
+        upright_m = self._upright(upright_xy, density)
         feet_m = self._feet(feet_xy)
         # Both measure the same face equally well.
         same = np.abs(upright_m - feet_m) < SAME_SURFACE_SHARE * feet_m
         upright_m = np.where(same, 0.5 * (upright_m + feet_m), np.fmin(upright_m, feet_m))
         middle = self._middle
-        limit = self._limit(upright_m)
+        movable_m = None if movable_xy is None else self._upright(movable_xy, density)
+        limit = self._limit(upright_m if movable_m is None else np.fmin(upright_m, movable_m))
         seen = floor & (middle < limit[:, None])
         # A dip of a few bearings in which nothing stands up is a hole in the mask, a spike is floor
         # that has crept up a blank wall.
@@ -148,6 +151,7 @@ class FloorScanner:
             ranges.astype(np.float32),
             upright_m.astype(np.float32),
             self._range_max_m,
+            None if movable_m is None else movable_m.astype(np.float32),
         )
 
     def _limit(self, upright_m: Array) -> Array:
@@ -189,13 +193,15 @@ class FloorScanner:
         unbroken = np.cumsum(broken, axis=1) == 0
         return np.where(seen & unbroken & may_end, middle, 0.0).max(axis=1)
 
-    def _upright(self, counts: NDArray[np.intp], density: float) -> Array:
-        """Return the range (N,) of the nearest upright thing, NaN where there is none.
+    def _upright(self, xy: NDArray[np.float32], density: float) -> Array:
+        """Return the range (N,) of the nearest upright thing, NaN where there is none, of points
+        (2, M) as in `scan`.
 
         It must show as many pixels, within the spread of its disparities, as an upright surface
         of a given height does at its range. Its range is the median of its pixels: of those within
         the spread on both sides of it.
         """
+        counts = self._polar_counts(xy)
         camera, middle = self._camera, _NEAREST_M * np.exp(_LOG_STEP * (self._log_bins + 0.5))
         wide = camera.fx * self._step * density
         needed = np.maximum(2.0, 0.5 * wide * _UPRIGHT_M * camera.fy / middle)
@@ -325,9 +331,9 @@ class OverheadMatcher:
         disparity_px = _SCALE * disparity[rows, columns].astype(np.float64)
         centre = 0.5 * (_SCALE - 1)
         uv_px = np.stack([_SCALE * columns + centre, _SCALE * rows + first + centre], axis=1)
-        return self._in_the_way(uv_px, disparity_px, mount)
+        return self.in_the_way(uv_px, disparity_px, mount)
 
-    def _in_the_way(self, uv_px: Array, disparity_px: Array, mount: Mount) -> NDArray[np.float32]:
+    def in_the_way(self, uv_px: Array, disparity_px: Array, mount: Mount) -> NDArray[np.float32]:
         """Return those of the pixels (N, 2) as positions (2, M) whose height concerns the robot."""
         camera, settings = self._camera, self._settings
         depth_m = camera.disparity_times_depth / disparity_px

@@ -165,10 +165,12 @@ class FloorSegmentation:
                 texture = np.where(measured[columns] > 0, plain, np.float32(0))
         with measure(DISPARITY):
             disparity = self._disparity(first_row, left, right) if measured is None else measured
+            movable = None
+            if said is not None:
+                movable = np.where(said == MOVING, disparity, np.float32(0))
+                disparity[said == NOT_FLOOR] = 0
             if moving is not None:
                 disparity[moving > 0] = 0
-            if said is not None:
-                disparity[said == NOT_FLOOR] = 0
         below, textured = disparity[columns], texture > enough
         with measure('plane'):
             is_fixed = self.fixture.problem is None
@@ -212,7 +214,10 @@ class FloorSegmentation:
             feet_xy = _feet(view, profile, mask, row_slope(left_view), textured)
             if below_said is not None:
                 feet_xy = np.hstack([feet_xy, _barriers(view, profile, below_said)])
-            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy)
+            movable_xy = None if movable is None else self._positions(view, movable)
+            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, movable_xy)
+        if movable is not None:
+            disparity = np.maximum(disparity, movable)
         if self._mount_check is not None and T_map_base is not None:
             self._mount_check.add(left, right if measured is None else measured, T_map_base)
         return self._observation(view, profile, disparity, mask, scan, counted)
@@ -335,9 +340,10 @@ class FloorSegmentation:
         mask: NDArray[np.uint8],
         hanging_xy: NDArray[np.float32],
         feet_xy: NDArray[np.float32],
+        movable_xy: NDArray[np.float32] | None,
     ) -> FloorScan:
-        """Return the scan. hanging_xy, feet_xy: (2, N), what is in the way above the horizon, and
-        where blank faces stand.
+        """Return the scan. hanging_xy, feet_xy, movable_xy: (2, N), what is in the way above the
+        horizon, where blank faces stand, and what is of a class that moves.
         """
         standing = (evidence.mask[::2] == NOT_FLOOR) & evidence.above[::2]
         rows, columns = pixels_where(standing)
@@ -351,7 +357,17 @@ class FloorSegmentation:
         # At half the resolution a pixel tells of four, here of two or, in every other column, four.
         hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
         upright_xy = np.hstack([upright_xy, hanging_xy])
-        return self._scanner.scan(floor, shared, upright_xy, feet_xy, 1 / (2 * view.step))
+        density = 1 / (2 * view.step)
+        return self._scanner.scan(floor, shared, upright_xy, feet_xy, density, movable_xy)
+
+    def _positions(self, view: FloorView, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return where in the base's x-y plane a disparity (H, W) shows something, (2, N); as
+        many pixels tell as of what stands.
+        """
+        rows, columns = pixels_where(disparity[::2, :: view.step] > 0)
+        uv_px = np.stack([columns * view.step, rows * 2], axis=1)
+        at = disparity[uv_px[:, 1], uv_px[:, 0]]
+        return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
 
 
 def _evidence(

@@ -39,8 +39,14 @@ NUMBERS = {
     'num_rays': int,
     'num_contacts': int,
 }
-LENGTHS = {'fan_m': 'fan_count', 'thickness_m': 'thickness_count', 'positions_m': 'position_count'}
-"""The arrays of a keyframe, and what holds their lengths."""
+LENGTHS = {
+    'fan_m': 'fan_count',
+    'thickness_m': 'thickness_count',
+    'positions_m': 'position_count',
+    'movable_m': 'movable_count',
+}
+PLACES = ('positions_m', 'movable_m')
+"""The arrays of a keyframe, and what holds their lengths; which of them are of (x, y)."""
 
 SUBPIXEL_BITS = 4
 _SLANT_STEPS, _MAX_SLANT = 3, 4.0
@@ -57,7 +63,8 @@ class KeyframeEvidence:
     that reach farther than the fan. Then come lines along what the floor ends at, num_contacts
     ends and as many starts; the others are obstacle points at any height that concerns the robot.
     thickness_m: (num_contacts,) float16, how deep the things behind these lines are taken to be.
-    sure_range_m: up to where an obstacle is placed within its cell.
+    sure_range_m: up to where an obstacle is placed within its cell. movable_m: (2, P) float16,
+    faces of things of classes that move.
     """
 
     first_rad: float
@@ -68,6 +75,7 @@ class KeyframeEvidence:
     num_contacts: int
     thickness_m: NDArray[np.float16]
     sure_range_m: float
+    movable_m: NDArray[np.float16]
 
 
 def gather_evidence(
@@ -98,6 +106,7 @@ def gather_evidence(
         num_contacts=len(starts),
         thickness_m=_thickness_m(starts, scan),
         sure_range_m=_sure_range_m(scan, settings),
+        movable_m=_movable(scan, settings),
     )
 
 
@@ -194,6 +203,13 @@ def _contacts(scan: FloorScan, faces_m: Array) -> tuple[Array, Array]:
     return start, end
 
 
+def _movable(scan: FloorScan, settings: OccupancyGridSettings) -> NDArray[np.float16]:
+    """Return where, in the base frame, faces (2, P) of things of classes that move stand."""
+    faces_m = _faces(dataclasses.replace(scan, obstacle_m=scan.movable_m), settings)
+    near = np.flatnonzero(np.isfinite(faces_m))
+    return (unit_vectors(scan.bearings_rad[near]) * faces_m[near]).astype(np.float16)
+
+
 def _thickness_m(faces: Array, scan: FloorScan) -> NDArray[np.float16]:
     """Return how deep (C,) to mark behind faces (C, 2): two sigma of their distance, and no less
     than things that stand have.
@@ -234,9 +250,10 @@ def _scan_at(scan: FloorScan, points: Array) -> tuple[Array, Array]:
     inside = (index >= 0) & (index < len(scan.ranges_m))
     index = np.clip(index, 0, len(scan.ranges_m) - 1)
     scanned = np.where(inside, np.nan_to_num(scan.ranges_m[index]), 0.0)
-    if scan.obstacle_m is None:
-        return scanned, np.full(len(points), np.inf)
-    standing = scan.obstacle_m[index]
+    standing = np.full(len(points), np.nan)
+    for seen_m in (scan.obstacle_m, scan.movable_m):
+        if seen_m is not None:
+            standing = np.fmin(standing, seen_m[index])
     return scanned, np.where(inside & np.isfinite(standing), standing, np.inf)
 
 
@@ -245,13 +262,17 @@ def evidence_to_arrays(evidence: list[KeyframeEvidence]) -> Arrays:
     numbers = [[float(getattr(e, name)) for name in NUMBERS] for e in evidence]
     arrays: Arrays = {'numbers': np.array(numbers, np.float64).reshape(-1, len(NUMBERS))}
     for name, lengths in LENGTHS.items():
-        empty = np.zeros((0, 2) if name == 'positions_m' else 0, np.float16)
+        empty = np.zeros((0, 2) if name in PLACES else 0, np.float16)
         arrays[name], arrays[lengths] = joined([getattr(e, name).T for e in evidence], empty)
     return arrays
 
 
 def evidence_from_arrays(arrays: Arrays) -> list[KeyframeEvidence]:
-    """Return what `evidence_to_arrays` took. Raises KeyError or ValueError for other arrays."""
+    """Return what `evidence_to_arrays` took, also of an earlier release. Raises KeyError or
+    ValueError for other arrays.
+    """
+    count = len(arrays['numbers'])
+    arrays = {'movable_m': np.zeros((0, 2)), 'movable_count': np.zeros(count, np.int64), **arrays}
     parts = [split(arrays[name], arrays[lengths]) for name, lengths in LENGTHS.items()]
     evidence = []
     for row, *of_one in zip(arrays['numbers'].tolist(), *parts, strict=True):

@@ -34,12 +34,15 @@ from segfloor_ros.grid.keyframe_evidence import (
     unit_vectors,
 )
 from segfloor_ros.grid.map_file import (
+    FREE,
     HIT,
     LEAST,
     MISS,
     MOST,
+    OCCUPIED,
     OCCUPIED_FROM,
     SURE,
+    UNKNOWN,
     ZERO,
     LogOddsRaster,
     OccupancyGrid,
@@ -47,7 +50,7 @@ from segfloor_ros.grid.map_file import (
     render,
     steps,
 )
-from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath
+from segfloor_ros.slam.results import MAJORITY, KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
@@ -104,7 +107,10 @@ class OccupancyGridMapper:
 
     def grid(self) -> OccupancyGrid:
         """Return the map as of the last update."""
-        return render(self._history.raster(), self._history.poses[:, :2], self._settings)
+        history = self._history
+        grid = render(history.raster(), history.poses[:, :2], self._settings)
+        mark_standing(grid, history.evidence, history.poses)
+        return grid
 
     def to_arrays(self) -> Arrays:
         """Return the evidence of all keyframes, for a file."""
@@ -149,6 +155,34 @@ class OccupancyGridMapper:
         for history in (before, latest):
             self._history.extend(history.evidence, history.poses)
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])
+
+
+def mark_standing(
+    grid: OccupancyGrid, evidence: list[KeyframeEvidence], poses: NDArray[np.float64]
+) -> None:
+    """Occupy the cells of things of classes that move which have not moved in most of the map's
+    life: most of what keyframes, at poses (K, 3) = x, y, yaw, have seen of them is in no free cell,
+    from the first of these keyframes to the last. Where things walk, the floor was free before they
+    came, or after they left.
+    """
+    keyframe = np.repeat(np.arange(len(evidence)), [e.movable_m.shape[1] for e in evidence])
+    if len(keyframe) == 0:
+        return
+    x, y = np.concatenate([e.movable_m for e in evidence], axis=1).astype(np.float64)
+    cos, sin = unit_vectors(poses[keyframe, 2])
+    cells = grid.cells_of(poses[keyframe, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], 1))
+    inside = grid.holds(cells)
+    keyframe, at = keyframe[inside], tuple(cells[inside].T)
+    seen = np.zeros(grid.cells.shape, np.uint8)
+    seen[at] = 1
+    count, label = cv2.connectedComponents(cv2.dilate(seen, np.ones((3, 3), np.uint8)))
+    thing, keeps = label[at], grid.cells[at] != FREE
+    first, last = np.full(count, len(evidence)), np.zeros(count, np.intp)
+    np.minimum.at(first, thing[keeps], keyframe[keeps])
+    np.maximum.at(last, thing[keeps], keyframe[keeps])
+    stands = last - first > MAJORITY * len(evidence)
+    stands &= np.bincount(thing, keeps, count) > MAJORITY * np.bincount(thing, None, count)
+    grid.cells[(seen > 0) & stands[label] & (grid.cells == UNKNOWN)] = OCCUPIED
 
 
 class EvidenceHistory:

@@ -375,10 +375,12 @@ def disparity_message(
 def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
     """Return the floor scan in the base's plane: how far the floor was seen, per bearing. The
     distances of upright things go into `intensities`, which stay empty where they are not known;
-    `range_max` is the range whose error is 0.3 m, one sigma.
+    those of what is of a class that moves follow them, where a network has looked. `range_max` is
+    the range whose error is 0.3 m, one sigma.
     """
     ranges = np.ascontiguousarray(scan.ranges_m, np.float32)
-    obstacles = scan.obstacle_m if scan.obstacle_m is not None else np.zeros(0, np.float32)
+    known = [one for one in (scan.obstacle_m, scan.movable_m) if one is not None]
+    standing = np.concatenate([np.zeros(0, np.float32), *known])
     steps = max(len(ranges) - 1, 0)
     return LaserScan(
         header=make_header(stamp_ns, frame_id),
@@ -388,7 +390,7 @@ def scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
         range_min=0.0,
         range_max=float(scan.range_max_m),
         ranges=array.array('f', ranges.tobytes()),
-        intensities=array.array('f', np.ascontiguousarray(obstacles, np.float32).tobytes()),
+        intensities=array.array('f', standing.tobytes()),
     )
 
 
@@ -409,13 +411,14 @@ def scan_arrays(message: LaserScan, topic: str) -> FloorScan:
     if not np.isfinite([message.angle_min, message.angle_increment]).all():
         raise InputError(f'{topic}: the angles of the scan are not finite')
     ranges = np.frombuffer(message.ranges, np.float32).copy()
-    obstacles = np.frombuffer(message.intensities, np.float32).copy()
-    if len(obstacles) not in (0, len(ranges)):
-        raise InputError(f'{topic}: {len(ranges)} ranges, but {len(obstacles)} intensities')
+    count, standing = len(ranges), np.frombuffer(message.intensities, np.float32).copy()
+    if len(standing) not in (0, count, 2 * count):
+        raise InputError(f'{topic}: {count} ranges, but {len(standing)} intensities')
     return FloorScan(
         float(message.angle_min),
         float(message.angle_increment),
         ranges,
-        obstacles if len(obstacles) else None,
+        standing[:count] if len(standing) else None,
         float(message.range_max),
+        standing[count:] if len(standing) > count else None,
     )

@@ -23,7 +23,7 @@ from segfloor_ros.camera.images import union
 from segfloor_ros.camera.model import StereoFrame
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import silent_libraries
-from segfloor_ros.files.whole import read_bytes, read_yaml
+from segfloor_ros.files.whole import check_file, read_yaml
 from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.semantics.outputs import KINDS, UNLABELLED, Segments
 from segfloor_ros.settings import suggestion
@@ -34,6 +34,8 @@ Run = Callable[[NDArray[np.float32]], list[NDArray[Any]]]
 """Gets the input (1, C, h, w) and returns the outputs in the order of the file."""
 
 logger = logging.getLogger(__name__)
+
+OR_ELSE = '; export it with dynamo=False, or set runtime: onnxruntime in its YAML file'
 
 KEPT = 32
 """Images whose labels are kept: as many frames as lie between an image and its keyframe's turn."""
@@ -124,13 +126,13 @@ class Network:
     def __init__(self, path: Path) -> None:
         if path.suffix != '.onnx':
             raise InputError(f'{path}: is no ONNX file; export the network as NAME.onnx')
-        data = read_bytes(path)
+        check_file(path)
         described = path.with_suffix('.yaml')
         if not described.is_file():
             raise InputError(f'{described}: is missing; it says what the network sees')
         self.name = str(path)
         self.settings = NetworkSettings.read(described)
-        self._run = RUNTIMES[self.settings.runtime](path, data)
+        self._run = RUNTIMES[self.settings.runtime](path)
         self._says = np.full(UNLABELLED + 1, NO_EVIDENCE, np.uint8)
         for names, value in (
             (self.settings.floor, FLOOR),
@@ -160,7 +162,8 @@ class Network:
                 outputs = self._run(given)
         except Exception as error:  # whatever the libraries raise
             what = f'cannot be run on an input of {own.input[0]}x{own.input[1]}'
-            raise InputError(f'{self.name}: {what} ({_first_line(error)})') from None
+            instead = OR_ELSE if own.runtime == 'opencv' else ''
+            raise InputError(f'{self.name}: {what} ({_first_line(error)}){instead}') from None
         try:
             return KINDS[own.kind](outputs, own, (width, height))
         except (ValueError, IndexError, TypeError, StopIteration):
@@ -175,15 +178,14 @@ class Network:
         return cv2.LUT(labels, self._says)
 
 
-def _opencv(path: Path, data: bytes) -> Run:
+def _opencv(path: Path) -> Run:
     try:
         with silent_libraries():
-            network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+            network = cv2.dnn.readNetFromONNX(str(path))
             names = network.getUnconnectedOutLayersNames()
     except (cv2.error, SystemError) as error:
         raise InputError(
-            f'{path}: OpenCV cannot read this network ({_first_line(error)}); export it anew, or '
-            'set runtime: onnxruntime in its YAML file'
+            f'{path}: OpenCV cannot read this network ({_first_line(error)}){OR_ELSE}'
         ) from None
 
     def run(given: NDArray[np.float32]) -> list[NDArray[Any]]:
@@ -193,7 +195,7 @@ def _opencv(path: Path, data: bytes) -> Run:
     return run
 
 
-def _onnxruntime(path: Path, data: bytes) -> Run:
+def _onnxruntime(path: Path) -> Run:
     try:
         import onnxruntime
     except ImportError:
@@ -201,8 +203,9 @@ def _onnxruntime(path: Path, data: bytes) -> Run:
             f"{path}: needs onnxruntime: pip install 'segfloor_ros[onnx]' (or onnxruntime)"
         ) from None
     try:
-        providers = onnxruntime.get_available_providers()
-        session = onnxruntime.InferenceSession(data, providers=providers)
+        options, providers = onnxruntime.SessionOptions(), onnxruntime.get_available_providers()
+        options.log_severity_level = 3  # errors alone
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # of types that it does not document
         raise InputError(
             f'{path}: onnxruntime cannot read this network ({_first_line(error)})'
@@ -213,7 +216,7 @@ def _onnxruntime(path: Path, data: bytes) -> Run:
     return lambda given: session.run(None, {first.name: given if has_batch else given[0]})
 
 
-RUNTIMES: dict[str, Callable[[Path, bytes], Run]] = {'opencv': _opencv, 'onnxruntime': _onnxruntime}
+RUNTIMES: dict[str, Callable[[Path], Run]] = {'opencv': _opencv, 'onnxruntime': _onnxruntime}
 
 
 def _of_type(kind: Any, value: Any) -> Any:

@@ -20,10 +20,10 @@ def fan(first_m, last_m, bearings_deg=(-10, 10), per_m=100):
     return np.stack([(r * np.cos(b)).ravel(), (r * np.sin(b)).ravel()]).astype(np.float32)
 
 
-def scan(*stretches_m, upright=None, feet=None, blind_from_deg=90.0):
+def scan(*stretches_m, upright=None, feet=None, blind_from_deg=90.0, movable=None):
     """The scan of floor in stretches of range within 10 degrees of straight ahead; to the left of
     blind_from_deg one camera alone sees it. upright, feet: (2, N), what stands, and where blank
-    faces do.
+    faces do; movable: what is of a class that moves.
     """
     scanner = FloorScanner(CAMERA, MOUNT, SETTINGS)
     x, y = scanner.cells_xy
@@ -33,7 +33,7 @@ def scan(*stretches_m, upright=None, feet=None, blind_from_deg=90.0):
         floor |= (ranges > first_m) & (ranges < last_m) & (np.abs(bearings_deg) < 10)
     nothing = np.zeros((2, 0), np.float32)
     points, lines = (nothing if given is None else given for given in (upright, feet))
-    return scanner.scan(floor, bearings_deg < blind_from_deg, points, lines, 0.5)
+    return scanner.scan(floor, bearings_deg < blind_from_deg, points, lines, 0.5, movable)
 
 
 def at(result, values, bearing_deg=0.0):
@@ -107,6 +107,15 @@ def test_a_lone_match_does_not_end_the_scan():
     lone = np.array([[1.0], [0.0]], np.float32)
     result = scan((0.35, 3.0), upright=lone)
     assert at(result, result.ranges_m) > 2.6
+
+
+def test_what_is_of_a_class_that_moves_ends_the_floor_and_is_no_obstacle():
+    result = scan((0.35, 3.0), movable=np.repeat(fan(2.0, 2.02, (-5, 5)), 60, axis=1))
+    assert 1.8 < at(result, result.ranges_m) < 2.0
+    assert np.isnan(at(result, result.obstacle_m))
+    assert at(result, result.movable_m) == pytest.approx(2.01, abs=0.03)
+    assert np.isnan(at(result, result.movable_m, 8.0))
+    assert scan((0.35, 3.0)).movable_m is None
 
 
 def test_right_in_front_is_zero():

@@ -58,6 +58,7 @@ class Drive:
     error_per_m: float = 0.002
     miss_share: float = 0.0
     leak_share: float = 0.0
+    movable: World | None = None
     poses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def scan(self, world: World, pose: tuple[float, float, float]) -> FloorScan:
@@ -71,12 +72,21 @@ class Drive:
         leaks = self.noise.random(count) < self.leak_share
         floor = np.minimum(np.where(leaks, seen + 1.5, seen), SIGHT_M)
         obstacle = np.where(leaks | (seen > SIGHT_M), np.nan, seen)
+        movable = None
+        if self.movable is not None:
+            ends = self.movable.distance_m(pose[0], pose[1], pose[2] + bearing)
+            hides = ends < floor
+            # The end of floor that fades out is less certain than that at an obstacle.
+            floor = np.minimum(floor, ends - 0.1)
+            obstacle = np.where(hides, np.nan, obstacle)
+            movable = np.where(hides, ends, np.nan).astype(np.float32)
         return FloorScan(
             -FIELD_OF_VIEW_RAD / 2,
             step,
             floor.astype(np.float32),
             obstacle.astype(np.float32),
             RANGE_MAX_M,
+            movable,
         )
 
     def look(

@@ -44,5 +44,6 @@ def test_a_ray_to_a_floor_point_ends_half_a_cell_before_it(length_m: float, last
         num_contacts=0,
         thickness_m=np.zeros(0, np.float16),
         sure_range_m=5.0,
+        movable_m=np.zeros((2, 0), np.float16),
     )
     assert changed_cells(evidence) == {(0, row) for row in range(last + 1)}

@@ -320,3 +320,44 @@ def test_a_wall_of_a_hand_s_breadth_has_free_floor_on_both_sides(make_drive: Mak
             drive.look(ended_wall(2.1), (4.0 - x, y, math.pi))
     for beside in ((1.9, 2.0), (2.1, 2.2)):
         assert (cells_at(drive.grid(), centres(beside, (0.0, 0.5))) == 0).all()
+
+
+def test_what_could_move_is_in_the_map_where_it_stood_for_most_of_its_life(
+    make_drive: MakeDrive,
+) -> None:
+    parked, gone, left = (2.0, 0.8, 0.3), (2.0, -0.9, 0.3), (3.2, 0.0, 0.2)
+    there = [World(discs=discs) for discs in ((parked, gone, left), (parked, left), (parked,))]
+    drive = make_drive(OccupancyGridSettings(), movable=there[0])
+    at = {disc: centres((disc[0] - 0.3, disc[0]), (disc[1] - 0.2, disc[1] + 0.2)) for disc in
+          (parked, gone, left)}  # fmt: skip
+
+    def is_there(disc: tuple[float, float, float]) -> bool:
+        return bool((cells_at(drive.grid(), at[disc]) == 100).any())
+
+    for pose in AHEAD[:20]:
+        drive.look(ROOM, pose)
+    assert is_there(parked) and is_there(gone) and is_there(left)
+    # The first one leaves in view, the second one while nobody looks.
+    drive.movable = there[1]
+    for pose in AHEAD[20:45]:
+        drive.look(ROOM, pose)
+    assert is_there(parked) and not is_there(gone) and is_there(left)
+    drive.movable = there[2]
+    for x, y, _ in AHEAD[45:]:
+        drive.look(ROOM, (x, y, math.pi))
+    assert not (is_there(parked) or is_there(gone) or is_there(left))
+    for x, y, _ in AHEAD[45:]:
+        drive.look(ROOM, (x - 1, y, math.pi))
+    drive.look(ROOM, (0.0, 0.0, 0.0))
+    assert is_there(parked) and not (is_there(gone) or is_there(left))
+
+
+def test_maps_of_earlier_releases_hold_nothing_that_could_move(make_drive: MakeDrive) -> None:
+    drive = make_drive(OccupancyGridSettings())
+    for pose in AHEAD[:20:4]:
+        drive.look(ROOM, pose)
+    arrays = drive.mapper.to_arrays()
+    old = {name: a for name, a in arrays.items() if not name.startswith('movable')}
+    read = make_drive(OccupancyGridSettings())
+    read.mapper.from_arrays(old, old['stamp_ns'])
+    np.testing.assert_array_equal(read.grid().cells, drive.grid().cells)

@@ -313,18 +313,20 @@ def test_clouds_that_contradict_themselves_are_refused_by_name() -> None:
 
 def test_the_floor_scan_survives() -> None:
     ranges = np.array([0.0, np.nan, 2.5], np.float32)
-    for obstacles in (None, np.array([1.0, np.nan, np.nan], np.float32)):
-        scan = FloorScan(-0.5, 0.25, ranges, obstacles, 8.25)
+    standing = np.array([1.0, np.nan, np.nan], np.float32)
+    for obstacles, movable in ((None, None), (standing, None), (standing, ranges)):
+        scan = FloorScan(-0.5, 0.25, ranges, obstacles, 8.25, movable)
         message = over_the_wire(arrays.scan_message(STAMP_NS, 'base_link', scan))
         assert (message.angle_min, message.angle_max) == (-0.5, 0.0)
         back = arrays.scan_arrays(message, 'scan')
         assert (back.angle_min_rad, back.angle_increment_rad) == (-0.5, 0.25)
         assert back.range_max_m == 8.25
         np.testing.assert_array_equal(back.ranges_m, ranges)
-        if obstacles is None:
-            assert back.obstacle_m is None
-        else:
-            np.testing.assert_array_equal(back.obstacle_m, obstacles)
+        for found, expected in ((back.obstacle_m, obstacles), (back.movable_m, movable)):
+            if expected is None:
+                assert found is None
+            else:
+                np.testing.assert_array_equal(found, expected)
 
 
 def test_the_disparity_image_gives_depth() -> None:
