@@ -145,7 +145,7 @@ class StereoSlam:
                 result = self._result(frame, None, '', None)
                 return self._hold(_carried(result, self.front_end.motion, self._covariance()))
             if not fault:
-                self.rig_check.watch(frame)
+                self.rig_check.watch(frame, self.front_end.motion.turn_rad(frame.stamp_ns))
                 frame = self.rig_check.corrected(frame)
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = (

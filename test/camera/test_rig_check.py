@@ -181,6 +181,20 @@ def test_a_wrong_focal_length_shows_in_turns(turning, factor) -> None:
     assert 'turns show 1' in found['focal_length'].line()  # 160 px
 
 
+def test_a_turn_after_a_long_way_shows_the_focal_length() -> None:
+    """Once nothing was found in motion few frames are looked at, but turns are."""
+    room = StereoRoom(seed=5)
+    check = RigCheck(replace(CAMERA, fx=0.9 * CAMERA.fx, fy=0.9 * CAMERA.fy))
+    straight, turn_rad = round(2.2 * SETTLED_FRAMES), np.radians(1.5)
+    for i in range(straight):
+        check.watch(room.frame(i, planar_pose(0.04 * i, 0.0, 0.0)))
+    assert check.faults == {}
+    for k in range(SETTLED_FRAMES // 2):
+        pose = planar_pose(0.04 * straight + 0.01 * k, 0.0, turn_rad * k)
+        check.watch(room.frame(straight + k, pose), turn_rad)
+    assert set(check.faults) == {'focal_length'}
+
+
 def test_a_wrong_focal_length_is_not_said_of_a_straight_drive() -> None:
     room = StereoRoom(seed=5)
     straight = [room.frame(i, planar_pose(0.03 * i, 0.0, 0.0)) for i in range(SETTLED_FRAMES)]

@@ -25,6 +25,7 @@ from segfloor_ros.camera.rig.estimates import (
     LEAST_NOISE_PX,
     MAX_HAMMING,
     MIN_MATCHES,
+    MIN_TURN_RAD,
     ROWS_PX,
     SURE,
     WINDOW_PX,
@@ -185,21 +186,25 @@ class RigCheck:
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
         self._frame_s = 0.0
         self._moving_looks = self._watched = 0
+        self._has_gap = False
         self._depth = DepthCheck()
         self._calibration = CalibrationCheck(camera)
 
     @timed
-    def watch(self, frame: StereoFrame) -> None:
+    def watch(self, frame: StereoFrame, turn_rad: float = 0.0) -> None:
         """Take in a frame of a drive: each one until nothing was found in motion, then one burst in
-        fifty frames.
+        fifty frames, and turns until the calibration is known. turn_rad: since the frame before.
         """
         self._watched += 1
         is_settled = self._moving_looks >= RECENT and not self.faults
-        since_burst = self._watched % SETTLED_FRAMES
-        if is_settled and since_burst == 0:
+        is_turn = turn_rad * (EVERY // 2) > MIN_TURN_RAD and not self._calibration.is_done
+        if is_settled and not is_turn and self._watched % SETTLED_FRAMES >= BURST:
+            self._has_gap = True
+            return
+        if self._has_gap:
             self.jump()
-        if not is_settled or since_burst < BURST:
-            self.see(frame)
+        self._has_gap = False
+        self.see(frame)
 
     def see(self, frame: StereoFrame) -> None:
         """Take in a frame that shows something."""
