@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from types import FrameType
@@ -79,11 +79,8 @@ def terminated_like_interrupted() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, end)
-    try:
+    with _handled_by(end, (signal.SIGTERM,)):
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager
@@ -101,11 +98,8 @@ def interrupts_deferred() -> Iterator[None]:
     def note(number: int, frame: FrameType | None) -> None:
         received.append(number)
 
-    handlers = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
+    with _handled_by(note):
         yield
-    finally:
-        _restore(handlers)
     if received:
         signal.raise_signal(received[0])
 
@@ -120,15 +114,24 @@ def first_interrupt_noted() -> Iterator[Interrupt]:
     def note(number: int, frame: FrameType | None) -> None:
         event.number = number
         event.set()
-        _restore(handlers)
+        restore()
 
-    handlers = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
+    with _handled_by(note) as restore:
         yield event
+
+
+@contextlib.contextmanager
+def _handled_by(
+    handle: Callable[[int, FrameType | None], None], signals: Sequence[signal.Signals] = SIGNALS
+) -> Iterator[Callable[[], None]]:
+    """Handle signals within the block otherwise; yields what restores the handlers before."""
+    before = {number: signal.signal(number, handle) for number in signals}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    try:
+        yield restore
     finally:
-        _restore(handlers)
-
-
-def _restore(handlers: dict[signal.Signals, signal._HANDLER]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+        restore()

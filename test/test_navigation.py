@@ -107,6 +107,18 @@ def test_a_scan_clears_what_it_passes_and_nothing_else() -> None:
         assert explorer.obstacles.tolist() == [list(point[:2]) for point in kept]
 
 
+def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None:
+    explorer = Explorer(BODY, 0)
+    # Free to the left of ahead for 2 m, to the right of it for half a metre.
+    ranges = np.where(np.arange(11) >= 7, 2.0, 0.5).astype(np.float32)
+    scan = FloorScan(-0.5, 0.1, ranges, None, 4.0)
+    T_map_base = pose_of(3.0, -1.0, np.pi / 2)
+    left, right = np.array([[1.0, 0.35, 0.1], [1.0, -0.35, 0.1]])
+    in_map = np.array([T_map_base[:3, :3] @ p + T_map_base[:3, 3] for p in (left, right)])
+    explorer.take_obstacles(in_map, scan, T_map_base)
+    np.testing.assert_allclose(explorer.obstacles, in_map[1:, :2])
+
+
 class Drive:
     """A robot on a true map, of which it sees what lies before it within some metres."""
 

@@ -74,12 +74,21 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         written.unlink(missing_ok=True)
 
 
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file that was named, in place of an older one. Raises InputError."""
+@contextmanager
+def writing(path: Path) -> Iterator[IO[bytes]]:
+    """Write a file that was named, in place of an older one, to the disk. Raises InputError."""
     with os_errors(f'{path}: cannot be written'):
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write(content)
+        with replacing(path.absolute()) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file that was named, in place of an older one. Raises InputError."""
+    with writing(path) as file:
+        file.write(content)
 
 
 def check_writable(
@@ -275,13 +284,8 @@ class MapFile:
 
 def write_map_file(path: Path, saved: MapFile) -> None:
     """Write a map in place of an older file. Raises InputError where that is not possible."""
-    path = path.absolute()
-    with os_errors(f'{path}: cannot be written'):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            write_to(file, saved)
-            file.flush()
-            os.fsync(file.fileno())
+    with writing(path.absolute()) as file:
+        write_to(file, saved)
 
 
 def read_map_file(path: Path) -> MapFile:

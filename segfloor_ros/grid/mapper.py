@@ -80,7 +80,6 @@ class OccupancyGridMapper:
     def change_settings(self, settings: OccupancyGridSettings) -> None:
         """Map with changed live settings from now on, old evidence included."""
         self._settings = settings
-        self._history.fold_anew(EvidenceFolder(settings))
 
     def update(
         self,
@@ -222,11 +221,6 @@ class EvidenceHistory:
         self._return_to(int(np.argmax(gone)))
         self.evidence = [e for e, g in zip(self.evidence, gone, strict=True) if not g]
         self.poses = self.poses[~gone]
-
-    def fold_anew(self, folder: EvidenceFolder) -> None:
-        """Fold all evidence again by other rules."""
-        self._folder = folder
-        self._start_over()
 
     def raster(self) -> LogOddsRaster:
         """Return the raster of all keyframes."""

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from camera_recordings import grey_pairs, opened, sensor_yaml, write_folders, write_kitti
+from camera_recordings import (
+    calibration,
+    grey_pairs,
+    opened,
+    sensor_yaml,
+    write_folders,
+    write_kitti,
+)
 from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.bag_writer import BagWriter, ImageCoding, convert
+from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.model import ImuSample, MeasurementLog
 from segfloor_ros.camera.sources import StereoSource
 from segfloor_ros.errors import InputError
@@ -120,6 +130,11 @@ def test_wheels_imu_and_depth_are_kept(tmp_path: Path, distorted: bool, beside: 
     pairs = grey_pairs(3)
     if distorted:
         folder = write_folders(tmp_path / 'images', pairs, distorted=True)
+        for side in ('left', 'right'):  # the rectified axes are not those of the raw images
+            eye = getattr(calibration(distorted=True), side)
+            turned = Rotation.from_rotvec((0.05, -0.1, 0.2)).as_matrix()
+            path = folder / f'{side}.yaml'
+            write_ros_calibration(path, dataclasses.replace(eye, R=turned), side)
     else:
         folder = write_kitti(tmp_path / 'images', pairs)
     (folder / 'wheel_odometry.txt').write_text(WHEELS)

@@ -160,6 +160,13 @@ def test_what_has_come_and_what_has_gone(first):
         }
 
 
+def test_what_stands_beside_what_stood_has_not_come(first):
+    earlier = with_post(first, np.array([2.0, 0.2]))
+    for apart_m, has_come in ((0.05, False), (0.3, True)):
+        _, change = changes(earlier, with_post(earlier, np.array([2.0 + apart_m, 0.2])))
+        assert (change == 1).any() == has_come
+
+
 def test_nothing_has_changed_where_nothing_did(first, second):
     _, change = changes(first, second)
     assert (change != 0).sum() <= 4

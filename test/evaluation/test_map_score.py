@@ -180,10 +180,12 @@ def test_recall_counts_only_the_observable_floor():
     half[:, 11:] = -1
     estimate = OccupancyGrid(half, 0.1, (0.0, 0.0))
     drive = np.array([[1.05, 0.5, np.pi]])
-    assert score_map(estimate, MapTruth(truth), plan=FEW).cells.free_recall == 0.5
+    whole = score_map(estimate, MapTruth(truth), plan=FEW)
+    assert whole.cells.free_recall == 0.5
     score = score_map(estimate, MapTruth(truth, base_poses=drive), plan=FEW)
     assert score.observable_only
     assert score.cells.free_recall == 1.0
+    assert score.raw.recall.mean == 1.0 > whole.raw.recall.mean
 
 
 @pytest.mark.parametrize('near', [None, (1.05, -0.6, 0.55)])

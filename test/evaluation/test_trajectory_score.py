@@ -1,7 +1,10 @@
 """Trajectory files and errors worked out by hand."""
 
+import json
+
 import numpy as np
 import pytest
+from command_line import segfloor
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import InputError
@@ -73,6 +76,16 @@ def test_lost_frames_are_reported(tmp_path):
     assert result.matched == 71
     assert result.frames == 101
     assert result.tracked == pytest.approx(71 / 101)
+
+
+def test_frames_that_are_named_count_as_lost_where_they_have_no_pose(tmp_path):
+    for name in ('truth.txt', 'estimate.txt'):
+        write_tum(tmp_path / name, drive())
+    found = segfloor('evaluate', 'trajectory', tmp_path / 'estimate.txt', tmp_path / 'truth.txt',
+                     '--frames', 202, '--json')  # fmt: skip
+    score = json.loads(found.stdout)
+    assert (score['frames'], score['matched']) == (202, 101)
+    assert score['tracked'] == pytest.approx(0.5)
 
 
 def test_denser_truth_does_not_count_as_lost_frames(tmp_path):

@@ -78,6 +78,16 @@ def test_demo_maps_and_scores(tmp_path):
     assert float(occupied[3]) > 94.0
 
 
+def test_finer_rendering_is_another_picture_of_the_same(files, tmp_path):
+    noiseless = ('--set', 'camera.noise_sigma=0', '--set', 'path.waypoints=[[0, 0], [0.1, 0]]')
+    images = []
+    for finer in (1, 3):
+        simulate(tmp_path / f'{finer}', *noiseless, '--supersampling', finer)
+        images.append(cv2.imread(str(tmp_path / f'{finer}' / 'image_0' / '000000.png'), -1))
+    off = cv2.absdiff(*images)
+    assert 0.5 < off.mean() < 10 and off.max() > 20
+
+
 def test_simulate_writes_a_folder_that_can_be_read(files):
     source = open_source(StereoCameraSettings(input=str(files)))
     assert source.calibration.camera.fx == pytest.approx(80.0)

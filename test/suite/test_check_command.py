@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -138,6 +139,10 @@ def test_what_decides_the_result_is_in_its_key(room, tmp_path):
     assert len(set(keys)) == 4
     assert elsewhere.content_digest([room]) == keys[0]
     assert elsewhere.digest() != job.digest()
+    # What continues another map is another one, and so is one that is continued.
+    others = [dataclasses.replace(job, origin='a'), dataclasses.replace(job, origin='b'),
+              dataclasses.replace(job, is_continued=True)]  # fmt: skip
+    assert len({one.digest() for one in (job, *others)}) == 4
 
 
 def truth_of_room(folder: Path) -> Path:

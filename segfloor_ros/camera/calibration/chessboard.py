@@ -389,26 +389,20 @@ def _solve(
     """
     boards = [board.corners_m[view.ids] for view in views]
     left, right = ([view.corners[side] for view in views] for side in (0, 1))
-    K, D = [], []
-    for pixels in (left, right):
-        _, intrinsics, distortion, *_ = cv2.calibrateCamera(
-            boards, pixels, size, None, None, criteria=SOLVER_END
-        )
-        K.append(intrinsics)
-        D.append(distortion)
+    lenses = [
+        cv2.calibrateCamera(boards, pixels, size, None, None, criteria=SOLVER_END)[1:3]
+        for pixels in (left, right)
+    ]
     rms_px, K1, D1, K2, D2, R, t, *_, errors_px = cv2.stereoCalibrateExtended(
-        boards, left, right, K[0], D[0], K[1], D[1], size, np.zeros((3, 3)), np.zeros((3, 1)),
+        boards, left, right, *lenses[0], *lenses[1], size, np.zeros((3, 3)), np.zeros((3, 1)),
         flags=cv2.CALIB_USE_INTRINSIC_GUESS, criteria=SOLVER_END,
     )  # fmt: skip
-    eyes = (_raw_eye(K1, D1, size, name), _raw_eye(K2, D2, size, name))
+    left_eye, right_eye = (
+        EyeCalibration.of_raw(size, K, D.ravel()[:5], origin=name) for K, D in ((K1, D1), (K2, D2))
+    )
     T_right_left = make_transform(R, t.ravel())
-    calibration = StereoCalibration.from_extrinsics(*eyes, T_right_left)
+    calibration = StereoCalibration.from_extrinsics(left_eye, right_eye, T_right_left)
     return calibration, float(rms_px), np.asarray(errors_px).reshape(-1, 2)
-
-
-def _raw_eye(K: Array, D: Array, size: tuple[int, int], name: str) -> EyeCalibration:
-    P = np.hstack([K, np.zeros((3, 1))])
-    return EyeCalibration(*size, K, D.ravel()[:5], np.eye(3), P, origin=name)
 
 
 def _rows_rms_px(calibration: StereoCalibration, view: View) -> float:

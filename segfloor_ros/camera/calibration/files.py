@@ -203,15 +203,16 @@ def _euroc_eye(document: Mapping[str, Any], origin: str) -> EyeCalibration:
             f'{origin}: unknown camera model {lens}; calibrate it as pinhole, of a fisheye with '
             'the distortion model equidistant'
         )
-    width, height = _numbers(document['resolution'], 2, f'{origin}, resolution').astype(int)
+    width, height = (
+        _numbers(document['resolution'], 2, f'{origin}, resolution').astype(int).tolist()
+    )
     fu, fv, cu, cv = _numbers(document['intrinsics'], 4, f'{origin}, intrinsics')
     K = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
     words = ('distortion_coefficients', 'distortion_coeffs')
     word = next((word for word in words if word in document), words[0])
     D = _numbers(document.get(word, []), None, f'{origin}, {word}')
-    P = np.hstack([K, np.zeros((3, 1))])
     model = str(document.get('distortion_model', 'plumb_bob'))
-    return EyeCalibration(int(width), int(height), K, D, np.eye(3), P, model, origin)
+    return EyeCalibration.of_raw((width, height), K, D, model, origin)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

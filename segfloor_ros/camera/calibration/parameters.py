@@ -96,6 +96,15 @@ class EyeCalibration:
         matrix = np.asarray(P, np.float64).reshape(3, 4)
         return cls(width, height, matrix[:, :3], np.zeros(5), np.eye(3), matrix, origin=origin)
 
+    @classmethod
+    def of_raw(
+        cls, size: tuple[int, int], K: Array, D: Array, model: str = 'plumb_bob', origin: str = ''
+    ) -> EyeCalibration:
+        """Return the calibration of a camera of a size (width, height) of which no more is known
+        than its intrinsics (3, 3) and distortion.
+        """
+        return cls(*size, K, D, np.eye(3), np.hstack([K, np.zeros((3, 1))]), model, origin)
+
     @property
     def is_straight(self) -> bool:
         """Whether the lens is a pinhole: a fisheye is none, whatever its coefficients."""

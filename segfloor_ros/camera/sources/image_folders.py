@@ -390,11 +390,8 @@ def _tum_camera(folder: Path, images: Sequence[Path]) -> EyeCalibration:
         value for key, value in TUM_CAMERAS.items() if key in folder.resolve().name
     )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    width, height = files.first_image_size(images, str(folder))
-    P = np.hstack([K, np.zeros((3, 1))])
-    return EyeCalibration(
-        width, height, K, np.array(distortion), np.eye(3), P, origin='the TUM RGB-D benchmark'
-    )
+    size = files.first_image_size(images, str(folder))
+    return EyeCalibration.of_raw(size, K, np.array(distortion), origin='the TUM RGB-D benchmark')
 
 
 def _read_list(index: Path) -> list[Stamped[Path]]:
