@@ -223,7 +223,7 @@ class LockstepRun:
             mount,
             self._summary(wall_s, grid is not None),
             self._configuration,
-            stages.labels(grid, path),
+            stages.labels(grid),
         )
 
     @property

@@ -23,7 +23,7 @@ from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.semantics.label_map import LabelMap, Labels
+from segfloor_ros.semantics.label_map import LABELS, LabelMap, Labels
 from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.slam.results import (
     FrameResult,
@@ -71,10 +71,12 @@ class KeyframeStages:
         self.map_updates = 0
         self._is_loaded = False
         self._times = times
-        self._labeller, self._label_map = labeller, None
+        self._labeller, self._label_map = labeller, LabelMap(camera)
+        self._path = KeyframePath(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
         if labeller is not None:
-            height_m = configuration.floor_segmentation.robot_height_m
-            self._label_map = LabelMap(camera, len(labeller.classes), height_m)
+            height_m, own = configuration.floor_segmentation.robot_height_m, labeller.network
+            classes, moves = own.settings.classes, own.settings.moves
+            self._label_map = LabelMap(camera, classes, height_m, moves)
         has_mount = configuration.stereo_slam.has_mount
         self.floor = FloorSegmentation(
             camera, configuration.floor_segmentation, checks_mount=has_mount
@@ -91,7 +93,7 @@ class KeyframeStages:
             floor = self.floor.process(
                 keyframe.left, keyframe.right, mount, keyframe.T_map_base, keyframe.moving, said
             )
-        if self._labeller is not None and self._label_map is not None:
+        if self._labeller is not None:
             labels = self._labeller.labels(keyframe.stamp_ns, keyframe.left)
             self._label_map.add(
                 keyframe.stamp_ns,
@@ -102,9 +104,11 @@ class KeyframeStages:
                 keyframe.features,
                 floor.scan.range_max_m,
             )
-        path, cloud = keyframe.path, keyframe.cloud
+        self._path, cloud = keyframe.path, keyframe.cloud
         self.update_map(
-            MapInput(keyframe.stamp_ns, keyframe.features, path, cloud, floor.mask, floor.scan)
+            MapInput(
+                keyframe.stamp_ns, keyframe.features, self._path, cloud, floor.mask, floor.scan
+            )
         )
         return floor
 
@@ -126,23 +130,22 @@ class KeyframeStages:
         of_network = self._labeller.remarks if self._labeller is not None else []
         return [*of_network, *self.floor.remarks.values()]
 
-    def labels(self, grid: OccupancyGrid | None, path: KeyframePath) -> Labels | None:
+    def labels(self, grid: OccupancyGrid | None) -> Labels | None:
         """Return the labels of the map, with its keyframes where they lie now; None where no
         network has looked at them.
         """
-        if self._labeller is None or self._label_map is None or self.labelled is None:
+        if self.labelled is None:
             return None
-        cells = None if grid is None else self._label_map.cells(grid, path)
-        points = self._label_map.points(self.labelled.point_id)
-        return Labels(self._labeller.classes, cells, points)
+        return self._label_map.labels(grid, self._path, self.labelled.point_id)
 
     def note_points(self, cloud: SparseCloud) -> None:
         """Take in the points of a keyframe whose floor is not segmented."""
         self.labelled = self._labelling.labelled(cloud)
 
     def to_arrays(self) -> dict[str, Arrays]:
-        """Return what is known of points and grid, for a file."""
-        return {'cloud': self._labelling.to_arrays(), 'grid': self._mapper.to_arrays()}
+        """Return what is known of points, grid and classes, for a file."""
+        parts = {'cloud': self._labelling.to_arrays(), 'grid': self._mapper.to_arrays()}
+        return parts | ({LABELS: self._label_map.to_arrays()} if self._label_map.classes else {})
 
     def load(self, parts: dict[str, Arrays], loaded: LoadedMap, name: str) -> None:
         """Go on with a map that SLAM has loaded. Raises InputError, by the file's name, for parts
@@ -152,6 +155,9 @@ class KeyframeStages:
             self._labelling.from_arrays(parts['cloud'])
             self.labelled = self._labelling.labelled(loaded.cloud)
             self._mapper.from_arrays(parts['grid'], parts['grid']['stamp_ns'] + loaded.shift_ns)
+            self._path = loaded.path
+            if LABELS in parts:
+                self._label_map.from_arrays(parts[LABELS], loaded.shift_ns)
         except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
             raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
         self._is_loaded = True

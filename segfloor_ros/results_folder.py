@@ -39,7 +39,9 @@ from segfloor_ros.slam.results import FrameResult
 from segfloor_ros.trajectory import Trajectory, write_tum
 
 MAP, REPORT = 'map.yaml', 'report.html'
-LABEL_FILES = ('map_semantic.png', 'map_labels.yaml', 'map_labels.pgm', 'point_labels.csv')
+SEMANTIC = 'map_semantic.png'
+POINT_LABELS = 'point_labels.csv'
+LABEL_FILES = (SEMANTIC, 'map_labels.yaml', 'map_labels.pgm', POINT_LABELS)
 PICTURES = ('floor_masks', 'moving_masks', 'floor_debug')
 OUTPUT_NAMES = (
     *PICTURES,
@@ -346,13 +348,13 @@ def _label_writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
     rows = [f'{i},{names[k]}' for i, k in zip(cloud.point_id, labels.points, strict=True)]
     points = '\n'.join(['id,class', *rows]) + '\n'
     of_points: dict[str, Callable[[Path], object]] = {
-        'point_labels.csv': lambda path: path.write_text(points)
+        POINT_LABELS: lambda path: path.write_text(points)
     }
     if grid is None or labels.cells is None:
         return of_points
     return of_points | {
         'map_labels.yaml': lambda path: save_labels(path, grid, labels),
-        'map_semantic.png': lambda path: path.write_bytes(png_bytes(draw_labels(grid, labels))),
+        SEMANTIC: lambda path: path.write_bytes(png_bytes(draw_labels(grid, labels))),
     }
 
 

@@ -33,7 +33,14 @@ from segfloor_ros.grid.map_file import (
     save_map,
 )
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.semantics.label_map import filter_mask
+from segfloor_ros.semantics.label_map import (
+    LABELS,
+    LabelMap,
+    Labels,
+    draw_labels,
+    filter_mask,
+    save_labels,
+)
 from segfloor_ros.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
 from segfloor_ros.slam.results import KeyframePath, SparseCloud
@@ -88,6 +95,9 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ('camera', f'{facts["camera"]}, {facts["camera_height_m"]:.2f} m above the floor'),
         ('file', f'{facts["file_mb"]:.1f} MB'),
     ]
+    if facts['classes_m2']:
+        areas = (f'{name} {area:.1f} m²' for name, area in facts['classes_m2'].items())
+        rows.append(('classes', ', '.join(areas)))
     for number, session in enumerate(facts['sessions'], 1):
         began, ended = session['first_ns'] / 1e9, session['last_ns'] / 1e9
         words = f'{_date(began)}, {ended - began:.0f} s, {session["keyframes"]} keyframes'
@@ -108,13 +118,21 @@ def export(
     path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map.')],
     out: Annotated[Path, typer.Argument(metavar='MAP.yaml', help='Map for map_server and Nav2.')],
 ) -> None:
-    """Write the occupancy grid of a saved map, as Nav2's map_server reads it.
+    """Write the occupancy grid of a saved map, as Nav2's map_server reads it; where a network has
+    looked, the classes beside it.
 
     \b
     segfloor map export building.map building.yaml
     """
-    save_map(open_map(path).grid(), out)
+    saved = open_map(path)
+    grid, labels = saved.grid(), saved.labels()
+    save_map(grid, out)
     typer.echo(f'map: {out}')
+    if labels is not None:
+        beside, picture = (out.with_name(out.stem + n) for n in ('_labels.yaml', '_semantic.png'))
+        save_labels(beside, grid, labels)
+        write_file(picture, png_bytes(draw_labels(grid, labels)))
+        typer.echo(f'classes: {beside}, {picture}')
 
 
 @app.command('merge')
@@ -204,6 +222,13 @@ class SavedMap:
         """Return the occupancy grid."""
         return grid_of(self.file.parts['grid'])
 
+    def labels(self) -> Labels | None:
+        """Return the classes of cells and points, None where no network has looked."""
+        loaded, known = loaded_map(self.file, 0), LabelMap(saved_camera(self.file, self.name))
+        if LABELS in self.file.parts:
+            known.from_arrays(self.file.parts[LABELS])
+        return known.labels(self.grid(), loaded.path, loaded.cloud.point_id)
+
     def facts(self) -> dict[str, Any]:
         """Return what the map holds, by name: counts, areas in m², metres."""
         slam, camera, mount = self.slam, saved_camera(self.file, self.name), mount_of(self.file)
@@ -224,8 +249,17 @@ class SavedMap:
             ],
             'camera': f'{camera.width}x{camera.height}, baseline {camera.baseline_m:.3f} m',
             'camera_height_m': round(mount.height_m, 3),
+            'classes_m2': self._classes_m2(grid),
             'sessions': sessions_of(self.file),
         }
+
+    def _classes_m2(self, grid: OccupancyGrid) -> dict[str, float]:
+        labels = self.labels()
+        if labels is None:
+            return {}
+        cells = np.asarray(labels.cells)
+        areas = {n: round(grid.area_m2(cells == i), 2) for i, n in enumerate(labels.classes)}
+        return {name: area for name, area in areas.items() if area}
 
 
 def open_map(path: Path) -> SavedMap:
@@ -265,6 +299,15 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     both = first.file, added
     merged.parts['cloud'] = _labels(loaded_map(merged, 0).cloud, both)
     merged.parts['grid'] = _evidence(loaded_map(merged, 0).path, both)
+    known = LabelMap(camera)
+    with _parts_that_fit(f'{first.name} or {second.name}'):
+        if LABELS in first.file.parts:
+            known.from_arrays(first.file.parts[LABELS])
+        if LABELS in second.file.parts:
+            shift_ns, first_id = gap_ns(first.slam, second.slam), int(first.slam['num_ever'])
+            known.from_arrays(second.file.parts[LABELS], shift_ns, first_id)
+    if known.classes:
+        merged.parts[LABELS] = known.to_arrays()
     return SavedMap(f'{first.name} and {second.name}', merged)
 
 

@@ -24,14 +24,25 @@ from segfloor_ros.cli.terminal import console, progress_bar
 from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, SettingsError
-from segfloor_ros.files.images import jpeg_bytes, read_mask
+from segfloor_ros.files.images import jpeg_bytes, read_mask, read_picture
 from segfloor_ros.files.results import check_writable
+from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import FloorObservation
 from segfloor_ros.floor.segmentation import mask_overlay
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.results_folder import MAP, MOUNT_FIGURES, RunResult, read_summary, summary_rows
+from segfloor_ros.results_folder import (
+    MAP,
+    MOUNT_FIGURES,
+    POINT_LABELS,
+    SEMANTIC,
+    RunResult,
+    read_summary,
+    summary_rows,
+)
+from segfloor_ros.semantics.label_map import class_colours, draw_labels
+from segfloor_ros.semantics.outputs import UNLABELLED
 from segfloor_ros.slam.results import FrameResult, Keyframe, KeyframePath, MovingPoints
 from segfloor_ros.trajectory import read_trajectory
 
@@ -57,7 +68,8 @@ FLOOR_RGB, UNKNOWN_RGB, MOVING_RGB = (58, 166, 85), (150, 150, 150), (225, 40, 2
 
 BASE = 'world/base'
 CAMERA = f'{BASE}/camera'
-KEYFRAME, RIGHT, TIMES, TEXT, ABOUT = 'keyframe', 'right', 'ms', 'log', 'about'
+KEYFRAME, RIGHT, CLASSES = 'keyframe', 'right', 'classes'
+TIMES, TEXT, ABOUT = 'ms', 'log', 'about'
 
 
 @contextmanager
@@ -157,6 +169,12 @@ class View:
         self.path(stamp_ns, KeyframePath(path.stamp_ns, path.poses))
         self.cloud(stamp_ns, result.labelled)
         self.grid(stamp_ns, result.grid)
+        labels = result.labels
+        if labels is not None:
+            names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
+            self.classes(stamp_ns, result.labelled, [names[number] for number in labels.points])
+            if result.grid is not None:
+                self._picture(stamp_ns, CLASSES, draw_labels(result.grid, labels))
         self.about('Result', summary_rows(result.summary))
 
     def paced(self, what: str, show: Callable[[], None]) -> None:
@@ -226,6 +244,16 @@ class View:
         rgb[points.label == FLOOR] = FLOOR_RGB
         cloud = self._rr.Points3D(points.xyz_map, colors=rgb, radii=POINT_M)
         self._log(stamp_ns, 'world/cloud', cloud)
+
+    def classes(self, stamp_ns: int, points: LabelledPoints, names: Sequence[str]) -> None:
+        """Show the points by the names of their classes (N,), '' for none."""
+        known = sorted({*names} - {''})
+        of = np.array([known.index(name) if name else UNLABELLED for name in names], np.intp)
+        for i, (name, bgr) in enumerate(zip(known, class_colours(len(known)), strict=True)):
+            dots = self._rr.Points3D(
+                points.xyz_map[of == i], colors=bgr[::-1], radii=POINT_M, labels=name
+            )
+            self._log(stamp_ns, f'world/{CLASSES}/{name.replace(" ", "_")}', dots)
 
     def moving_points(self, stamp_ns: int, moving: MovingPoints) -> None:
         """Show what moves, with the way it moves in a second."""
@@ -301,7 +329,13 @@ class View:
         for count, at_s in enumerate(summary.get('loop_times_s', []), 1):
             self.loops(round(1e9 * at_s), count)
         self.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
-        self.cloud(first_ns, read_ply(folder / 'labelled_cloud.ply'))
+        cloud = read_ply(folder / 'labelled_cloud.ply')
+        self.cloud(first_ns, cloud)
+        if (folder / POINT_LABELS).is_file():
+            lines = read_text(folder / POINT_LABELS).splitlines()[1:]
+            self.classes(first_ns, cloud, [line.partition(',')[2] for line in lines])
+        if (folder / SEMANTIC).is_file():
+            self._picture(first_ns, CLASSES, read_picture(folder / SEMANTIC))
         if (folder / MAP).is_file():
             self.grid(first_ns, load_map(folder / MAP))
         for stamp_ns, T in zip(stamps_ns, T_map_base, strict=True):
@@ -358,6 +392,7 @@ def _panes(rrb: ModuleType, root: str) -> Any:
     pictures = rrb.Tabs(
         rrb.Spatial2DView(origin=f'{root}/{KEYFRAME}', name='Floor of the keyframe'),
         rrb.Spatial2DView(origin=f'{root}/{RIGHT}', name='Right'),
+        rrb.Spatial2DView(origin=f'{root}/{CLASSES}', name='Classes'),
         active_tab=0,
     )
     words = rrb.Tabs(

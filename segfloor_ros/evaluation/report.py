@@ -26,8 +26,9 @@ from segfloor_ros.evaluation.report_pictures import (
 )
 from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import add_files
+from segfloor_ros.files.whole import read_bytes
 from segfloor_ros.floor.segmentation import MASK_COLOURS
-from segfloor_ros.results_folder import REPORT
+from segfloor_ros.results_folder import REPORT, SEMANTIC
 
 STYLE = Path(__file__).with_name('report.css')
 
@@ -194,6 +195,9 @@ def _map_facts(score: MapScore) -> list[tuple[str, str]]:
 
 def _maps(data: ReportData) -> str:
     figures = [_figure(map_picture(data), 'Map with the path of the robot')]
+    classes = data.folder / SEMANTIC
+    if classes.is_file():
+        figures.append(_figure(read_bytes(classes), 'Classes that a network saw'))
     if data.truth is not None:
         overlay = overlay_png(compare(data.grid, data.truth))
         figures.append(_figure(overlay, 'Map laid on the true one'))

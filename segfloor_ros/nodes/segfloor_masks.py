@@ -37,7 +37,7 @@ from segfloor_ros.messages.topics import (
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 from segfloor_ros.semantics.label_map import LabelMap, numbered
-from segfloor_ros.semantics.network import ImageLabeller, Network
+from segfloor_ros.semantics.network import ImageLabeller, Network, NetworkSettings
 from segfloor_ros.slam.results import KeyframePath
 
 IMAGE, (KEYFRAME, INFO, *_) = 'left/image_raw', KEYFRAME_PARTS
@@ -49,9 +49,9 @@ SEEN = (DISPARITY, MASK, SCAN, FEATURES, PATH)
 class LabelLayer:
     """Publishes the likeliest class of every cell with each map."""
 
-    def __init__(self, node: AnyStageNode, classes: int) -> None:
+    def __init__(self, node: AnyStageNode, network: NetworkSettings) -> None:
         self._node = node
-        self._classes = classes
+        self._network = network
         self._mount: Mount | None = None
         self.reset()
         node.inputs.subscribe('camera_mount', self._take_mount)
@@ -84,7 +84,8 @@ class LabelLayer:
             height, width = disparity.shape
             camera = StereoCamera(width, height, fx, fy, cx, cy, float(parts[DISPARITY].t))
             height_m = self._node.settings.robot_height_m
-            self._labels = LabelMap(camera, self._classes, height_m)
+            own = self._network
+            self._labels = LabelMap(camera, own.classes, height_m, own.moves)
         self._labels.add(
             stamp_ns,
             labels,
@@ -120,7 +121,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
         self._work = self.inputs.later(self._process)
         self.inputs.subscribe(IMAGE, self._take_image, lambda: best_effort(IMAGES))
         self.inputs.subscribe(KEYFRAME, self._take_keyframe)
-        self._layer = LabelLayer(self, len(network.settings.classes))
+        self._layer = LabelLayer(self, network.settings)
         self.outputs.publish('semantic_classes', String(data=network.settings.as_json()))
 
     def reset_stage(self) -> None:

@@ -6,6 +6,8 @@ anew where the keyframes lie now.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +17,17 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.errors import InputError, SettingsError
+from segfloor_ros.files.results import Arrays, joined, split
 from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR
+from segfloor_ros.floor.observation import CELL_M, FLOOR, NOT_FLOOR
 from segfloor_ros.geometry import transform_points
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
 from segfloor_ros.semantics.outputs import UNLABELLED
 from segfloor_ros.settings import suggestion
 from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
+
+LABELS = 'labels'
+"""What a saved map calls its part of what networks saw."""
 
 STEP_PX = 4
 """Every so many pixels of a keyframe count, in both directions: cells are larger."""
@@ -35,24 +41,31 @@ LEGEND_ROW_PX, LEAST_SIDE_PX = 22, 600
 
 @dataclass(frozen=True)
 class _Seen:
-    """What one keyframe saw. xy_m: (N, 2) float16 in its base; label: (N,) uint8; stands: (N,)
-    bool, whether it stands up; point_id, point_label: (M,) of points of the map.
+    """What one keyframe saw. cells: (N, 5) int16, x and y in its base in `CELL_M`, class, whether
+    it stands up, and how many pixels showed it; points: (M, 2) int32, of the map, with the class.
     """
 
-    xy_m: NDArray[np.float16]
-    label: NDArray[np.uint8]
-    stands: NDArray[np.bool_]
-    point_id: NDArray[np.int32]
-    point_label: NDArray[np.uint8]
+    cells: NDArray[np.int16]
+    points: NDArray[np.int32]
 
 
 class LabelMap:
-    """Counts labels, keyframe by keyframe. robot_height_m: what hangs higher does not count."""
+    """Counts labels, keyframe by keyframe. classes: names by number; those of a map that is loaded
+    join them. robot_height_m: what hangs higher does not count. moves: classes of what stands where
+    it has a disparity, whatever the floor mask says.
+    """
 
-    def __init__(self, camera: StereoCamera, classes: int, robot_height_m: float) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        classes: Sequence[str] = (),
+        robot_height_m: float = math.inf,
+        moves: Sequence[str] = (),
+    ) -> None:
+        self.classes = list(classes)
         self._camera = camera
-        self._classes = classes
         self._robot_height_m = robot_height_m
+        self._moves = [self.classes.index(name) for name in moves]
         self._seen: dict[int, _Seen] = {}
 
     def add(
@@ -78,18 +91,20 @@ class LabelMap:
             depth_m = np.where(kind == FLOOR, down, self._camera.disparity_times_depth / disparity)
             xyz = transform_points(T, rays * depth_m[:, None])
             near = (depth_m > 0) & (np.hypot(xyz[:, 0], xyz[:, 1]) < reach_m)
-        upright = (kind == NOT_FLOOR) & (disparity > 0) & (xyz[:, 2] < self._robot_height_m)
-        kept = near & ((kind == FLOOR) | upright) & (label < self._classes)
+        upright = (kind == NOT_FLOOR) | ((kind != FLOOR) & np.isin(label, self._moves))
+        upright &= (disparity > 0) & (xyz[:, 2] < self._robot_height_m)
+        kept = near & ((kind == FLOOR) | upright) & (label < len(self.classes))
+        places = np.floor(xyz[kept, :2] / CELL_M)
+        cells = np.column_stack([places, label[kept], upright[kept]]).astype(np.int16)
+        cells, pixels = np.unique(cells, axis=0, return_counts=True)
         shows = features.point_id != NO_POINT
         at = np.rint(features.uv_px[shows]).astype(np.intp)
         limit = np.array(labels.shape[::-1]) - 1
         u, v = np.clip(at, 0, limit).T
+        points = np.column_stack([features.point_id[shows], labels[v, u]]).astype(np.int32)
         self._seen[stamp_ns] = _Seen(
-            xyz[kept, :2].astype(np.float16),
-            label[kept],
-            upright[kept],
-            features.point_id[shows],
-            labels[v, u],
+            np.column_stack([cells, pixels]).astype(np.int16),
+            points[points[:, 1] < len(self.classes)],
         )
 
     def cells(self, grid: OccupancyGrid, path: KeyframePath) -> NDArray[np.uint8]:
@@ -97,36 +112,87 @@ class LabelMap:
         where it is occupied, of the floor where it is free, `UNLABELLED` elsewhere. path: where
         the keyframes lie now.
         """
-        counts = np.zeros((2, grid.cells.size, self._classes), np.int32)
+        rows = [np.zeros((0, 4), np.int64)]
         for stamp_ns, T in zip(path.stamp_ns.tolist(), path.T_map_base, strict=True):
-            seen = self._seen.get(stamp_ns)
-            if seen is None:
-                continue
-            xy = seen.xy_m @ T[:2, :2].T + T[:2, 3]
-            cells = grid.cells_of(xy)
-            inside = grid.holds(cells)
-            cell = np.ravel_multi_index(cells[inside].T, grid.cells.shape)
-            np.add.at(counts, (seen.stands[inside].astype(int), cell, seen.label[inside]), 1)
-        kinds = grid.cells.reshape(-1)
-        best = np.full(len(kinds), UNLABELLED, np.uint8)
-        for stands, is_of in enumerate((kinds == FREE, kinds == OCCUPIED)):
-            best = np.where(is_of, _likeliest(counts[stands]), best)
+            if stamp_ns in self._seen:
+                seen = self._seen[stamp_ns].cells
+                xy = (seen[:, :2] + 0.5) * CELL_M @ T[:2, :2].T + T[:2, 3]
+                cells = grid.cells_of(xy)
+                inside = grid.holds(cells)
+                cell = np.ravel_multi_index(cells[inside].T, grid.cells.shape)
+                rows.append(np.column_stack([cell, seen[inside, 2:]]))
+        cell, label, stands, pixels = np.concatenate(rows).T
+        kinds, best = grid.cells.reshape(-1), np.full(grid.cells.size, UNLABELLED, np.uint8)
+        for is_upright, is_of in enumerate((kinds == FREE, kinds == OCCUPIED)):
+            of = stands == is_upright
+            likeliest = _likeliest(cell[of], label[of], pixels[of], len(kinds))
+            best = np.where(is_of, likeliest, best)
         return best.reshape(grid.cells.shape)
 
     def points(self, point_id: NDArray[np.int32]) -> NDArray[np.uint8]:
         """Return the likeliest class (N,) of points by id, ascending."""
-        counts = np.zeros((len(point_id), self._classes), np.int32)
-        for seen in self._seen.values():
-            row = np.searchsorted(point_id, seen.point_id)
-            row = np.minimum(row, len(point_id) - 1)
-            known = (point_id[row] == seen.point_id) & (seen.point_label < self._classes)
-            np.add.at(counts, (row[known], seen.point_label[known]), 1)
-        return _likeliest(counts)
+        seen = [one.points for one in self._seen.values()]
+        ids, label = np.concatenate([np.zeros((0, 2), np.int64), *seen]).T
+        row = np.minimum(np.searchsorted(point_id, ids), max(len(point_id) - 1, 0))
+        known = point_id[row] == ids if len(point_id) else np.zeros(0, np.bool_)
+        return _likeliest(row[known], label[known], np.ones(known.sum(), int), len(point_id))
+
+    def to_arrays(self) -> Arrays:
+        """Return what the keyframes saw, for a file."""
+        seen = list(self._seen.values())
+        cells, cell_count = joined([one.cells for one in seen], np.zeros((0, 5), np.int16))
+        points, point_count = joined([one.points for one in seen], np.zeros((0, 2), np.int32))
+        names = np.frombuffer('\n'.join(self.classes).encode(), np.uint8)
+        return {
+            'names': names,
+            'stamp_ns': np.array(list(self._seen), np.int64),
+            'cells': cells,
+            'cell_count': cell_count,
+            'points': points,
+            'point_count': point_count,
+        }
+
+    def from_arrays(self, arrays: Arrays, shift_ns: int = 0, first_id: int = 0) -> None:
+        """Take in what `to_arrays` returned, with later stamps and higher ids; classes keep their
+        names. Raises KeyError, IndexError or ValueError for other arrays.
+        """
+        names = arrays['names'].astype(np.uint8).tobytes().decode().split('\n')
+        self.classes += [name for name in names if name not in self.classes]
+        if len(self.classes) > UNLABELLED:
+            raise ValueError('too many classes')
+        number = np.array([self.classes.index(name) for name in names])
+        cells = split(arrays['cells'], arrays['cell_count'])
+        points = split(arrays['points'], arrays['point_count'])
+        for stamp_ns, *seen in zip(arrays['stamp_ns'].tolist(), cells, points, strict=True):
+            x, y, label, stands, pixels = seen[0].T
+            ids, label_of = seen[1].T
+            self._seen[stamp_ns + shift_ns] = _Seen(
+                np.column_stack([x, y, number[label], stands, pixels]).astype(np.int16),
+                np.column_stack([ids + first_id, number[label_of]]).astype(np.int32),
+            )
+
+    def labels(
+        self, grid: OccupancyGrid | None, path: KeyframePath, point_id: NDArray[np.int32]
+    ) -> Labels | None:
+        """Return the labels of a map, None where no network has looked at it."""
+        if not self.classes:
+            return None
+        cells = None if grid is None else self.cells(grid, path)
+        return Labels(self.classes, cells, self.points(point_id))
 
 
-def _likeliest(counts: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return the class (N,) with the most of counts (N, C), `UNLABELLED` where there are none."""
-    return np.where(counts.any(axis=1), counts.argmax(axis=1), UNLABELLED).astype(np.uint8)
+def _likeliest(
+    where: NDArray[np.integer], label: NDArray[np.integer], weight: NDArray[np.integer], count: int
+) -> NDArray[np.uint8]:
+    """Return the class (count,) with the most weight at each place, `UNLABELLED` where there is
+    none. where, label, weight: (N,).
+    """
+    key, of = np.unique(where * (UNLABELLED + 1) + label, return_inverse=True)
+    place, number = np.divmod(key, UNLABELLED + 1)
+    order = np.lexsort((-number, np.bincount(of, weight, len(key)), place))
+    best = np.full(count, UNLABELLED, np.uint8)
+    best[place[order]] = number[order]  # the last one of a place stays
+    return best
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,28 @@ def test_a_file_that_is_no_network_ends_run_and_replay_in_one_line(tmp_path, dri
     assert not (tmp_path / 'out').exists()
 
 
+def test_a_saved_map_keeps_its_classes(tmp_path, drive):
+    network = constant_network(tmp_path / 'n.onnx', 'floor', CLASSES, floor=['floor'])
+    saved, again, out = (tmp_path / name for name in ('a.map', 'b.map', 'out'))
+    words = ('--network', network, '--save-map', saved)
+    assert segfloor_process('run', drive, '--out', out, *words, *WITH_MOUNT).returncode == 0
+    facts = json.loads(segfloor('map', 'info', saved, '--json').stdout)
+    assert facts['classes_m2'] == {'floor': pytest.approx(facts['free_m2'], rel=0.5)}
+    assert 'floor' in segfloor('map', 'info', saved).stdout
+    assert segfloor('map', 'export', saved, tmp_path / 'e.yaml').returncode == 0
+    exported = load_map(tmp_path / 'e_labels.yaml')
+    np.testing.assert_array_equal(exported.cells, load_map(out / 'map_labels.yaml').cells)
+    assert (tmp_path / 'e_semantic.png').is_file()
+    # It goes on without a network.
+    words = ('--load-map', saved, '--save-map', again)
+    done = segfloor_process('run', drive, '--out', tmp_path / 'later', *words, *WITH_MOUNT)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / 'later' / 'map_semantic.png').is_file()
+    assert json.loads(segfloor('map', 'info', again, '--json').stdout)['classes_m2'].keys() == {
+        'floor'
+    }
+
+
 @pytest.mark.slow
 def test_replay_runs_the_network_beside_the_five_nodes(tmp_path, drive):
     pytest.importorskip('rclpy')

@@ -55,7 +55,7 @@ def where(cells, number):
 def test_floor_has_its_class_where_it_lies_and_follows_its_keyframe():
     labels = np.full(SHAPE, 0, np.uint8)
     labels[:, SHAPE[1] // 2 :] = 1  # on the right
-    stage = LabelMap(CAMERA, len(CLASSES), 1.0)
+    stage = LabelMap(CAMERA, CLASSES, 1.0)
     stage.add(0, labels, *seen(floor_below()), MOUNT, features(), 8.0)
     cells = stage.cells(grid(FREE), path((0, 0)))
     assert {*np.unique(cells)} == {0, 1, UNLABELLED}
@@ -76,19 +76,19 @@ def test_floor_has_its_class_where_it_lies_and_follows_its_keyframe():
 
 def test_what_stands_is_where_its_disparity_puts_it_and_not_above_the_robot():
     mask = np.full(SHAPE, STANDING, np.uint8)
-    stage = LabelMap(CAMERA, len(CLASSES), 1.0)
+    stage = LabelMap(CAMERA, CLASSES, 1.0)
     labels = np.full(SHAPE, 2, np.uint8)
     stage.add(0, labels, *seen(mask, 2.0), MOUNT, features(), 8.0)
     cells = stage.cells(grid(OCCUPIED), path((0, 0)))
     ahead = np.nonzero(cells[30] == 2)[0] * 0.1 - 3.0
     assert ahead.min() > 1.6 and ahead.max() < 2.2
-    low = LabelMap(CAMERA, len(CLASSES), -9.0)
+    low = LabelMap(CAMERA, CLASSES, -9.0)
     low.add(0, labels, *seen(mask, 2.0), MOUNT, features(), 8.0)
     assert (low.cells(grid(OCCUPIED), path((0, 0))) == UNLABELLED).all()
 
 
 def test_the_likeliest_class_of_a_point_counts_and_a_keyframe_told_anew_replaces_itself():
-    stage = LabelMap(CAMERA, len(CLASSES), 1.0)
+    stage = LabelMap(CAMERA, CLASSES, 1.0)
     nothing = seen(np.full(SHAPE, NO_EVIDENCE, np.uint8))
     uv = [[10, 10], [600, 400], [300, 5]]
     for stamp, number in enumerate((1, 2, 2)):
@@ -166,3 +166,29 @@ def test_the_picture_shows_each_class_and_names_it_below(saved):
     assert len({tuple(colour) for colour in rows}) == 3
     np.testing.assert_array_equal(picture[5, 5], (254, 254, 254))  # free, of no class
     assert picture.shape[0] > 3 * side
+
+
+def test_labels_of_a_file_join_those_of_a_drive_by_their_names():
+    first = LabelMap(CAMERA, CLASSES, 1.0)
+    labels = np.full(SHAPE, 2, np.uint8)
+    seen_here = seen(np.full(SHAPE, STANDING, np.uint8), 2.0)
+    first.add(5, labels, *seen_here, MOUNT, features([[10, 10]], [4]), 8.0)
+    second = LabelMap(CAMERA, ['door', 'lift'], 1.0)
+    second.from_arrays(first.to_arrays(), -5, 100)
+    assert second.classes == ['door', 'lift', 'carpet', 'tiles']
+    second.add(1, labels - 1, *seen_here, MOUNT, features([[10, 10]], [7]), 8.0)
+    made = second.labels(grid(OCCUPIED), path((0, 0), (0.8, 0)), np.array([7, 104], np.int32))
+    assert made.points.tolist() == [1, 0]
+    np.testing.assert_allclose(where(made.cells, 1) - where(made.cells, 0), [0.8, 0], atol=0.05)
+    damaged = first.to_arrays() | {'names': np.zeros(0, np.uint8)}
+    with pytest.raises((IndexError, ValueError)):
+        LabelMap(CAMERA).from_arrays(damaged)
+    assert LabelMap(CAMERA).labels(grid(FREE), path((0, 0)), np.zeros(0, np.int32)) is None
+
+
+def test_what_could_move_has_its_class_where_the_mask_says_nothing():
+    nothing = seen(np.full(SHAPE, NO_EVIDENCE, np.uint8), 2.0)
+    for moves, expected in (((), {UNLABELLED}), (('door',), {2, UNLABELLED})):
+        stage = LabelMap(CAMERA, CLASSES, 1.0, moves)
+        stage.add(0, np.full(SHAPE, 2, np.uint8), *nothing, MOUNT, features(), 8.0)
+        assert {*np.unique(stage.cells(grid(OCCUPIED), path((0, 0))))} == expected
