@@ -45,12 +45,13 @@ class Configuration:
         """Return the settings by stage name, in the order of the data flow."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
 
-    def as_ros_parameters(self) -> dict[str, Any]:
-        """Return the nested mapping of a ROS 2 parameter file with every value as resolved."""
-        return {
-            name: {'ros__parameters': dataclasses.asdict(stage)}
-            for name, stage in self.stages().items()
-        }
+    def as_ros_parameters(self, **nodes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the nested mapping of a ROS 2 parameter file with every value as resolved, and
+        further ones, or others, of nodes by name.
+        """
+        values = {name: dataclasses.asdict(stage) for name, stage in self.stages().items()}
+        _merge(values, nodes)
+        return {name: {'ros__parameters': parameters} for name, parameters in values.items()}
 
 
 STAGE_SETTINGS: dict[str, type[StageSettings]] = typing.get_type_hints(Configuration)

@@ -62,6 +62,7 @@ FIGURES = (
 )  # fmt: skip
 MOUNT_FIGURES = ('camera_height_m', 'camera_pitch_rad', 'camera_roll_rad')
 STAGE_FIGURES = ('count', 'p50_ms', 'p95_ms', 'max_ms')
+STAGE_COLUMNS = ('stage', 'calls', 'median ms', 'p95 ms', 'max ms')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -372,6 +373,18 @@ def _try_to(write: Callable[[Path], object], path: Path) -> str:
         path.unlink(missing_ok=True)
         return getattr(error.__cause__ or error, 'strerror', None) or str(error)
     return ''
+
+
+def stage_rows(stages: Mapping[str, Mapping[str, float]]) -> list[list[str]]:
+    """Return name, calls, and median, 95th percentile and maximum in ms of stages, for people."""
+    return [
+        [
+            name,
+            str(stage['count']),
+            *(f'{stage[key]:.1f}' for key in ('p50_ms', 'p95_ms', 'max_ms')),
+        ]
+        for name, stage in stages.items()
+    ]
 
 
 def summary_rows(summary: RunSummary) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from segfloor_ros.cli.terminal import View, console, figure_table, print_error, within
+from segfloor_ros.cli.terminal import View, console, figure_table, number_option, print_error
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.files.results import add_files, check_target, check_writable
@@ -53,10 +53,7 @@ def check_suite(
         typer.Option(help='Folder of the recordings, of which those that are there are mapped.'),
     ] = None,
     jobs: Annotated[
-        int,
-        typer.Option(
-            callback=within(1), help='Recordings at a time, each in a process of this machine.'
-        ),
+        int, number_option('Recordings at a time, each in a process of this machine.', 1)
     ] = 1,
     scheduler: Annotated[
         str, typer.Option(help='Address of a Dask scheduler whose workers map the recordings.')

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
-from segfloor_ros.cli.terminal import DriveOptions, console, within
+from segfloor_ros.cli.terminal import DriveOptions, console, number_option
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings
 from segfloor_ros.errors import MapError, SettingsError, about
@@ -265,8 +265,7 @@ def simulate(
     ] = None,
     set_values: terminal.SceneValues = None,
     floor_every: Annotated[
-        int,
-        typer.Option(callback=within(0), help='A true floor mask every so many frames; 0: none.'),
+        int, number_option('A true floor mask every so many frames; 0: none.', 0)
     ] = 10,
     disparity: Annotated[
         bool, typer.Option('--disparity', help='With each mask the true disparity (1/256 px).')
@@ -279,7 +278,7 @@ def simulate(
         ),
     ] = False,
     supersampling: Annotated[
-        int, typer.Option(callback=within(1, 4), help='Render so many times finer than the image.')
+        int, number_option('Render so many times finer than the image.', 1, 4)
     ] = 1,
     list_scenes: Annotated[
         bool,
@@ -325,8 +324,8 @@ class ExploreOptions:
     robot: Annotated[str, typer.Option(help='The robot: turtlebot3_burger or husky.')] = (
         'turtlebot3_burger'
     )
-    goals: Annotated[int, typer.Option(min=0, help='Goals to draw at random and to drive to.')] = 5
-    seed: Annotated[int, typer.Option(min=0, help='Of the goals, the textures and the noise.')] = 1
+    goals: Annotated[int, number_option('Goals to draw at random and to drive to.', 0)] = 5
+    seed: Annotated[int, number_option('Of the goals, the textures and the noise.', 0)] = 1
     goal: Annotated[
         list[str] | None,
         typer.Option(
@@ -337,9 +336,7 @@ class ExploreOptions:
     start_in: Annotated[
         Path | None, typer.Option(help='Start in the map of this earlier exploration, be found.')
     ] = None
-    minutes: Annotated[
-        float, typer.Option(min=0.1, help="At most so long, in the robot's time.")
-    ] = 30.0
+    minutes: Annotated[float, number_option("At most so long, in the robot's time.", 0.1)] = 30.0
     depth: terminal.Depth = False
     set_values: terminal.SceneValues = None
     params: terminal.Params = None

@@ -32,10 +32,10 @@ from segfloor_ros.cli.terminal import (
     console,
     figure_table,
     needing_ros,
+    number_option,
     print_json,
     progress_bar,
     value_table,
-    within,
 )
 from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError
@@ -87,28 +87,17 @@ def evaluate_map(
     ] = 'none',
     overlay: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
     nodes: Annotated[
-        int,
-        typer.Option(
-            callback=within(0, 10_000), help='Nodes of a road map; 0: one per 1.5 m², 20 to 400.'
-        ),
+        int, number_option('Nodes of a road map; 0: one per 1.5 m², 20 to 400.', 0, 10_000)
     ] = 0,
-    min_distance: Annotated[
-        float, typer.Option(callback=within(0.0), help='Between nodes of a road map, in m.')
-    ] = 0.25,
-    repetitions: Annotated[
-        int, typer.Option(callback=within(1), help='Road maps to average.')
-    ] = 30,
-    seed: Annotated[int, typer.Option(callback=within(0), help='Of the random nodes.')] = 0,
+    min_distance: Annotated[float, number_option('Between nodes of a road map, in m.', 0.0)] = 0.25,
+    repetitions: Annotated[int, number_option('Road maps to average.', 1)] = 30,
+    seed: Annotated[int, number_option('Of the random nodes.', 0)] = 0,
     sight: Annotated[
-        float,
-        typer.Option(callback=within(0.1, 1000.0), help='How far the camera is said to see, in m.'),
+        float, number_option('How far the camera is said to see, in m.', 0.1, 1000.0)
     ] = DEFAULT_RANGE_M,
     fov: Annotated[
         float | None,
-        typer.Option(
-            callback=within(1.0, 360.0),
-            help="Horizontal field of view, in degrees; else the scene's.",
-        ),
+        number_option("Horizontal field of view, in degrees; else the scene's.", 1.0, 360.0),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -142,8 +131,7 @@ def evaluate_trajectory(
         Path, typer.Argument(metavar='TRUTH', help='TUM or KITTI file, or a recording folder.')
     ],
     frames: Annotated[
-        int | None,
-        typer.Option(callback=within(1), help='Frames of the recording; else one per true pose.'),
+        int | None, number_option('Frames of the recording; else one per true pose.', 1)
     ] = None,
     plot: Annotated[Path | None, typer.Option(help='Write a picture (PNG).')] = None,
     as_json: Json = False,
@@ -297,14 +285,11 @@ def benchmark(
         str, typer.Option(help='Keyframes for labelling and grid, one run for each number.')
     ] = ','.join(map(str, DEFAULT.sizes)),
     frames: Annotated[
-        int,
-        typer.Option(callback=within(2), help='Image pairs for all stages, generated or recorded.'),
+        int, number_option('Image pairs for all stages, generated or recorded.', 2)
     ] = DEFAULT.frames,
-    seed: Annotated[
-        int, typer.Option(callback=within(0), help='Of the generated data.')
-    ] = DEFAULT.seed,
+    seed: Annotated[int, number_option('Of the generated data.', 0)] = DEFAULT.seed,
     threads: Annotated[
-        int, typer.Option(callback=within(1), help='Threads of OpenCV; one compares machines best.')
+        int, number_option('Threads of OpenCV; one compares machines best.', 1)
     ] = DEFAULT.threads,
     nodes: Annotated[
         str | None,
@@ -314,9 +299,7 @@ def benchmark(
             'to map, CPU, memory and losses.',
         ),
     ] = None,
-    rate: Annotated[
-        float, typer.Option(callback=within(0.01), help='Speed of --nodes against real time.')
-    ] = 1.0,
+    rate: Annotated[float, number_option('Speed of --nodes against real time.', 0.01)] = 1.0,
     as_json: Json = False,
     params: Params = None,
     assignments: Set = None,

@@ -119,14 +119,13 @@ class ExploreSession:
 
     def _parameters(self, folder: Path) -> dict[str, Any]:
         """Return the parameters as resolved, of nodes in step with the robot."""
-        parameters = self.configuration.as_ros_parameters()
-        del parameters[CAMERA]
-        parameters[ROBOT] = {'ros__parameters': {**self.robot, 'rate': 0.0, 'start_paused': True}}
-        parameters[SLAM]['ros__parameters'].update(
-            self.slam, background=False, tf_wait_s=0.0, save_map=str(self.save.absolute())
-        )
-        parameters[GRID]['ros__parameters'].update(publish_period_s=0.0)
-        return parameters
+        slam = {'background': False, 'tf_wait_s': 0.0, 'save_map': str(self.save.absolute())}
+        nodes = {
+            ROBOT: {**self.robot, 'rate': 0.0, 'start_paused': True},
+            SLAM: {**self.slam, **slam},
+            GRID: {'publish_period_s': 0.0},
+        }
+        return self.configuration.as_ros_parameters(**nodes)
 
 
 class Pilot:

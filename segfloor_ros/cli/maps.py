@@ -21,6 +21,7 @@ from segfloor_ros.errors import InputError, MapError, SettingsError
 from segfloor_ros.evaluation.maps import resample
 from segfloor_ros.files.images import png_bytes
 from segfloor_ros.files.results import Arrays, MapFile, read_map_file, write_file, write_map_file
+from segfloor_ros.floor.segmentation import MASK_COLOURS
 from segfloor_ros.geometry import planar
 from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
 from segfloor_ros.grid.map_file import (
@@ -63,7 +64,7 @@ app = typer.Typer(help='Look at saved maps, compare them, make one of two.')
 FirstMap = Annotated[Path, typer.Argument(metavar='A', help='File of --save-map.')]
 SecondMap = Annotated[Path, typer.Argument(metavar='B', help='File of --save-map.')]
 
-APPEARED_BGR, GONE_BGR = (40, 40, 220), (60, 170, 60)
+APPEARED_BGR, GONE_BGR = MASK_COLOURS['not floor'], MASK_COLOURS['floor']
 
 
 @app.command('info')

@@ -27,7 +27,7 @@ from segfloor_ros.camera.sources import open_source
 from segfloor_ros.camera.sources.opening import Inspection, Stream, inspect_recording, size_mb
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.cli import terminal
-from segfloor_ros.cli.terminal import console, figure_table, value_table, within
+from segfloor_ros.cli.terminal import console, figure_table, number_option, value_table
 from segfloor_ros.cli.view import open_view
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.files.results import is_map_file
@@ -123,7 +123,7 @@ def record(
         str | None,
         typer.Option(help='Camera in place of topics: 0 side by side, or left and right as 0,2.'),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help='How long; 0: until Ctrl-C.')] = 0.0,
+    seconds: Annotated[float, number_option('How long; 0: until Ctrl-C.', 0.0)] = 0.0,
     images: Annotated[
         ImageCoding, typer.Option(help='How images of a device are kept; raw and png are exact.')
     ] = ImageCoding.raw,
@@ -257,16 +257,14 @@ def calibrate(
         typer.Argument(help='Folder of pairs left01, right01, … or with left/ and right/.'),
     ] = None,
     square_m: Annotated[
-        float | None,
-        typer.Option('--square', callback=within(1e-6, 100), help='Side of a square in metres.'),
+        float | None, number_option('Side of a square in metres.', 1e-6, 100, name='--square')
     ] = None,
     board: Annotated[
         str,
         typer.Option(help='Inner corners along both sides: the long one first, ChArUco as drawn.'),
     ] = '9x6',
     marker_m: Annotated[
-        float,
-        typer.Option('--marker', callback=within(0), help='ChArUco: side of a marker in metres.'),
+        float, number_option('ChArUco: side of a marker in metres.', 0, name='--marker')
     ] = 0.0,
     dictionary: Annotated[
         str, typer.Option(help='ChArUco: of its markers, e.g. 4X4_50.')

@@ -105,31 +105,27 @@ class ReplaySession:
         """Return the parameters as resolved. What only the nodes have (frames, rates) comes from
         the user's file.
         """
-        parameters = self.configuration.as_ros_parameters()
-        playing = {
+        nodes: dict[str, dict[str, Any]] = {node: {'resume_within_s': 0.0} for node in NODES}
+        nodes[CAMERA] |= {
             'rate': float(self.rate),
             'lossless': True,
             'start_paused': True,
             'image_transport': 'raw',
         }
-        parameters[CAMERA]['ros__parameters'].update(playing)
-        for node in NODES:
-            parameters[node]['ros__parameters'].update(resume_within_s=0.0)
-        if self.network is not None:
-            network = str(self.network.absolute())
-            parameters[MASKS] = {'ros__parameters': {'network': network, 'resume_within_s': 0.0}}
-        parameters[SLAM]['ros__parameters'].update(
-            background=False,
-            image_transport='raw',
-            tf_wait_s=0.0,
-            localize=self.maps.localize,
-            use_depth=self.configuration.stereo_camera.depth,
-            path_only=self.path_only,
-        )
+        nodes[SLAM] |= {
+            'background': False,
+            'image_transport': 'raw',
+            'tf_wait_s': 0.0,
+            'localize': self.maps.localize,
+            'use_depth': self.configuration.stereo_camera.depth,
+            'path_only': self.path_only,
+        }
         if self.maps.load is not None:
-            parameters[SLAM]['ros__parameters']['load_map'] = str(self.maps.load.absolute())
-        parameters[GRID]['ros__parameters'].update(map_file=str(folder / MAP_FILE))
-        return parameters
+            nodes[SLAM]['load_map'] = str(self.maps.load.absolute())
+        nodes[GRID]['map_file'] = str(folder / MAP_FILE)
+        if self.network is not None:
+            nodes[MASKS] = {'network': str(self.network.absolute()), 'resume_within_s': 0.0}
+        return self.configuration.as_ros_parameters(**nodes)
 
     def _follow(self, graph: NodeGraph) -> tuple[RunResult, ReplayReport]:
         discovery_s = graph.connect(interrupted=self.interrupt)
@@ -317,10 +313,10 @@ def connected_nodes(
     """The five nodes in a graph of their own, connected, with the camera paused. Raises
     ReplayError.
     """
-    parameters = configuration.as_ros_parameters()
-    parameters[CAMERA]['ros__parameters'].update(rate=rate, lossless=lossless, start_paused=True)
+    playing = {'rate': rate, 'lossless': lossless, 'start_paused': True}
     # Else it is this period that is measured.
-    parameters[GRID]['ros__parameters'].update(publish_period_s=0.0)
+    at_once = {'publish_period_s': 0.0}
+    parameters = configuration.as_ros_parameters(**{CAMERA: playing, GRID: at_once})
     with running_nodes(lambda _folder: parameters) as graph:
         # A camera that keeps to the clock does not listen to the nodes.
         graph.connect(is_paced=lossless)

@@ -32,7 +32,14 @@ from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import SettingsError, printable
 from segfloor_ros.lockstep import MapOptions, SaveMasks
 from segfloor_ros.processes import Interrupt
-from segfloor_ros.results_folder import MAP, OutputFolder, RunSummary, summary_rows
+from segfloor_ros.results_folder import (
+    MAP,
+    STAGE_COLUMNS,
+    OutputFolder,
+    RunSummary,
+    stage_rows,
+    summary_rows,
+)
 from segfloor_ros.settings import suggestion
 
 console = Console(markup=False, highlight=False)
@@ -105,10 +112,9 @@ def print_sensors(sensors: Sequence[RecordedSensor]) -> None:
 def print_summary(title: str, summary: RunSummary) -> None:
     """Print the figures of a run and the time of each stage as tables with units."""
     console.print(value_table('result', summary_rows(summary), title))
-    stages = figure_table('stage', 'calls', 'median ms', 'p95 ms', 'max ms')
-    for name, stage in summary.stages.items():
-        values = (stage['p50_ms'], stage['p95_ms'], stage['max_ms'])
-        stages.add_row(name, str(stage['count']), *(f'{value:.1f}' for value in values))
+    stages = figure_table(*STAGE_COLUMNS)
+    for row in stage_rows(summary.stages):
+        stages.add_row(*row)
     console.print(stages)
 
 
@@ -165,11 +171,9 @@ def finish_run(
         raise typer.Exit(status or 1)
 
 
-def within(
-    low: float, high: float = math.inf
-) -> Callable[[typer.CallbackParam, float | None], float | None]:
-    """Return what checks a finite number of an option, in one line; `nan` would pass the bounds of
-    typer. It raises SettingsError.
+def number_option(help: str, low: float, high: float = math.inf, name: str = '') -> Any:
+    """Return an option that takes a finite number within bounds, and says in one line of another
+    one what it expects; `nan` would pass the bounds of typer.
     """
 
     def check(parameter: typer.CallbackParam, value: float | None) -> float | None:
@@ -178,7 +182,7 @@ def within(
             raise SettingsError(f'{parameter.opts[0]} {value}: expected {words}')
         return value
 
-    return check
+    return typer.Option(*filter(None, [name]), callback=check, help=help)
 
 
 @contextmanager

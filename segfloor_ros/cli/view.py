@@ -28,9 +28,9 @@ from segfloor_ros.files.images import jpeg_bytes, read_mask, read_picture
 from segfloor_ros.files.results import check_writable
 from segfloor_ros.files.whole import read_text
 from segfloor_ros.floor.observation import FloorObservation
-from segfloor_ros.floor.segmentation import mask_overlay
+from segfloor_ros.floor.segmentation import MASK_COLOURS, mask_overlay
 from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map
+from segfloor_ros.grid.map_file import UNKNOWN_PIXEL, OccupancyGrid, load_map
 from segfloor_ros.pipeline import Pipeline
 from segfloor_ros.results_folder import (
     MAP,
@@ -64,7 +64,7 @@ HIGH_M = 2.0
 """Obstacles are coloured by their height up to this."""
 
 PATH_RGB, KEYFRAME_RGB, LOOP_RGB = (31, 119, 180), (255, 127, 14), (214, 39, 40)
-FLOOR_RGB, UNKNOWN_RGB, MOVING_RGB = (58, 166, 85), (150, 150, 150), (225, 40, 200)
+FLOOR_RGB, MOVING_RGB = (MASK_COLOURS[name][::-1] for name in ('floor', 'moving'))
 
 BASE = 'world/base'
 CAMERA = f'{BASE}/camera'
@@ -240,7 +240,7 @@ class View:
             return
         levels = np.clip(255 / HIGH_M * points.xyz_map[:, 2], 0, 255).astype(np.uint8)
         rgb = cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA).reshape(-1, 3)[:, ::-1].copy()
-        rgb[points.label != OBSTACLE] = UNKNOWN_RGB
+        rgb[points.label != OBSTACLE] = UNKNOWN_PIXEL
         rgb[points.label == FLOOR] = FLOOR_RGB
         cloud = self._rr.Points3D(points.xyz_map, colors=rgb, radii=POINT_M)
         self._log(stamp_ns, 'world/cloud', cloud)

@@ -86,7 +86,7 @@ def score_floor_folders(estimate: Path, truth: Path) -> FloorScore:
     for name in common:
         mask = read_mask(estimates[name])
         true = draw_outline(drawn[name], mask.shape) if drawn else read_mask(files[name])
-        check_same_size(mask, true, estimates[name])
+        check_same_size(mask, true.shape, estimates[name])
         counts += count_pixels(mask, true)
     return FloorScore(len(common), len(truths) - len(common), *(int(value) for value in counts))
 

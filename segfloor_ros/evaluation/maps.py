@@ -21,7 +21,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_table, read_yaml
 from segfloor_ros.geometry import Array, Pose2d, planar
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map
+from segfloor_ros.grid.map_file import FINE, FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map
 from segfloor_ros.trajectory import read_trajectory
 
 BEARINGS = 361
@@ -34,12 +34,6 @@ Mask = NDArray[np.bool_]
 
 ENOUGH = 40000
 """Cells or points, to score an alignment by or to draw."""
-
-REFINEMENTS = 4
-"""Steps of the refinement: that of the search, then half of the one before."""
-
-TURN_PER_METRE = 0.15
-"""Radians of a refinement step that go with a metre: a lever of about 7 m."""
 
 
 @dataclass(frozen=True)
@@ -226,22 +220,23 @@ def _gain_images(truth: OccupancyGrid) -> tuple[Array, Array]:
 
 
 def _refine(fit: _Fit, start: Pose2d) -> Pose2d:
-    """Move to the best of the neighbouring poses until none is better, with shrinking steps."""
+    """Move to the best of the neighbouring poses until none is better, with steps that are halved
+    down to what a cell shows. A turn moves points by as much as a step does.
+    """
     best, best_score = start, fit.score(start)
-    moves = [move for move in product((-1, 0, 1), repeat=3) if any(move)]
-    for step in SAME_PLACE_M / 2 ** np.arange(REFINEMENTS):
+    moves = np.array([move for move in product((-1, 0, 1), repeat=3) if any(move)])
+    lever_m = float(np.hypot(*np.vstack([fit.free, fit.occupied]).T).mean())
+    step_m = SAME_PLACE_M
+    while step_m >= FINE * fit.truth.resolution_m:
+        steps = moves * (step_m, step_m, step_m / max(lever_m, step_m))
         improved = True
         while improved:
-            centre, improved = best, False
-            for dx, dy, turn in moves:
-                pose = (
-                    centre[0] + dx * step,
-                    centre[1] + dy * step,
-                    centre[2] + turn * step * TURN_PER_METRE,
-                )
-                score = fit.score(pose)
+            centre, improved = np.array(best), False
+            for x, y, yaw in (centre + steps).tolist():
+                score = fit.score((x, y, yaw))
                 if score > best_score:
-                    best, best_score, improved = pose, score, True
+                    best, best_score, improved = (x, y, yaw), score, True
+        step_m /= 2
     return best
 
 

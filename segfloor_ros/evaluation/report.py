@@ -28,7 +28,7 @@ from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
 from segfloor_ros.files.results import add_files
 from segfloor_ros.files.whole import read_bytes
 from segfloor_ros.floor.segmentation import MASK_COLOURS
-from segfloor_ros.results_folder import REPORT, SEMANTIC
+from segfloor_ros.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, stage_rows
 
 STYLE = Path(__file__).with_name('report.css')
 
@@ -236,14 +236,9 @@ def _v_disparity(data: ReportData) -> str:
 
 def _stages(summary: dict[str, Any]) -> str:
     stages = summary['stages']
-    times = ('p50_ms', 'p95_ms', 'max_ms')
-    rows = [
-        [name, str(stage['count']), *(f'{stage[key]:.1f}' for key in times)]
-        for name, stage in stages.items()
-    ]
     longest = max([stage['p95_ms'] for stage in stages.values()] or [1.0])
     shares = [stage['p50_ms'] / longest for stage in stages.values()]
-    return _table(('stage', 'calls', 'median ms', 'p95 ms', 'max ms', ''), rows, shares)
+    return _table((*STAGE_COLUMNS, ''), stage_rows(stages), shares)
 
 
 def _table(names: tuple[str, ...], rows: list[list[str]], shares: list[float]) -> str:

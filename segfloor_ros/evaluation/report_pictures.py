@@ -319,7 +319,7 @@ def _masked_frames(folder: Path, frames: Iterable[StereoFrame]) -> list[MaskedFr
             paths = [masks[frame.index] for masks in (floors, moving) if frame.index in masks]
             found = [read_mask(path) for path in paths]
             for mask, path in zip(found, paths, strict=True):
-                check_same_size(mask, frame.left, path)
+                check_same_size(mask, frame.left.shape, path)
             strip.append(MaskedFrame(frame, *found))
     return strip
 

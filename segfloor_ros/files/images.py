@@ -93,10 +93,10 @@ def check_size(width: int, height: int, name: str) -> None:
         raise InputError(f'{name}: an image of {width}x{height} pixels is not taken')
 
 
-def check_same_size(image: NDArray[Any], other: NDArray[Any], path: Path) -> None:
-    """Raise InputError unless the image of a file is as large as the one it belongs to."""
-    if image.shape[:2] != other.shape[:2]:
-        found, expected = (f'{shape[1]}x{shape[0]}' for shape in (image.shape, other.shape))
+def check_same_size(image: NDArray[Any], shape: tuple[int, ...], path: Path) -> None:
+    """Raise InputError unless the image of a file has the shape of the one it belongs to."""
+    if image.shape[:2] != shape[:2]:
+        found, expected = (f'{width}x{height}' for height, width in (image.shape[:2], shape[:2]))
         raise InputError(f'{path}: is {found}, but the image it belongs to is {expected}')
 
 

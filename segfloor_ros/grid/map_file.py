@@ -40,6 +40,10 @@ PICTURE_PX = 1000
 Cells = NDArray[np.int64]
 """Rows and columns (..., 2)."""
 
+FINE = 0.25
+"""Share of a cell that its raster does not show: so far apart are samples of a ray, and keyframes
+or maps that move by less are not followed."""
+
 _NOTHING, _UNREACHED, _REACHED, _STANDING = range(4)
 """What a cell is while the map is drawn."""
 _HOLE_M2 = 0.01

@@ -34,6 +34,7 @@ from segfloor_ros.grid.keyframe_evidence import (
     unit_vectors,
 )
 from segfloor_ros.grid.map_file import (
+    FINE,
     FREE,
     HIT,
     LEAST,
@@ -54,10 +55,6 @@ from segfloor_ros.slam.results import MAJORITY, KeyframeFeatures, KeyframePath
 
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""
-
-_FINE = 0.25
-"""Share of a cell that its raster does not show: so far apart are samples of a ray, and keyframes
-that moved by less are not followed."""
 
 UNDO_BYTES = 4_000_000
 _MAX_STRIDE_M = 2.0
@@ -138,7 +135,7 @@ class OccupancyGridMapper:
         now, then = poses[row], self._history.poses
         moved_m = np.hypot(now[:, 0] - then[:, 0], now[:, 1] - then[:, 1])
         turn = np.abs(np.remainder(now[:, 2] - then[:, 2] + np.pi, 2 * np.pi) - np.pi)
-        limit_m = _FINE * self._settings.resolution_m
+        limit_m = FINE * self._settings.resolution_m
         moved = np.flatnonzero(moved_m + turn * _LEVER_M > limit_m)
         if len(moved):
             self._history.move(int(moved[0]), now[moved[0] :])
@@ -469,7 +466,7 @@ def draw_rays(raster: NDArray[np.uint8], base: Array, offset: Array, short: floa
     length = np.maximum(np.sqrt((offset**2).sum(axis=0)) - short, 0)
     if len(length) == 0:
         return
-    along = np.arange(0, length.max() + _FINE, _FINE)
+    along = np.arange(0, length.max() + FINE, FINE)
     direction = offset / np.maximum(np.sqrt((offset**2).sum(axis=0)), 1e-9)
     distance = np.minimum(along, length[:, None])
     column, row = (base[:, None, None] + direction[:, :, None] * distance).astype(np.intp)

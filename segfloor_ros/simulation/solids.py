@@ -101,7 +101,7 @@ class Prism:
 
 
 def block(
-    at: Point,
+    at: Point | Array,
     size: tuple[float, float, float],
     texture: str,
     yaw_deg: float = 0.0,
@@ -161,8 +161,7 @@ def _wall(wall: Wall) -> list[Prism]:
         middle = (np.array(start) + np.array(end)) / 2
         size = (length + wall.thickness_m, wall.thickness_m, wall.height_m)
         yaw_deg = float(np.degrees(np.arctan2(along[1], along[0])))
-        at = (float(middle[0]), float(middle[1]))
-        solids.append(block(at, size, wall.texture, yaw_deg, wall.bottom_m))
+        solids.append(block(middle, size, wall.texture, yaw_deg, wall.bottom_m))
     return solids
 
 
@@ -190,7 +189,7 @@ def _posters(scene: Scene) -> list[Prism]:
             bottom_m = min(rng.uniform(0.2, 1.2), wall.height_m - tall)
             texture = f'poster:{rng.integers(POSTER_VARIANTS)}'
             size = (wide, POSTER_THICKNESS_M, tall)
-            solids.append(block((at[0], at[1]), size, texture, yaw_deg, bottom_m, is_sheet=True))
+            solids.append(block(at, size, texture, yaw_deg, bottom_m, is_sheet=True))
     return solids
 
 
@@ -221,13 +220,11 @@ def _furniture(thing: Furniture) -> list[Prism]:
     if thing.kind not in kinds:
         raise InputError(f'unknown furniture {thing.kind}{suggestion(thing.kind, list(kinds))}')
     texture, parts = kinds[thing.kind]['texture'], kinds[thing.kind]['blocks']
-    solids = []
-    for forward, left, length, width, height, bottom in parts:
-        x, y = _turn(thing.yaw_deg) @ (forward, left) + np.array(thing.at)
-        solids.append(
-            block((float(x), float(y)), (length, width, height), texture, thing.yaw_deg, bottom)
-        )
-    return solids
+    turn, at = _turn(thing.yaw_deg), np.array(thing.at)
+    return [
+        block(turn @ (x, y) + at, (length, width, height), texture, thing.yaw_deg, bottom)
+        for x, y, length, width, height, bottom in parts
+    ]
 
 
 def _turn(yaw_deg: float) -> Array:

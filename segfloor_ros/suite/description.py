@@ -85,7 +85,7 @@ def read_suite(path: Path, data: Path | None = None) -> Suite:
         key: Key = ('recordings', index)
         own = _mapping(document, key, item, RECORDING_KEYS + SHARED_KEYS)
         _mapping(document, (*key, 'published'), own.get('published') or {}, tuple(published))
-        reader = _Reader(document, key, own, defaults, data)
+        reader = _Reader(document, key, own, defaults, (data or path.parent).absolute())
         if data is not None and not reader.is_there():
             missing.append(str(own.get('name') or own[RECORDING]))
             continue
@@ -122,19 +122,17 @@ def _continued(
     return replace(entry, continue_from=name)
 
 
+@dataclass(frozen=True)
 class _Reader:
-    """Reads one item of `recordings`, which is several entries where its input is a pattern."""
+    """Reads one item of `recordings`, which is several entries where its input is a pattern.
+    _folder: of the recordings.
+    """
 
-    def __init__(
-        self,
-        document: MarkedYaml,
-        key: Key,
-        own: dict[str, Any],
-        defaults: dict[str, Any],
-        data: Path | None,
-    ) -> None:
-        self._document, self._key, self._own, self._defaults = document, key, own, defaults
-        self._folder = (data or document.path.parent).absolute()
+    _document: MarkedYaml
+    _key: Key
+    _own: dict[str, Any]
+    _defaults: dict[str, Any]
+    _folder: Path
 
     def is_there(self) -> bool:
         """Whether there is a recording, where one is named."""

@@ -176,37 +176,23 @@ def bag_sensors(
     """Return the sensors of a bag. R_left_raw: (3, 3) from the frame of the images on `left_topic`
     to the rectified left one. Raises InputError.
     """
-    ignored = settings.ignored_sensors
     found = []
-    wheels = _wheel_topic(path, bag, settings.wheel_odometry_topic)
-    if wheels:
+    used = {name: name not in settings.ignored_sensors for name in (WHEEL_ODOMETRY, IMU)}
+    if wheels := _wheel_topic(path, bag, settings.wheel_odometry_topic):
+        count = bag.topics[wheels].num_messages
+        read_wheels = cache(lambda: list(_wheel_poses(path, wheels)))
         found.append(
-            RecordedSensor(
-                WHEEL_ODOMETRY,
-                wheels,
-                bag.topics[wheels].num_messages,
-                WHEEL_ODOMETRY not in ignored,
-                cache(lambda: list(_wheel_poses(path, wheels))),
-            )
+            RecordedSensor(WHEEL_ODOMETRY, wheels, count, used[WHEEL_ODOMETRY], read_wheels)
         )
-    imu = _imu_topic(path, bag, settings.imu_topic)
-    if imu:
-        used, T_raw_imu, where = IMU not in ignored, None, imu
-        if used:
-            T_raw_imu = _T_raw_imu(bag, left_topic, imu)
-            if T_raw_imu is None:
-                used, where = False, f'{imu} (no tf from its frame to the camera)'
-        T_left_raw = make_transform(R_left_raw, np.zeros(3))
-        T_left_imu = T_left_raw @ (np.eye(4) if T_raw_imu is None else T_raw_imu)
-        found.append(
-            RecordedSensor(
-                IMU,
-                where,
-                bag.topics[imu].num_messages,
-                used,
-                cache(lambda: _imu_samples(path, imu, T_left_imu)),
-            )
-        )
+    if imu := _imu_topic(path, bag, settings.imu_topic):
+        count, where = bag.topics[imu].num_messages, imu
+        T_raw_imu = _T_raw_imu(bag, left_topic, imu) if used[IMU] else np.eye(4)
+        if T_raw_imu is None:
+            where = f'{imu} (no tf from its frame to the camera)'
+            used[IMU], T_raw_imu = False, np.eye(4)
+        T_left_imu = make_transform(R_left_raw, np.zeros(3)) @ T_raw_imu
+        read_imu = cache(lambda: _imu_samples(path, imu, T_left_imu))
+        found.append(RecordedSensor(IMU, where, count, used[IMU], read_imu))
     return found
 
 
@@ -214,14 +200,13 @@ def _wheel_topic(path: Path, bag: BagFile, given: str) -> str:
     topics = _topics(path, bag, ODOMETRY_TYPE, given, 'wheel_odometry_topic')
     if given:
         return given
-    candidates = []
-    for topic in topics:
-        published_by_slam = f'{topic.rpartition("/")[0]}/keyframe/odometry' in topics
-        if published_by_slam or any(word in topic.lower() for word in NOT_WHEELS):
-            continue
-        first = bag.first(topic)
-        if first.header.frame_id.strip('/') not in GLOBAL_FRAMES:
-            candidates.append(topic)
+    candidates = [
+        topic
+        for topic in topics
+        if f'{topic.rpartition("/")[0]}/keyframe/odometry' not in topics  # of SLAM
+        and not any(word in topic.lower() for word in NOT_WHEELS)
+        and _frame_of(bag, topic) not in GLOBAL_FRAMES
+    ]
     return min(candidates, key=lambda t: ('wheel' not in t, 'filtered' in t, t), default='')
 
 
@@ -229,11 +214,7 @@ def _imu_topic(path: Path, bag: BagFile, given: str) -> str:
     topics = _topics(path, bag, IMU_TYPE, given, 'imu_topic')
     if given:
         return given
-    complete = []
-    for topic in topics:
-        first = bag.first(topic)
-        if measures_motion(first):
-            complete.append(topic)
+    complete = [topic for topic in topics if measures_motion(bag.first(topic))]
     return max(complete, key=lambda t: (bag.topics[t].num_messages, t), default='')
 
 
@@ -249,18 +230,19 @@ def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
     Without any, an IMU for which up is up in the image is taken for one in the frame of the images;
     None for others.
     """
-    frames = []
-    for topic in (left_topic, imu_topic):
-        first = bag.first(topic)
-        frames.append(first.header.frame_id.strip('/'))
-    if frames[0] == frames[1]:
+    left, imu = _frame_of(bag, left_topic), _frame_of(bag, imu_topic)
+    if left == imu:
         return np.eye(4)
-    T_left_imu = _fixed_transforms(bag).lookup(*frames)
+    T_left_imu = _fixed_transforms(bag).lookup(left, imu)
     if T_left_imu is not None:
         return T_left_imu
     some = islice(bag.messages([imu_topic]), FIRST_MESSAGES)
     felt = np.nanmedian([xyz(message.linear_acceleration) for _, message in some], axis=0)
     return np.eye(4) if is_upright(felt) else None
+
+
+def _frame_of(bag: BagFile, topic: str) -> str:
+    return str(bag.first(topic).header.frame_id.strip('/'))
 
 
 def _fixed_transforms(bag: BagFile) -> FrameTree:

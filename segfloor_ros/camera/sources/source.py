@@ -22,7 +22,7 @@ from segfloor_ros.camera.calibration.parameters import StereoCalibration, Stereo
 from segfloor_ros.camera.images import EightBitScale
 from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.images import CorruptImageError, Grey, read_mask
+from segfloor_ros.files.images import CorruptImageError, Grey, check_same_size, read_mask
 from segfloor_ros.geometry import MAX_DISORDER_NS
 
 PLAUSIBLE_HZ = 0.1, 1000.0
@@ -61,9 +61,7 @@ class MaskFolder:
         if not path.exists():
             return None
         mask = read_mask(path)
-        if mask.shape != self._shape:
-            found, expected = (f'{shape[1]}x{shape[0]}' for shape in (mask.shape, self._shape))
-            raise InputError(f'{path}: is {found}, but the images are {expected}')
+        check_same_size(mask, self._shape, path)
         return mask
 
 
