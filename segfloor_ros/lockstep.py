@@ -300,7 +300,9 @@ class LockstepRun:
 
     def _masked_frames(self) -> Iterator[StereoFrame]:
         """Yield the frames; where there is a network, it looks at them on a thread of its own."""
-        frames, labeller = self._source.frames(), self._pipeline.labeller
+        labeller = self._pipeline.labeller
+        self._source.takes_colour = labeller is not None and labeller.sees_colours
+        frames = self._source.frames()
         return frames if labeller is None else prefetched(labeller.with_masks(frames))
 
     def _say_faults(self) -> None:

@@ -25,7 +25,13 @@ from segfloor_ros import MAX_PIXELS
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.model import ImuSample, StereoCamera, WheelPose, is_disparity
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.images import CorruptImageError, Grey, check_size, decode_file
+from segfloor_ros.files.images import (
+    CorruptImageError,
+    Grey,
+    check_size,
+    decode_colour,
+    decode_file,
+)
 from segfloor_ros.geometry import Array, transform_from_quaternion
 
 Region = NDArray[np.uint8]
@@ -103,6 +109,19 @@ def grey_image(message: Any, name: str) -> Grey:
     return _grey_of(_unpacked(message, name, CHANNELS[encoding], dtype), encoding)
 
 
+def colour_image(message: Any, name: str) -> Grey:
+    """Return the image of a message as `grey_image`, but (H, W, 3), BGR, where it has colours."""
+    if not hasattr(message, 'encoding'):
+        return decode_colour(bytes(message.data), name)
+    encoding = message.encoding
+    if CHANNELS.get(encoding, 1) == 1 and not encoding.startswith('bayer_'):
+        return grey_image(message, name)
+    dtype = np.dtype(np.uint16 if '16' in encoding else np.uint8)
+    pixels = _unpacked(message, name, CHANNELS[encoding], dtype)
+    kind = encoding[6:10] if encoding.startswith('bayer_') else encoding.rstrip('0123456789UC')
+    return cv2.cvtColor(pixels, TO_BGR[kind]) if kind in TO_BGR else pixels[:, :, :3]
+
+
 def depth_image(message: Any, name: str) -> NDArray[np.uint16] | NDArray[np.float32]:
     """Return the depth image (H, W) of a sensor_msgs Image (REP-118), or of a CompressedImage of
     compressed_depth_image_transport: uint16 in mm or float32 in metres. Raises as `grey_image`.
@@ -161,6 +180,16 @@ def to_grey(image: Grey) -> Grey:
         return image[:, :, 0]
     code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
     return cv2.cvtColor(image, code)
+
+
+TO_BGR = {
+    'rggb': cv2.COLOR_BayerBG2BGR, 'bggr': cv2.COLOR_BayerRG2BGR,
+    'gbrg': cv2.COLOR_BayerGR2BGR, 'grbg': cv2.COLOR_BayerGB2BGR,
+    'rgb': cv2.COLOR_RGB2BGR, 'rgba': cv2.COLOR_RGBA2BGR,
+    'yuv': cv2.COLOR_YUV2BGR_UYVY, 'uyvy': cv2.COLOR_YUV2BGR_UYVY,
+    'yuv422_yuy': cv2.COLOR_YUV2BGR_YUY2, 'yuyv': cv2.COLOR_YUV2BGR_YUY2,
+}  # fmt: skip
+"""How encodings that are not BGR become it, by the encoding without its numbers."""
 
 
 class EightBitScale:

@@ -31,6 +31,7 @@ PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 JPEG_START, JPEG_END = b'\xff\xd8', b'\xff\xd9'
 
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+COLOUR = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 _lock = threading.Lock()
 _silent: set[object] = set()
@@ -54,6 +55,11 @@ def read_grey(path: Path) -> Grey:
     cannot be read.
     """
     return decode_file(read_bytes(path), str(path))
+
+
+def read_colour(path: Path) -> Grey:
+    """Return the image of a file as `read_grey`, but (H, W, 3), BGR, where it has colours."""
+    return decode_colour(read_bytes(path), str(path))
 
 
 def read_mask(path: Path) -> NDArray[np.uint8]:
@@ -85,6 +91,11 @@ def png_bytes(image: NDArray[Any]) -> bytes:
 def jpeg_bytes(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
     """Return an image (H, W) or (H, W, 3), BGR, as a JPEG file."""
     return cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def decode_colour(data: bytes, name: str) -> Grey:
+    """Return the image of the bytes of a file as `decode_file`, BGR where it has colours."""
+    return _decoded(data, name, COLOUR)
 
 
 def check_size(width: int, height: int, name: str) -> None:

@@ -25,10 +25,11 @@ from std_msgs.msg import MultiArrayDimension, MultiArrayLayout, UInt8MultiArray
 from stereo_msgs.msg import DisparityImage
 
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
-from segfloor_ros.camera.images import depth_image, grey_image
+from segfloor_ros.camera.images import colour_image, depth_image, grey_image
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
 from segfloor_ros.errors import InputError
+from segfloor_ros.files.images import Grey
 from segfloor_ros.files.results import FORMAT, MapFile, from_bytes, to_bytes
 from segfloor_ros.floor.observation import FloorObservation, FloorScan, free_ranges
 from segfloor_ros.grid.map_file import OccupancyGrid
@@ -296,9 +297,19 @@ def compressed_message(
 
 def grey8_image(message: Image, topic: str) -> NDArray[np.uint8]:
     """Return the grey image (H, W) of a message of 8 bits. Raises InputError."""
-    image = grey_image(message, topic)
+    return _eight_bit(grey_image(message, topic), message, topic)
+
+
+def colour8_image(message: Image, topic: str) -> NDArray[np.uint8]:
+    """Return the image of a message of 8 bits, (H, W, 3) BGR, or (H, W) where it has no colours.
+    Raises InputError.
+    """
+    return _eight_bit(colour_image(message, topic), message, topic)
+
+
+def _eight_bit(image: Grey, message: Image, topic: str) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
-        raise InputError(f'{topic}: {message.encoding} has 16 bits, expected mono8')
+        raise InputError(f'{topic}: {message.encoding} has 16 bits, expected 8')
     return image.astype(np.uint8, copy=False)
 
 

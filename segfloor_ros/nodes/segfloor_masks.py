@@ -16,6 +16,7 @@ from std_msgs.msg import String
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.configuration import SegfloorMasksNodeSettings
 from segfloor_ros.messages.arrays import (
+    colour8_image,
     depth_image,
     features_arrays,
     grey8_image,
@@ -187,7 +188,8 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
         self.reporter.report(stamp_ns, Level.OK, 'keyframe')
 
     def _look_at_image(self, stamp_ns: int, message: Image) -> None:
-        image, at = grey8_image(message, IMAGE), (stamp_ns, message.header.frame_id)
+        read = colour8_image if self._labeller.sees_colours else grey8_image
+        image, at = read(message, IMAGE), (stamp_ns, message.header.frame_id)
         moving = self._labeller.moving(stamp_ns, image)
         self.outputs.publish('dynamic_mask', image_message(*at, moving))
         labels = self._labeller.labels(stamp_ns, image)

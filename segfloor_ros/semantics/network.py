@@ -249,6 +249,7 @@ class ImageLabeller:
         self._times = times or StageTimes()
         self._lock = threading.Lock()
         self._known: dict[int, NDArray[np.uint8]] = {}
+        self._colours: dict[int, NDArray[np.uint8]] = {}
 
     @property
     def classes(self) -> list[str]:
@@ -256,14 +257,22 @@ class ImageLabeller:
         return self.network.settings.classes
 
     @property
+    def sees_colours(self) -> bool:
+        """Whether the network is one for colours."""
+        return len(self.network.settings.mean) > 1
+
+    @property
     def is_late(self) -> bool:
         """Whether the network looks at keyframes alone, once they are keyframes."""
         return self.network.settings.every == 0
 
     def labels(self, stamp_ns: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the labels (H, W) of the image of a stamp. Raises InputError."""
+        """Return the labels (H, W) of the image of a stamp, of its colours where a frame has had
+        them. Raises InputError.
+        """
         with self._lock:
             if stamp_ns not in self._known:
+                image = self._colours.get(stamp_ns, image)
                 with self._times.measure('network'):
                     self._known[stamp_ns] = self.network.infer(image).labels
                 if len(self._known) > KEPT:
@@ -293,9 +302,15 @@ class ImageLabeller:
         every = self.network.settings.every
         mask: NDArray[np.uint8] | None = None
         for number, frame in enumerate(frames):
+            if frame.colour is not None:
+                with self._lock:
+                    self._colours[frame.stamp_ns] = frame.colour
+                    if len(self._colours) > KEPT:
+                        del self._colours[next(iter(self._colours))]
             if every and number % every == 0:
                 mask = self.moving(frame.stamp_ns, frame.left)
-            yield dataclasses.replace(frame, excluded=union(frame.excluded, mask))
+            excluded = union(frame.excluded, mask)
+            yield dataclasses.replace(frame, excluded=excluded, colour=None)
 
     def _remark(self, words: str) -> None:
         if not self.remarks:

@@ -11,6 +11,7 @@ import pytest
 from segfloor_ros.camera.images import (
     CorruptImageError,
     EightBitScale,
+    colour_image,
     decode_file,
     grey_image,
     to_grey,
@@ -21,10 +22,12 @@ RED, GREEN, BLUE = 200, 100, 50
 GREY = round(0.299 * RED + 0.587 * GREEN + 0.114 * BLUE)
 
 
-def raw(data: bytes, width: int, height: int, encoding: str, **fields: object) -> np.ndarray:
+def raw(
+    data: bytes, width: int, height: int, encoding: str, decode=grey_image, **fields: object
+) -> np.ndarray:
     header = {'step': len(data) // max(height, 1), 'is_bigendian': 0, **fields}
     message = SimpleNamespace(data=data, width=width, height=height, encoding=encoding, **header)
-    return grey_image(message, 'left')
+    return decode(message, 'left')
 
 
 @pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
@@ -57,6 +60,28 @@ def test_colour_becomes_grey(encoding: str, pixel: list[int]) -> None:
     image = raw(bytes(pixel * 6), 3, 2, encoding)
     assert image.shape == (2, 3)
     assert np.abs(image.astype(int) - GREY).max() <= 1
+    colour = raw(bytes(pixel * 6), 3, 2, encoding, colour_image)
+    assert colour.tolist() == [[[BLUE, GREEN, RED]] * 3] * 2
+
+
+@pytest.mark.parametrize('encoding', ['yuv422', 'yuyv', 'bayer_rggb8', 'bayer_grbg8'])
+def test_red_is_red_in_every_order(encoding: str) -> None:
+    # Red has a high V; in a Bayer pattern it is where its letter stands.
+    data = {
+        'yuv422': [90, 80, 240, 80] * 8,
+        'yuyv': [80, 90, 80, 240] * 8,
+        'bayer_rggb8': ([250, 0] * 4 + [0, 0] * 4) * 2,
+        'bayer_grbg8': ([0, 250] * 4 + [0, 0] * 4) * 2,
+    }[encoding]
+    width = 4 if encoding.startswith('y') else 8
+    blue, green, red = raw(bytes(data), width, 4, encoding, colour_image)[1:3, 1:3].mean((0, 1))
+    assert red > 100 and max(blue, green) < 40
+
+
+def test_grey_stays_grey_where_colours_are_asked_for() -> None:
+    assert raw(bytes([1, 2, 3, 4]), 2, 2, 'mono8', colour_image).tolist() == [[1, 2], [3, 4]]
+    with pytest.raises(InputError, match='encoding jpeg is not supported'):
+        raw(b'', 0, 0, 'jpeg', colour_image)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import logging
 
+import cv2
 import numpy as np
-from small_network import constant_network, grey_network
+import pytest
+from small_network import constant_network, conv, grey_network, write_network
+from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.model import StereoCameraSettings, StereoFrame
+from segfloor_ros.camera.sources.opening import open_source
 from segfloor_ros.floor.observation import FLOOR, MOVING, NO_EVIDENCE
 from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.timing import StageTimes
@@ -75,3 +79,30 @@ def test_where_nearly_everything_moves_nothing_is_left_out_and_it_is_said_once(
     assert (stage.says(0, masked[0].left) == NO_EVIDENCE).all()
     assert len(caplog.records) == len(stage.remarks) == 1
     assert '100 % of an image are of classes that move' in stage.remarks[0]
+
+
+@pytest.mark.parametrize('every', [0, 1, 2])
+def test_a_network_for_colours_gets_those_of_the_recording(tmp_path, every) -> None:
+    folder = write_kitti(tmp_path / 'drive', room_drive(3)[0])
+    for file in (folder / 'image_0').iterdir():
+        bgr = np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED)] * 3, axis=2)
+        half = bgr.shape[1] // 2
+        bgr[:, :half, 0] //= 2
+        bgr[:, half:, 2] //= 2
+        cv2.imwrite(str(file), bgr)
+    file = write_network(
+        tmp_path / 'red.onnx', [conv('image', 'scores', 'w', 'b')],
+        {'w': np.eye(3)[[0, 2]].reshape(2, 3, 1, 1), 'b': np.zeros(2)}, [1, 3, 48, 64],
+        {'scores': [1, 2, 48, 64]}, kind='semantic', input=[64, 48], classes=['red', 'blue'],
+        every=every,
+    )  # fmt: skip
+    stage = ImageLabeller(Network(file))
+    source = open_source(StereoCameraSettings(input=str(folder)))
+    source.takes_colour = stage.sees_colours
+    frames = list(stage.with_masks(source.frames()))
+    for frame in frames:
+        assert frame.left.ndim == 2 and frame.colour is None
+        labels = stage.labels(frame.stamp_ns, frame.left)
+        half = labels.shape[1] // 2
+        assert (labels[:, : half - 8] == 0).mean() > 0.99
+        assert (labels[:, half + 8 :] == 1).mean() > 0.99

@@ -311,6 +311,12 @@ class StereoRectifier:
             return rectified, cv2.remap(right, *left_maps, cv2.INTER_NEAREST, borderValue=nan)
         return rectified, cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
 
+    def rectify_colour(self, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the rectified left image (H, W, 3) of a raw one."""
+        if self._maps is None:
+            return left
+        return np.asarray(cv2.remap(left, *self._maps[0], cv2.INTER_LINEAR), np.uint8)
+
     def rectify_mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return a mask (H, W) of the raw left image on the rectified one: 255 where it is more
         than half, 0 elsewhere. Raises CalibrationError when the size is not the calibration's.

@@ -16,6 +16,7 @@ from segfloor_ros.camera.calibration.files import given_calibration, given_left_
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import (
     Grey,
+    colour_image,
     depth_calibration,
     depth_image,
     disparity_of_depth,
@@ -122,7 +123,7 @@ def _entries(
         yield from pairing.finish()
 
     def load(left: Any, right: Any) -> tuple[Grey, NDArray[Any]]:
-        image = grey_image(left, topics.left)
+        image = (colour_image if source.takes_colour else grey_image)(left, topics.left)
         if topics.right_is_depth:
             return image, disparity_of_depth(depth_image(right, topics.right), camera)
         return image, grey_image(right, topics.right)

@@ -26,7 +26,7 @@ from segfloor_ros.camera.sources.source import (
     check_forward,
 )
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
+from segfloor_ros.files.images import CorruptImageError, Grey, read_colour, read_grey
 from segfloor_ros.files.whole import nanoseconds, number, read_lines, whole_nanoseconds
 from segfloor_ros.geometry import Array, rotations_of
 
@@ -155,10 +155,11 @@ def file_pair_source(
                 source.skip(pair.index, f'its stamp {last_ns} ns was there before')
                 continue
             last_ns = pair.stamp_ns
-            yield PairEntry(pair.index, pair.stamp_ns, partial(load, pair))
+            read_left = read_colour if source.takes_colour else read_grey
+            yield PairEntry(pair.index, pair.stamp_ns, partial(load, pair, read_left))
 
-    def load(pair: FilePair) -> tuple[Grey, NDArray[Any]]:
-        return read_grey(pair.left), (read_right or read_grey)(pair.right)
+    def load(pair: FilePair, read_left: Callable[[Path], Grey]) -> tuple[Grey, NDArray[Any]]:
+        return read_left(pair.left), (read_right or read_grey)(pair.right)
 
     stamps = [pair.stamp_ns for pair in pairs]
     source = StereoSource(

@@ -120,7 +120,7 @@ def open_device(path: Path, settings: StereoCameraSettings) -> StereoSource:
 
     def entries(source: StereoSource) -> Iterator[PairEntry]:
         for index, (stamp_ns, images) in enumerate(device.pairs()):
-            yield PairEntry(index, stamp_ns, partial(_grey_pair, images))
+            yield PairEntry(index, stamp_ns, partial(_pair, images, source.takes_colour))
 
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ
     return StereoSource(name, calibration, entries, frame_count=None, rate_hz=rate_hz)
@@ -143,7 +143,7 @@ def open_video(path: Path, settings: StereoCameraSettings) -> StereoSource:
                 if not ok:
                     return
                 stamp_ns = round(index * 1e9 / source.rate_hz)
-                yield PairEntry(index, stamp_ns, partial(_grey_pair, halves(image)))
+                yield PairEntry(index, stamp_ns, partial(_pair, halves(image), source.takes_colour))
 
     with _opened_video(path) as video:
         frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -164,8 +164,8 @@ def _opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
         video.release()
 
 
-def _grey_pair(images: ColourPair) -> tuple[Grey, Grey]:
-    return to_grey(images[0]), to_grey(images[1])
+def _pair(images: ColourPair, takes_colour: bool) -> tuple[Grey, Grey]:
+    return images[0] if takes_colour else to_grey(images[0]), to_grey(images[1])
 
 
 def is_device(path: Path) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration, StereoRectifier
-from segfloor_ros.camera.images import EightBitScale
+from segfloor_ros.camera.images import EightBitScale, to_grey
 from segfloor_ros.camera.model import DEPTH, RecordedSensor, StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import CorruptImageError, Grey, check_same_size, read_mask
@@ -68,20 +68,21 @@ class MaskFolder:
 @dataclass(frozen=True)
 class RawPair:
     """One grey pair as the camera saw it, not rectified: images (H, W) uint8, the pair's number
-    in its recording, its stamp in ns.
+    in its recording, its stamp in ns. colour: the left one in BGR (H, W, 3), if asked for.
     """
 
     index: int
     stamp_ns: int
     left: NDArray[np.uint8]
     right: NDArray[Any]
+    colour: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
 class PairEntry:
-    """A pair that has not been decoded yet. `load` returns both grey images; it raises
-    CorruptImageError where one of them is damaged. A depth camera has a disparity for the right
-    one.
+    """A pair that has not been decoded yet. `load` returns both grey images, the left one with its
+    colours (H, W, 3), BGR, where the source takes them; it raises CorruptImageError where one of
+    them is damaged. A depth camera has a disparity for the right one.
     """
 
     index: int
@@ -93,8 +94,9 @@ class StereoSource:
     """A recording or device as a sequence of stereo pairs with one calibration.
 
     name: of the recording, for messages. calibration: of the raw pairs. read: gets this source and
-    yields its pairs in order, without decoding them. camera: the rectified
-    one. frame_count: pairs expected, None when unknown. rate_hz: frames per second.
+    yields its pairs in order, without decoding them. takes_colour: whether frames have colours,
+    where the camera has them. camera: the rectified one. frame_count: pairs expected, None when
+    unknown. rate_hz: frames per second.
     skipped_frames: pairs left out so far because an image was damaged or the stamp was there
     before. sensors: what else was found in the recording. masks: of what moves, where given.
     """
@@ -117,6 +119,7 @@ class StereoSource:
         self.frame_count = frame_count
         self.rate_hz = rate_hz
         self.masks: MaskFolder | None = None
+        self.takes_colour = False
         self._part = slice(0, None)
         self.skipped_frames = 0
         self._warned_of: set[int] = set()
@@ -188,7 +191,8 @@ class StereoSource:
         left, right = self._rectifier.rectify(pair.left, pair.right)
         mask = self.masks.read(pair.index) if self.masks is not None else None
         excluded = self._rectifier.rectify_mask(mask) if mask is not None else None
-        return StereoFrame(pair.index, pair.stamp_ns, left, right, excluded)
+        colour = None if pair.colour is None else self._rectifier.rectify_colour(pair.colour)
+        return StereoFrame(pair.index, pair.stamp_ns, left, right, excluded, colour)
 
     def _decoded(self) -> Iterator[RawPair]:
         pairs = map(self._decoded_pair, self.entries())
@@ -203,11 +207,14 @@ class StereoSource:
         for image in (left, right):
             what = f'{self.name}: frame {entry.index}'
             self.calibration.check_size(image.shape[1], image.shape[0], what)
+        colour, left = left if left.ndim == 3 else None, to_grey(left)
         if is_disparity(right):
             left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
         else:
             left, right = self._eight_bit(left, right)
-        return RawPair(entry.index, entry.stamp_ns, left, right)
+        if colour is not None:
+            colour = self._eight_bit(colour, colour)[0]
+        return RawPair(entry.index, entry.stamp_ns, left, right, colour)
 
     @cached_property
     def _rectifier(self) -> StereoRectifier:
