@@ -345,12 +345,12 @@ def _label_writers(result: RunResult) -> dict[str, Callable[[Path], object]]:
     labels, grid, cloud = result.labels, result.grid, result.labelled
     if labels is None:
         return {}
-    names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
-    rows = [f'{i},{names[k]}' for i, k in zip(cloud.point_id, labels.points, strict=True)]
-    points = '\n'.join(['id,class', *rows]) + '\n'
-    of_points: dict[str, Callable[[Path], object]] = {
-        POINT_LABELS: lambda path: path.write_text(points)
-    }
+    of_points: dict[str, Callable[[Path], object]] = {}
+    if labels.points is not None:
+        names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
+        rows = [f'{i},{names[k]}' for i, k in zip(cloud.point_id, labels.points, strict=True)]
+        points = '\n'.join(['id,class', *rows]) + '\n'
+        of_points[POINT_LABELS] = lambda path: path.write_text(points)
     if grid is None or labels.cells is None:
         return of_points
     return of_points | {

@@ -24,11 +24,21 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from segfloor_ros.cli.replay_recorder import SPIN_S, MaskListener, ReplayRecorder
+from segfloor_ros.cli.replay_recorder import SEMANTIC, SPIN_S, MaskListener, ReplayRecorder
 from segfloor_ros.errors import MapError, SegfloorError
 from segfloor_ros.files.results import scratch_folder
+from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.lockstep import ProgressListener
-from segfloor_ros.messages.topics import DIAGNOSTICS, GRID, NODES, PACED_BY, PATIENCE_S, TOPICS
+from segfloor_ros.messages.arrays import grid_of
+from segfloor_ros.messages.topics import (
+    DIAGNOSTICS,
+    GRID,
+    NODES,
+    PACED_BY,
+    PATIENCE_S,
+    TOPICS,
+    to_ns,
+)
 from segfloor_ros.processes import end_with_parent, how_it_ended, interrupts_deferred
 from segfloor_ros.timing import rss_mb
 
@@ -302,6 +312,16 @@ class NodeGraph:
         deadline_s = time.monotonic() + PATIENCE_S
         while 'map' not in self.recorder.latest and time.monotonic() < deadline_s:
             self.spin()
+
+    def wait_for_labels(self) -> OccupancyGrid | None:
+        """Wait for the numbers of the classes of the last map; None where they do not come."""
+        deadline_s, path = time.monotonic() + PATIENCE_S, self.recorder.path
+        while path is not None and time.monotonic() < deadline_s:
+            labels = self.recorder.latest.get(SEMANTIC)
+            if labels is not None and to_ns(labels.header.stamp) >= path.stamp_ns[-1]:
+                return grid_of(labels)
+            self.spin()
+        return None
 
     def call(self, kind: Any, name: str, request: Any, patience_s: float = PATIENCE_S) -> None:
         """Call a service. Raises ReplayError with its answer when it fails."""

@@ -62,7 +62,8 @@ POSES = ('odometry', 'pose')
 MASK, POINTS, KEYFRAME = 'keyframe/floor_mask', 'map_points', 'keyframe/odometry'
 MOUNT, LABELLED = 'camera_mount', 'labelled_points'
 OF_PATH = (*POSES, *(name + CORRECTED for name in POSES), MOUNT, 'keyframe/path')
-OF_MAP = (*OF_PATH, MASK, LABELLED, 'map')
+SEMANTIC = 'semantic_map'
+OF_MAP = (*OF_PATH, MASK, LABELLED, 'map', SEMANTIC)
 """What a replay records: of a path alone, and of a map."""
 
 

@@ -5,6 +5,7 @@ the processes cost and how long an image takes to the map.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import os
 import threading
@@ -41,6 +42,8 @@ from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S, Level, Status
 from segfloor_ros.messages.topics import CAMERA, GRID, MASKS, NODES, SLAM
 from segfloor_ros.processes import Interrupt
 from segfloor_ros.results_folder import RunResult, summarise
+from segfloor_ros.semantics.label_map import labels_of
+from segfloor_ros.semantics.network import NetworkSettings
 from segfloor_ros.slam.results import KeyframePath
 from segfloor_ros.slam.saved_slam import loaded_map, new_keyframes
 from segfloor_ros.timing import rss_mb
@@ -151,6 +154,11 @@ class ReplaySession:
                     raise broken from None
                 grid = grid_of(recorder.latest['map'])
         result = self._result(recorder, grid, wall_s, is_whole and broken is None)
+        if self.network is not None and grid is not None:
+            numbers = graph.wait_for_labels()
+            if numbers is not None and numbers.cells.shape == grid.cells.shape:
+                classes = NetworkSettings.read(self.network.with_suffix('.yaml')).classes
+                result = dataclasses.replace(result, labels=labels_of(numbers, classes))
         notices, status = [], 0 if broken is None else 1 if isinstance(broken, MapError) else 2
         try:
             notes = self._save_map(graph, result.summary.interrupted)

@@ -171,8 +171,9 @@ class View:
         self.grid(stamp_ns, result.grid)
         labels = result.labels
         if labels is not None:
-            names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
-            self.classes(stamp_ns, result.labelled, [names[number] for number in labels.points])
+            if labels.points is not None:
+                names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
+                self.classes(stamp_ns, result.labelled, [names[i] for i in labels.points])
             if result.grid is not None:
                 self._picture(stamp_ns, CLASSES, draw_labels(result.grid, labels))
         self.about('Result', summary_rows(result.summary))

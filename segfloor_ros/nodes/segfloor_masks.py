@@ -57,12 +57,14 @@ class LabelLayer:
         self.reset()
         node.inputs.subscribe('camera_mount', self._take_mount)
         node.inputs.join((INFO, *SEEN), self._take_keyframe)
-        node.inputs.subscribe('map', self._publish)
+        node.inputs.subscribe('map', self._take_map)
 
     def reset(self) -> None:
         """Know no keyframe."""
         self._path: KeyframePath | None = None
         self._labels: LabelMap | None = None
+        self._map: OccupancyGrid | None = None
+        self._last_ns = 0
         self._waiting: dict[int, NDArray[np.uint8]] = {}
 
     def expect(self, stamp_ns: int, labels: NDArray[np.uint8]) -> None:
@@ -75,9 +77,10 @@ class LabelLayer:
         self._mount = Mount.from_transform(transform_array(message))
 
     def _take_keyframe(self, stamp_ns: int, parts: dict[str, Any]) -> None:
+        self._last_ns = stamp_ns
         labels = self._waiting.pop(stamp_ns, None)
         if self._mount is None or labels is None:
-            return
+            return self._publish()
         disparity = depth_image(parts[DISPARITY].image, DISPARITY).astype(np.float32)
         scan = scan_arrays(parts[SCAN], SCAN)
         if self._labels is None:
@@ -97,11 +100,20 @@ class LabelLayer:
             scan.range_max_m,
         )
         self._path = path_arrays(parts[PATH])
+        self._publish()
 
-    def _publish(self, message: OccupancyGrid) -> None:
-        if self._labels is None or self._path is None:
+    def _take_map(self, message: OccupancyGrid) -> None:
+        self._map = message
+        self._publish()
+
+    def _publish(self) -> None:
+        """Publish the classes of a map once those of its last keyframe are there, too."""
+        message = self._map
+        if self._labels is None or self._path is None or message is None:
             return
-        grid = grid_of(message)
+        if to_ns(message.header.stamp) > self._last_ns:
+            return
+        self._map, grid = None, grid_of(message)
         layer = numbered(grid, self._labels.cells(grid, self._path))
         at = to_ns(message.header.stamp), message.header.frame_id
         self._node.outputs.publish('semantic_map', grid_message(*at, layer))

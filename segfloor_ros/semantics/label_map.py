@@ -198,12 +198,12 @@ def _likeliest(
 @dataclass(frozen=True)
 class Labels:
     """What is known of a whole map. classes: names by number. cells: (rows, columns) of its grid,
-    None where there is no grid. points: (N,) of its cloud.
+    None where there is no grid. points: (N,) of its cloud, None where that is not known.
     """
 
     classes: list[str]
     cells: NDArray[np.uint8] | None
-    points: NDArray[np.uint8]
+    points: NDArray[np.uint8] | None
 
 
 def numbered(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
@@ -212,6 +212,12 @@ def numbered(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
     """
     numbers = np.where(cells <= OCCUPIED, cells, UNKNOWN).astype(np.int8)
     return OccupancyGrid(numbers, grid.resolution_m, grid.origin_xy_m)
+
+
+def labels_of(numbers: OccupancyGrid, classes: list[str]) -> Labels:
+    """Return what `numbered` made of the labels of cells."""
+    cells = np.where(numbers.cells == UNKNOWN, UNLABELLED, numbers.cells).astype(np.uint8)
+    return Labels(classes, cells, None)
 
 
 def save_labels(path: Path, grid: OccupancyGrid, labels: Labels) -> None:

@@ -121,4 +121,7 @@ def test_replay_runs_the_network_beside_the_five_nodes(tmp_path, drive):
     summary = json.loads((out / 'summary.json').read_text())
     assert summary['tracked_frames'] == FRAMES
     assert summary['map_updates'] == summary['keyframes'] >= 2
+    labels, grid = load_map(out / 'map_labels.yaml'), load_map(out / 'map.yaml')
+    assert (labels.cells[grid.cells == FREE] == CLASSES.index('floor')).mean() > 0.5
+    assert (out / 'map_semantic.png').is_file()
     assert 'segfloor_masks' not in done.stderr, 'the node has nothing to warn of'
