@@ -9,7 +9,7 @@ from segfloor_ros.geometry import make_transform
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)

@@ -159,6 +159,15 @@ def test_heights_of_far_points_count_less() -> None:
     assert label_of(distant) == {1: UNKNOWN}
 
 
+def test_the_nearest_look_says_how_exact_a_height_is() -> None:
+    labelling, seen = CloudLabelling(CloudLabellingSettings()), features({1: NOWHERE})
+    point, far_base = cloud({1: (1.0, 0.0, 0.07)}), np.eye(4)
+    far_base[0, 3] = -8.0
+    for base, expected in ((far_base, UNKNOWN), (HERE, OBSTACLE), (far_base, OBSTACLE)):
+        assert label_of(labelling.update(point, seen, MASK, base)) == {1: expected}
+    assert labelling.to_arrays()['distance_m'] == [1.0]
+
+
 def test_empty_cloud() -> None:
     labelled = CloudLabelling(CloudLabellingSettings()).update(
         cloud({}), features({}), MASK, np.eye(4)

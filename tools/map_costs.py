@@ -33,7 +33,7 @@ from segfloor_ros.slam.places.place_recognition import NUM_WORDS, PlaceRecogniti
 from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.saved_slam import fill_map
 from segfloor_ros.slam.sparse_map import Match, SparseMap
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)

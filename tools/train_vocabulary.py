@@ -17,7 +17,7 @@ from segfloor_ros.configuration import resolve
 from segfloor_ros.slam.places import place_recognition as vocabulary
 from segfloor_ros.slam.places.place_recognition import BRANCHES, LEVELS
 from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.tracking.features import FeatureExtractor
+from segfloor_ros.slam.tracking.images import FeatureExtractor
 
 FRAMES_PER_RECORDING = 80
 STEPS = 12

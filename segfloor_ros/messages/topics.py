@@ -170,10 +170,21 @@ def _images(side: str) -> list[Topic]:
     ]
 
 
-def _rectified_pair(names: tuple[str, ...], profile: QoSProfile, **facts: Any) -> list[Topic]:
-    """Return the topics of rectified images and their calibrations."""
+def _rectified_pair(
+    names: tuple[str, ...],
+    profile: QoSProfile,
+    of_right: tuple[str, ...] = (),
+    of_left: tuple[str, ...] = (),
+    **facts: Any,
+) -> list[Topic]:
+    """Return the topics of rectified images and their calibrations. of_right, of_left: who
+    subscribes to those of a side.
+    """
     kinds = {name: CameraInfo if name.endswith('camera_info') else Image for name in names}
-    return [Topic(name, kind, profile, SLAM, **facts) for name, kind in kinds.items()]
+    return [
+        Topic(name, kind, profile, SLAM, of_left if '/left/' in name else of_right, **facts)
+        for name, kind in kinds.items()
+    ]
 
 
 _ALL = [
@@ -219,8 +230,7 @@ _ALL = [
     Topic(MAP_LOADED, UInt8MultiArray, LATCHED, SLAM, (CLOUD, GRID), is_optional=True),
     Topic(MAP_WANTED, Header, KEYFRAMES, SLAM, (CLOUD, GRID), is_optional=True),
     Topic(MAP_PART, UInt8MultiArray, KEYFRAMES, CLOUD, (SLAM,), is_optional=True, also_by=(GRID,)),
-    *_rectified_pair(KEYFRAME_PARTS[:2], KEYFRAMES, subscribers=(FLOOR, MASKS)),
-    *_rectified_pair(KEYFRAME_PARTS[2:], KEYFRAMES, subscribers=(FLOOR,)),
+    *_rectified_pair(KEYFRAME_PARTS, KEYFRAMES, of_right=(FLOOR,), of_left=(FLOOR, MASKS)),
     *_rectified_pair(FRAME_PARTS, FRAMES, is_optional=True, on_demand_by=(FLOOR,)),
     Topic('keyframe/features', PointCloud2, KEYFRAMES, SLAM, (CLOUD, GRID, MASKS)),
     Topic('keyframe/path', Path, KEYFRAMES, SLAM, (GRID, MASKS)),

@@ -43,8 +43,6 @@ from segfloor_ros.simulation.simulation import SimulatedFrame, Simulation
 
 WORLD, BASE = 'world', 'base_link'
 
-STOP = 0.0, 0.0
-
 LOOK_AHEAD_S = 0.05
 """The camera's exposure, and the lag of one eye, end so long after the stamp at most."""
 
@@ -149,7 +147,7 @@ class SimulatedRobotNode(StageNode[SimulatedRobotNodeSettings]):
             last_ns = self._stamps_ns[index - 2] if index > 1 else 0
         else:
             is_late = stamp_ns - last_ns > 1e9 * self.settings.command_timeout_s
-        self._robot.drive(*(STOP if is_late or not last_ns else given[last_ns]))
+        self._robot.drive(*((0.0, 0.0) if is_late or not last_ns else given[last_ns]))
         self._commands = {ns: command for ns, command in given.items() if ns >= last_ns}
 
     def _publish(self, stamp_ns: int, frame: SimulatedFrame) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
     from segfloor_ros.camera.images import Region
     from segfloor_ros.slam.rig import Observations
     from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-    from segfloor_ros.slam.tracking.features import Features
+    from segfloor_ros.slam.tracking.images import Features
     from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 UNKNOWN_COVARIANCE = 1e6
@@ -48,6 +48,14 @@ places."""
 
 MOST = 0.6
 """Share of what is expected at a pose that must be found there: what looks alike shows less."""
+
+NEARLY_ALL = 0.9
+"""Share of a keyframe's points that others must see as well, or of a view that they must cover, for
+it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E)."""
+
+POINTS_PER_KEYFRAME = 300
+"""Points of a keyframe that hold the map together where it is adjusted as a whole, those that most
+others see, and corners of its floor; the rest moves along."""
 
 PROOF = 3
 """Keyframes that must show something for it to be believed: that a point stands still, or is gone,

@@ -22,7 +22,7 @@ from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCl
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Retirement, SparseMap
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Features
 
 if TYPE_CHECKING:  # which uses this module
     from segfloor_ros.slam.stereo_slam import StereoSlam

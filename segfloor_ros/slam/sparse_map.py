@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Up
 from segfloor_ros.files.results import Arrays, check_lengths
 from segfloor_ros.geometry import Array, invert
-from segfloor_ros.slam.places.ground_views import NOTHING, GroundView
 from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
 
 OF_POSITION = ('xyz_world', 'patch', 'patch_distance_m')
@@ -239,6 +238,17 @@ class Match:
     rows: NDArray[np.intp]
     ids: NDArray[np.int32]
     stable_ids: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """Corners of the floor: xy_m (N, 2) on it in the base frame, descriptor (N, 32) uint8."""
+
+    xy_m: NDArray[np.float32]
+    descriptor: NDArray[np.uint8]
+
+
+NOTHING = GroundView(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
 
 
 @dataclass

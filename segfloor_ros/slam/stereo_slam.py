@@ -20,7 +20,7 @@ from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array, adjoint, invert, transform_points
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
-from segfloor_ros.slam.places.ground_views import GroundViews
+from segfloor_ros.slam.places.views import GroundViews
 from segfloor_ros.slam.results import (
     NO_POINT,
     UNKNOWN_COVARIANCE,

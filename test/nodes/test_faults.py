@@ -19,7 +19,7 @@ from segfloor_ros.messages.arrays import camera_info_message, image_message
 from segfloor_ros.messages.diagnostics import Level
 from segfloor_ros.messages.poses import path_arrays, pose_array
 from segfloor_ros.messages.topics import FLOOR, SLAM, TOPICS, to_ns
-from segfloor_ros.slam.places.known_views import NEW_TURN_RAD
+from segfloor_ros.slam.places.views import NEW_TURN_RAD
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""

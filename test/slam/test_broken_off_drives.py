@@ -96,6 +96,27 @@ def test_a_place_that_is_not_seen_is_held_and_said_to_be_unsure(frames):
     assert 0.1 < jump_m < 3 * sigma_m(held)
 
 
+def test_a_heading_that_is_unsure_makes_the_way_since_unsure_across_it(frames):
+    """The robot was carried, and drives an arc of 1 m before the map is recognised."""
+    slam, _ = broken_off(frames[:FRAMES])
+    arc, pose = [planar_pose(1.0, 0.0, 2.4)] * 17, planar_pose(1.0, 0.0, 2.4)
+    for _ in range(20):
+        pose = pose @ planar_pose(0.05, 0.0, 0.06)
+        arc.append(pose)
+    for k, pose in enumerate(arc):
+        slam.process(ROOM.frame(FRAMES + GAP + k, pose))
+    assert slam.back_end.submap is Submap.LOST
+    result = slam.provisional
+    # From where the camera was held to where the base is now.
+    held = base_at(FRAMES - 1) @ MOUNT.T_base_left
+    way = (result.T_map_odom @ result.T_odom_base)[:3, 3] - held[:3, 3]
+    assert np.linalg.norm(way[:2]) > 0.8
+    covariance = result.covariance_in_map
+    variance = np.diag(covariance)[3:].mean()
+    expected = variance * ((1 + way @ way) * np.eye(3) - np.outer(way, way))
+    np.testing.assert_allclose(covariance[:3, :3], expected, atol=0.1 * variance)
+
+
 def test_wheels_tell_the_way_that_nobody_saw(frames):
     slam, _ = broken_off(frames[:FRAMES], wheels(FRAMES))
     for pose in wheels(FRAMES + GAP + 5):

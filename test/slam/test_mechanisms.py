@@ -11,8 +11,7 @@ from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.keyframe_mapping import find_duplicates
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking.features import FeatureExtractor
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import FeatureExtractor, Images
 from segfloor_ros.slam.tracking.map_tracking import LocalMap, Tracker
 
 SETTINGS = StereoSlamSettings(num_features=600)

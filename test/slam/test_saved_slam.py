@@ -133,6 +133,16 @@ def test_frames_in_a_row_must_find_who_is_lost(mapped):
     assert tracked == [False] * 8 + [True] * 2
 
 
+def test_what_was_found_before_a_new_search_does_not_count_in_it(mapped):
+    slam, here = loaded(mapped, localize=True), there(25)[10]
+    tracked = []
+    for k in range(7):
+        if k == 2:
+            slam.front_end.reset()
+        tracked.append(slam.process(ROOM.frame(k, here))[0].tracked)
+    assert tracked == [False] * 4 + [True] * 3
+
+
 @pytest.mark.parametrize(('second', 'is_found'), [(1, False), (10, True)])
 def test_finds_agree_as_far_as_the_camera_can_have_moved(mapped, second, is_found):
     """0.9 m in a tenth of a second is another place, in a second it is a drive."""

@@ -7,7 +7,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.pipeline import make_slam
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking.features import FeatureExtractor
+from segfloor_ros.slam.tracking.images import FeatureExtractor
 
 BUDGET = 600
 

@@ -31,9 +31,8 @@ from segfloor_ros.slam.results import StereoSlamSettings, Track
 from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.features import Features
 from segfloor_ros.slam.tracking.front_end import FrontEnd
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import Features, Images
 from segfloor_ros.timing import timed
 
 

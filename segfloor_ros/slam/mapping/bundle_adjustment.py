@@ -29,7 +29,7 @@ from segfloor_ros.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.slam.results import ENOUGH
+from segfloor_ros.slam.results import ENOUGH, POINTS_PER_KEYFRAME
 from segfloor_ros.slam.rig import (
     MIN_DEPTH_M,
     NO_OFFSET,
@@ -44,9 +44,6 @@ from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""
-
-POINTS_PER_KEYFRAME = 300
-"""Points of a keyframe that most others see: they hold the map together, the rest moves along."""
 
 STEPS = 6
 """An adjustment mostly converges in three."""

@@ -26,14 +26,20 @@ from segfloor_ros.slam.results import (
     CHANCE_SHARE,
     ENOUGH,
     MAJORITY,
+    NEARLY_ALL,
     NO_POINT,
     PROOF,
     ObservedFeatures,
 )
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.features import MAX_HAMMING, hamming, one_to_one
-from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX, Images
+from segfloor_ros.slam.tracking.images import (
+    MAX_HAMMING,
+    SMALL_WIDTH_PX,
+    Images,
+    hamming,
+    one_to_one,
+)
 from segfloor_ros.slam.tracking.map_tracking import predict_points
 from segfloor_ros.slam.tracking.patch_alignment import ALIGNED_PX, SIDE_PX, measure_disparity
 from segfloor_ros.timing import timed
@@ -51,9 +57,6 @@ MAX_DISPARITY_SHARE = 0.5
 MIN_TEXTURE = 5
 MAX_OCTAVES_APART, CANDIDATES = 2.5, 4
 """Levels of the pyramid between two views of what may be one point, and points tried for each."""
-
-REDUNDANT_SHARE = 0.9
-"""Share of a keyframe's points that others must see as well for it to be retired (section VI-E)."""
 
 Pairs = tuple[NDArray[np.int32], NDArray[np.int32]]
 
@@ -304,7 +307,7 @@ def retire_redundant(sparse_map: SparseMap, candidates: NDArray[np.integer]) -> 
     last = len(sparse_map.keyframes) - PROOF
     for index in sorted(int(k) for k in candidates if 0 < k < last):
         keyframe = sparse_map.keyframes[index]
-        if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= REDUNDANT_SHARE:
+        if keyframe.retired is None and redundant_share(sparse_map, keyframe) >= NEARLY_ALL:
             order, _ = sparse_map.covisible(keyframe.point_id[keyframe.point_id != NO_POINT])
             reference = order[order != index][0]
             sparse_map.retire(keyframe, sparse_map.keyframes[reference])
@@ -316,7 +319,7 @@ def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
     """
     rows = np.flatnonzero(keyframe.point_id != NO_POINT)
     enough = sparse_map.observer_count[keyframe.point_id[rows]] > PROOF
-    if not len(rows) or enough.mean() < REDUNDANT_SHARE:
+    if not len(rows) or enough.mean() < NEARLY_ALL:
         return float(enough.mean()) if len(rows) else 0.0
     rows = rows[np.argsort(keyframe.point_id[rows])]
     ids = keyframe.point_id[rows]

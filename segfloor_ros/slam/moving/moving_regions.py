@@ -32,7 +32,7 @@ from segfloor_ros.slam.moving.scene_flow import (
     SmallCamera,
     static_scale,
 )
-from segfloor_ros.slam.places.known_views import MIN_FRAMES
+from segfloor_ros.slam.places.views import MIN_FRAMES
 from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
@@ -40,10 +40,10 @@ from segfloor_ros.slam.tracking.pose import FLOOR_M
 
 DISPARITIES = 64
 BLOCK_PX = 5
-P1, P2 = 100, 400
-"""Of semi-global matching (Hirschmueller 2008), for the sum of differences over a block."""
+P1, P2, SPECKLE_PX = 100, 400, 40
+"""Of semi-global matching (Hirschmueller 2008): penalties for the sum of differences over a block,
+and the size up to which a region on its own is noise."""
 
-SPECKLE_PX = 40
 MAX_PARALLAX_RAD = float(np.radians(30.0))
 COMPARED_VIEWS, KEPT_VIEWS = 5, 30
 SHIN_M, FOOT_M = 0.3, 0.2

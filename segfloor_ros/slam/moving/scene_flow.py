@@ -21,11 +21,10 @@ from scipy.spatial import cKDTree
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.results import MAJORITY, PROOF, MovingPoints
-from segfloor_ros.slam.rig import MIN_DEPTH_M
+from segfloor_ros.slam.rig import GATE, MIN_DEPTH_M, chi2_limit
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.sparse_map import MAX_PATCH_ZOOM
-from segfloor_ros.slam.tracking.features import spread
-from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, SMALL_WIDTH_PX, follow_pixels
+from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, SMALL_WIDTH_PX, follow_pixels, spread
 
 AGES_NS = (300_000_000, 900_000_000)
 """How long ago an image was that corners are followed back to: in the first someone who walks has
@@ -50,10 +49,6 @@ MAX_RETURN_PX = 0.5
 
 MAX_SHIFT_PX = 20.0
 """What stands still and changes its place in the image by more is not compared."""
-
-STATIC_SIGMAS, QUARTER_SIGMAS = 3.0, 0.319
-"""What moves differs by more than so many sigmas, of which a quarter of normal errors is below the
-second."""
 
 NEIGHBOUR_PX = 15.0
 """Corners so near to each other, at the same depth, are on one thing."""
@@ -195,7 +190,9 @@ def static_scale(ratios: Array) -> float:
     """
     if len(ratios) == 0:
         return 1.0
-    return max(1.0, STATIC_SIGMAS / QUARTER_SIGMAS * float(np.quantile(ratios, 0.25)))
+    quarter = 0.25
+    sigma = float(np.quantile(ratios, quarter)) / np.sqrt(chi2_limit(1, quarter))
+    return max(1.0, sigma * np.sqrt(chi2_limit(1, GATE)))
 
 
 def _follow(

@@ -47,7 +47,7 @@ from segfloor_ros.slam.sparse_map import (
     Match,
     SparseMap,
 )
-from segfloor_ros.slam.tracking.features import Features
+from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
 

@@ -17,12 +17,17 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
-from segfloor_ros.slam.places.ground_views import motion_between, seen_ahead_m
-from segfloor_ros.slam.places.known_views import ALIKE_SHARE, novelty, views_near
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
     Sightings,
     greatest_speed_mps,
+)
+from segfloor_ros.slam.places.views import (
+    ALIKE_SHARE,
+    motion_between,
+    novelty,
+    seen_ahead_m,
+    views_near,
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME
 from segfloor_ros.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
@@ -39,12 +44,9 @@ MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
 """Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
 as before: floors slope, and carts shake."""
 
-IN_FRONT_SHARE = 0.1
-"""A point is in front of another on its ray where its disparity is larger by this share."""
-
-MAX_SEEN_THROUGH = 0.2
-"""Share of points that the other side may see through: edges hide what is behind by a few pixels.
-"""
+IN_FRONT_SHARE, MAX_SEEN_THROUGH = 0.1, 0.2
+"""A point is in front of another on its ray where its disparity is larger by the first share. The
+second of all points the other side may see through: edges hide what is behind by a few pixels."""
 
 
 @dataclass(frozen=True)
@@ -216,14 +218,14 @@ class PlaceMatcher:
 
     def add(self, match: Match | None) -> bool:
         """Take in what the next keyframe sees of the place; returns whether enough of them agree,
-        over a motion that makes each of so many views a new one.
+        two of them so far apart that each of so many views on the way is new.
         """
         if not self._sightings.add(match):
             return False
-        first, latest = self.matches[0], self.matches[-1]
-        depth_m = median_depth_m(self._map, self._map.keyframes[latest.keyframe])
-        motion = latest.T_camera_world @ invert(first.T_camera_world)
-        return bool(novelty(motion, depth_m) >= self._needed - 1)
+        depth_m = median_depth_m(self._map, self._map.keyframes[self.matches[-1].keyframe])
+        poses = np.stack([match.T_camera_world for match in self.matches])
+        apart = novelty(poses[:, None] @ invert(poses), depth_m)
+        return bool(apart.max() >= self._needed - 1)
 
     def agree(self, before: Match, latest: Match) -> bool:
         """Whether two keyframes show the same drift, up to what two loops err."""

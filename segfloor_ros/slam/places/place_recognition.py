@@ -30,11 +30,11 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.files.results import Arrays, joined, split
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
-from segfloor_ros.slam.places.known_views import COLUMNS, ROWS
+from segfloor_ros.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.features import Features, hamming
+from segfloor_ros.slam.tracking.images import Features, hamming
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 
 FILE = 'vocabulary.npy'

@@ -15,7 +15,7 @@ from segfloor_ros.camera.model import Measurement, WheelPose, is_sound
 from segfloor_ros.geometry import Array, adjoint, invert, is_within, make_transform
 from segfloor_ros.slam.results import ENOUGH
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
-from segfloor_ros.slam.sensors.inertial_odometry import Gravity, InertialOdometry
+from segfloor_ros.slam.sensors.inertial_odometry import SPEED_SIGMA, Gravity, InertialOdometry
 from segfloor_ros.slam.sensors.wheel_odometry import (
     SIGMA_ROOT_M,
     SIGMA_ROOT_RAD,
@@ -28,12 +28,6 @@ from segfloor_ros.slam.sensors.wheel_odometry import (
 
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""
-
-SIGMA_ROOT_TURN_RAD = 0.01
-"""Error of the heading measured by wheels, per root metre."""
-
-SLIP_M_S = 0.5
-"""Error of a speed measured by wheels that slip."""
 
 WINDOW = 0.1, 0.1
 """A stretch of the drive to learn from ends after so many metres or radians, or a moment."""
@@ -148,7 +142,7 @@ class BodyMotion:
         T_before_now = make_transform(R, np.append(way_m, 0.0))
         variance = self._variance(measured, None if turn is None else turn[1])
         if self._slipped_ns is not None and before_ns < self._slipped_ns + MOMENT_NS:
-            variance[:2] += (SLIP_M_S * seconds) ** 2
+            variance[:2] += (SPEED_SIGMA * seconds) ** 2
         A = adjoint(invert(self.T_base_left))
         return RelativeMotion(
             invert(self.T_base_left) @ invert(T_before_now) @ self.T_base_left,
@@ -162,7 +156,7 @@ class BodyMotion:
         on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
         up = SIGMA_ROOT_M**2 * length_m
         tilt = SIGMA_ROOT_RAD**2 * length_m
-        yaw = SIGMA_ROOT_TURN_RAD**2 * length_m
+        yaw = SIGMA_ROOT_RAD**2 * length_m
         yaw += (SIGMA_TURN_SHARE * yaw_of(measured.T_before_now)) ** 2
         yaw += (calibration.lag_sigma_s * measured.turning_up_rad_s) ** 2
         on_floor += float(calibration.lag_sigma_s * np.linalg.norm(measured.speeding_up_m_s)) ** 2

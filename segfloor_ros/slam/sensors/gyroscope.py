@@ -32,11 +32,9 @@ of millimetres in their place are little then. Wheels are asked for a pose as of
 KEPT_NS = 40 * MOMENT_NS
 """How long samples are kept."""
 
-SIGMA_ROOT_S = 3e-4
-"""Error of an angle, rad per root second: consumer gyroscopes have 0.005 to 0.02 degrees."""
-
-SIGMA_SHARE = 0.005
-"""Error of an angle as a share of it: scale and alignment of the axes."""
+SIGMA_ROOT_S, SIGMA_SHARE = 3e-4, 0.005
+"""Error of an angle: rad per root second, of which consumer gyroscopes have 0.005 to 0.02 degrees,
+and a share of it, by scale and alignment of the axes."""
 
 FIRST_BIAS_SIGMA, BIAS_DRIFT = 0.02, 1e-4
 """Bias of a cheap gyroscope, rad/s, and its drift, rad/s per root second."""
@@ -47,8 +45,8 @@ FIRST_LAG_SIGMA_S, LAG_DRIFT = 0.02, 1e-5
 STEADY_RAD_S = 0.02
 """Noise alone shows smaller changes of the rate: they say nothing of a lag."""
 
-SIGMA_SEEN_RAD = 1e-3
-"""Error of a turn as the images show it."""
+SIGMA_SEEN_M, SIGMA_SEEN_RAD = 0.003, 1e-3
+"""Error of the place of a frame, and of a turn, as the images show it."""
 
 SAID_S = 0.01
 """A lag that is worth a word; less is what a driver may be off."""

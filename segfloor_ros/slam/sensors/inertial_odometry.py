@@ -19,14 +19,11 @@ from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import Array, rotation_angle
 from segfloor_ros.slam.results import PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.slam.rig import is_gated
-from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, STEP_NS, Gyroscope
+from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, SIGMA_SEEN_M, STEP_NS, Gyroscope
 
-SIGMA_SEEN_M = 0.003
-"""Error of the place of a frame as the images show it."""
-
-FIRST_SPEED_SIGMA_M_S = 0.3
-SIGMA_STEADY = 0.5
-"""How much a speed that is taken for constant changes, m/s per root second."""
+SPEED_SIGMA = 0.5
+"""Error of a speed that nothing measures, m/s: at first, or by wheels that slip; and how much one
+changes that is taken for constant, m/s per root second."""
 
 SIGMA_INTEGRATED = 0.01
 """Error of a speed that is integrated, m/s per root second: noise and shaking."""
@@ -84,7 +81,7 @@ class InertialOdometry:
         """Take in the pose of a frame that images or wheels show."""
         predicted = self._predicted(stamp_ns, R_world_odom)
         if predicted is None:
-            sigma = (SIGMA_SEEN_M, FIRST_SPEED_SIGMA_M_S, FIRST_ERROR_SIGMA_M_S2)
+            sigma = (SIGMA_SEEN_M, SPEED_SIGMA, FIRST_ERROR_SIGMA_M_S2)
             mean = np.stack([T_odom_camera[:3, 3], np.zeros(3), np.zeros(3)])
             predicted = mean, np.diag(np.square(sigma))
         mean, P = predicted
@@ -129,7 +126,7 @@ class InertialOdometry:
             known = np.array([1.0, 1.0, 0.0])
             P = P * np.outer(known, known) + np.diag([0.0, 0.0, FIRST_ERROR_SIGMA_M_S2**2])
             F[:2, 2] = 0.0
-            grown = SIGMA_STEADY
+            grown = SPEED_SIGMA
         else:
             against = R_world_odom.T @ lift
             way = before.R_odom_camera @ integrated.way - against * s**2 / 2

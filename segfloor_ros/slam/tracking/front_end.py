@@ -1,22 +1,26 @@
-"""The front end of SLAM: where the camera is, frame by frame."""
+"""The front end of SLAM: where the camera is, frame by frame, and which images cannot be tracked:
+black, white, only half delivered, or the same as before.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import Region, union
-from segfloor_ros.camera.model import StereoFrame, is_disparity
-from segfloor_ros.geometry import Array
-from segfloor_ros.slam.places.known_views import ALIKE_SHARE
+from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.geometry import Array, transform_points
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
     greatest_speed_mps,
     is_within,
 )
+from segfloor_ros.slam.places.views import ALIKE_SHARE
 from segfloor_ros.slam.results import (
     ENOUGH,
     MAJORITY,
@@ -30,20 +34,15 @@ from segfloor_ros.slam.results import (
 )
 from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.features import FeatureExtractor, Features
-from segfloor_ros.slam.tracking.images import (
-    ImageRotation,
-    Images,
-    RepeatCheck,
-    expected_shift,
-    image_fault,
-    is_inside,
-)
+from segfloor_ros.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
 from segfloor_ros.slam.tracking.map_tracking import Follower, LocalMap, Tracker
-from segfloor_ros.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
-from segfloor_ros.slam.tracking.patch_alignment import count_firm, with_patch_noise
+from segfloor_ros.slam.tracking.motion import CameraMotion, ImageRotation, TrackingState, sigma_m
+from segfloor_ros.slam.tracking.patch_alignment import GREY_NOISE, count_firm, with_patch_noise
 from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
 from segfloor_ros.timing import timed
+
+MIN_EXPECTED_SHIFT = 0.004
+"""Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
 
 PLENTY = 100
 """With so many points in view the place is certain enough, whatever they are, also where the
@@ -325,3 +324,54 @@ def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) 
 def _recognised(track: Track, ratio: float) -> bool:
     """Whether a camera that was lost sees enough of what it should see there."""
     return len(track.point_ids) >= ratio * len(track.visible_ids)
+
+
+def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
+    """Return what is wrong with a stereo pair of grey images (H, W), in words, or '' when it
+    can be tracked.
+    """
+    for side, image in (('left', left), ('right', right)):
+        sampled = image[::4, ::4]
+        if float(sampled.std()) < GREY_NOISE:
+            return f'{side} image without contrast (mean grey level {sampled.mean():.0f})'
+        live = np.ptp(sampled, axis=1) > 0
+        if live.mean() < MOST:
+            return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
+    return ''
+
+
+def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
+    """Return how far the picture of points (N, 3) should have moved between two poses
+    (T_camera_world, (4, 4)), in image widths; 0 without points.
+    """
+    if len(points) == 0:
+        return 0.0
+    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
+    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
+
+
+class RepeatCheck:
+    """Distinguishes an image that a camera delivers twice, as a Kinect does, from a camera that is
+    frozen: it delivers the same one again and again. A robot that stands still shows the same view,
+    too, but then no motion was to be expected.
+
+    is_repeated: whether the last image is the one before. is_carried: whether its view should have
+    moved since, so that it shows nothing of this moment.
+    """
+
+    def __init__(self) -> None:
+        self._last: NDArray[np.uint8] | None = None
+        self.is_repeated = self.is_carried = self._is_frozen = False
+
+    def is_frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
+        """Return whether the image (H, W) is the one before for a second time although it was to
+        move by expected_shift(), a share of its width, which is asked for only then.
+        """
+        was_carried = self.is_carried
+        self.is_repeated = self._last is not None and np.array_equal(left, self._last)
+        self._last = left
+        self._is_frozen &= self.is_repeated
+        should_move = self.is_repeated and expected_shift() > MIN_EXPECTED_SHIFT
+        self._is_frozen |= should_move and was_carried
+        self.is_carried = should_move and not self._is_frozen
+        return self._is_frozen

@@ -7,28 +7,30 @@ Parts of an image that do not count, because they move or lie on the border of r
 
 Two sources say so: a segmentation network (`StereoFrame.excluded`) and `moving_regions`.
 
-Images that cannot be tracked: black, white, only half delivered, or the same as before.
+ORB features spread over the image.
 
-How far the camera turned since the last image, from the images alone.
+Rublee et al., ORB: an efficient alternative to SIFT or SURF (ICCV 2011). The strongest corners
+alone would all lie on posters and shelves; the budget is dealt out over image cells instead, so
+that the floor gets its share.
 
-On a thumbnail a rotation looks like a shift. It is found without features by phase
-correlation, so that tracking survives a turn that its motion model did not foresee (the "small
-blurry image" of Klein and Murray, Improving the Agility of Keyframe-Based SLAM, 2008).
+Matching of binary descriptors: guided by a predicted pixel, or without guidance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.images import Region, blank_border, union
 from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
-from segfloor_ros.geometry import Array, make_transform, transform_points
+from segfloor_ros.geometry import Array
+from segfloor_ros.slam.results import StereoSlamSettings
+from segfloor_ros.timing import timed
 
 SIDE_PX = 11
 """Of the patch around a pixel: small enough to be flat, large enough to be distinct."""
@@ -41,12 +43,26 @@ STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.05)
 SIGMA_FLOW_PX = 1.0
 """Error of a pixel that is followed."""
 
-MIN_CONTRAST = 3.0
-MIN_LIVE_ROWS = 0.7
-MIN_EXPECTED_SHIFT = 0.004
-"""Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
+OVERSAMPLING = 4
+"""Corners detected per feature kept; the surplus is what the cells choose from."""
 
-MIN_RESPONSE = 0.05
+CELL_SIZE_PX = 16
+"""Side of the image cells over which features are spread: about as many cells as features."""
+
+PYRAMID_LEVELS, PYRAMID_SCALE = 8, 1.2
+"""The pyramid of ORB as published: sizes up to 3.6 times as large are recognised."""
+
+MAX_HAMMING = 80
+"""Largest distance of a match, of 256 bits: descriptors of different corners are about 128 apart,
+and one in a billion pairs is as near as this by chance."""
+
+MAX_RATIO = 0.85
+"""A match must be so much nearer than the second best (Lowe, Distinctive Image Features, 2004)."""
+
+NEIGHBOURS = 12
+"""Features looked at around a predicted pixel; a radius holds about ten."""
+
+Matches = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
@@ -137,85 +153,171 @@ def is_inside(region: Region | None, uv_px: NDArray[np.floating]) -> NDArray[np.
     return region[v, u] > 0
 
 
-def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
-    """Return what is wrong with a stereo pair of grey images (H, W), in words, or '' when it
-    can be tracked.
-    """
-    for side, image in (('left', left), ('right', right)):
-        sampled = image[::4, ::4]
-        if float(sampled.std()) < MIN_CONTRAST:
-            return f'{side} image without contrast (mean grey level {sampled.mean():.0f})'
-        live = np.ptp(sampled, axis=1) > 0
-        if live.mean() < MIN_LIVE_ROWS:
-            return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
-    return ''
-
-
-def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
-    """Return how far the picture of points (N, 3) should have moved between two poses
-    (T_camera_world, (4, 4)), in image widths; 0 without points.
-    """
-    if len(points) == 0:
-        return 0.0
-    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
-    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
-
-
-class RepeatCheck:
-    """Distinguishes an image that a camera delivers twice, as a Kinect does, from a camera that is
-    frozen: it delivers the same one again and again. A robot that stands still shows the same view,
-    too, but then no motion was to be expected.
-
-    is_repeated: whether the last image is the one before. is_carried: whether its view should have
-    moved since, so that it shows nothing of this moment.
+@dataclass(frozen=True)
+class Features:
+    """The features of one image: uv_px (N, 2) float32 at full resolution, octave (N,) uint8,
+    descriptor (N, 32) uint8.
     """
 
-    def __init__(self) -> None:
-        self._last: NDArray[np.uint8] | None = None
-        self.is_repeated = self.is_carried = self._is_frozen = False
+    uv_px: NDArray[np.float32]
+    octave: NDArray[np.uint8]
+    descriptor: NDArray[np.uint8]
 
-    def is_frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
-        """Return whether the image (H, W) is the one before for a second time although it was to
-        move by expected_shift(), a share of its width, which is asked for only then.
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    def take(self, rows: NDArray[np.intp]) -> Features:
+        """Return the chosen rows."""
+        return Features(self.uv_px[rows], self.octave[rows], self.descriptor[rows])
+
+
+class FeatureExtractor:
+    """Detects oriented FAST corners on a pyramid and describes a spread selection of them."""
+
+    def __init__(self, settings: StereoSlamSettings) -> None:
+        self._budget = settings.num_features
+        self._orb = cv2.ORB_create(
+            nfeatures=OVERSAMPLING * settings.num_features,
+            scaleFactor=PYRAMID_SCALE,
+            nlevels=PYRAMID_LEVELS,
+            edgeThreshold=19,
+            fastThreshold=settings.fast_threshold,
+        )
+
+    @timed
+    def extract(self, image: NDArray[np.uint8], excluded: Region | None = None) -> Features:
+        """Return the features of a grey image (H, W) outside of what is excluded."""
+        corners = self._orb.detect(image, None)
+        if excluded is not None and corners:
+            inside = is_inside(excluded, cv2.KeyPoint_convert(corners))
+            corners = [corner for corner, out in zip(corners, ~inside, strict=True) if out]
+        if not corners:
+            return Features(
+                np.zeros((0, 2), np.float32), np.zeros(0, np.uint8), np.zeros((0, 32), np.uint8)
+            )
+        uv = cv2.KeyPoint_convert(corners)
+        response = np.array([corner.response for corner in corners], np.float32)
+        chosen = spread(uv, response, CELL_SIZE_PX, self._budget)
+        kept, descriptor = self._orb.compute(image, [corners[i] for i in chosen])
+        octave = np.array([corner.octave & 0xFF for corner in kept], np.uint8)
+        uv = np.asarray(cv2.KeyPoint_convert(kept), np.float32).reshape(-1, 2)
+        return Features(self._at_full_resolution(uv, octave, image), octave, np.asarray(descriptor))
+
+    def _at_full_resolution(
+        self, uv: NDArray[np.float32], octave: NDArray[np.uint8], image: NDArray[np.uint8]
+    ) -> NDArray[np.float32]:
+        """Return exact positions (N, 2). OpenCV multiplies a corner's place in its pyramid
+        level by the nominal scale; but levels have whole sizes, and what scales is the
+        distance from the image's outer edge, half a pixel before the first pixel's centre.
         """
-        was_carried = self.is_carried
-        self.is_repeated = self._last is not None and np.array_equal(left, self._last)
-        self._last = left
-        self._is_frozen &= self.is_repeated
-        should_move = self.is_repeated and expected_shift() > MIN_EXPECTED_SHIFT
-        self._is_frozen |= should_move and was_carried
-        self.is_carried = should_move and not self._is_frozen
-        return self._is_frozen
+        nominal = PYRAMID_SCALE ** octave.astype(np.float64)[:, None]
+        size = np.array(image.shape[::-1], np.float64)
+        level_size = np.rint(size / nominal)
+        return (((uv / nominal) + 0.5) * (size / level_size) - 0.5).astype(np.float32)
 
 
-class ImageRotation:
-    """Compares each image with the one before."""
+def spread(
+    uv_px: NDArray[np.float32], response: NDArray[np.float32], cell_px: int, budget: int
+) -> NDArray[np.intp]:
+    """Choose up to `budget` corners: first the best of every cell, then every cell's second,
+    and so on.
 
-    def __init__(self, camera: StereoCamera) -> None:
-        self._scale = SMALL_WIDTH_PX / 4 / camera.width
-        height = max(8, round(camera.height * self._scale))
-        self._size = (SMALL_WIDTH_PX // 4, height)
-        self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        self._focal = (camera.fx * self._scale, camera.fy * height / camera.height)
-        self._last: NDArray[np.float32] | None = None
-        self._now: NDArray[np.float32] | None = None
+    uv_px: (N, 2). response: (N,), larger is better. Returns ascending indices.
+    """
+    column, row = (uv_px // cell_px).astype(np.int64).T
+    cell = row * (int(column.max()) + 1) + column
+    strength = response.astype(np.float64)
+    span = float(np.ptp(strength)) + 1.0  # one sort by two keys: much faster than lexsort
+    order = np.argsort(cell * span - strength, kind='stable')
+    sorted_cell = cell[order]
+    first_of_cell = np.r_[0, np.flatnonzero(np.diff(sorted_cell)) + 1]
+    run_start = np.zeros(len(order), np.int64)
+    run_start[first_of_cell] = first_of_cell
+    rank_in_cell = np.arange(len(order)) - np.maximum.accumulate(run_start)
+    by_rank = np.argsort(rank_in_cell * span - strength[order], kind='stable')
+    return np.sort(order[by_rank[:budget]])
 
-    def see(self, image: NDArray[np.float32]) -> None:
-        """Take in the next image (H, W)."""
-        small = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
-        self._last, self._now = self._now, np.asarray(cv2.GaussianBlur(small, (0, 0), 0.75))
 
-    def turn_since_last(self) -> Array:
-        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
-        centre.
+def hamming(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return the Hamming distances (...,) of descriptors (..., 32), broadcast against each
+    other.
+    """
+    if hasattr(np, 'bitwise_count'):  # NumPy 2
+        difference = np.bitwise_xor(a.view(np.uint64), b.view(np.uint64))
+        bits = np.bitwise_count(difference)
+        # A sum over so short an axis takes longer than its terms.
+        return np.asarray(sum((bits[..., k] for k in range(1, 4)), bits[..., 0].astype(np.int32)))
+    pairs = np.bitwise_xor(a.view(np.uint16), b.view(np.uint16))
+    return np.asarray(_bits()[pairs].sum(axis=-1, dtype=np.int32))
 
-        The identity where there was no image before, or where the two have too little in common.
-        """
-        if self._last is None or self._now is None:
-            return np.eye(4)
-        (du, dv), response = cv2.phaseCorrelate(self._last, self._now, self._window)
-        if response < MIN_RESPONSE:
-            return np.eye(4)
-        # A scene point that moves right by du lies further to the right now: it turned about +y.
-        angles = [-np.arctan2(dv, self._focal[1]), np.arctan2(du, self._focal[0]), 0.0]
-        return make_transform(Rotation.from_euler('xyz', angles).as_matrix(), np.zeros(3))
+
+@cache
+def _bits() -> NDArray[np.uint8]:
+    """Return how many bits of each number (65536,) of 16 are set."""
+    halves = np.arange(1 << 16, dtype=np.uint16).view(np.uint8).reshape(-1, 2)
+    return np.unpackbits(halves, axis=1).sum(axis=1, dtype=np.uint8)
+
+
+def match_predicted(
+    features: Features,
+    tree: cKDTree,
+    predicted_uv_px: NDArray[np.floating],
+    predicted_octave: NDArray[np.floating],
+    descriptor: NDArray[np.uint8],
+    radius_px: NDArray[np.floating],
+) -> Matches:
+    """Match map points to the features around their predicted pixels.
+
+    predicted_uv_px: (M, 2), predicted_octave: (M,), descriptor: (M, 32), radius_px: (M,). A match
+    must lie within one octave of the prediction and be clearly better than the second best of the
+    same octave. Returns (point rows, feature rows), one to one.
+    """
+    if len(predicted_uv_px) == 0 or len(features) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    # A list of ranks, as a single one alone would lose its axis.
+    ranks = list(range(1, min(NEIGHBOURS, len(features)) + 1))
+    found = tree.query(predicted_uv_px, k=ranks, distance_upper_bound=radius_px.max())
+    reach, near = (np.asarray(part) for part in found)
+    octave = np.append(features.octave.astype(np.float64), -100.0)[near]
+    valid = (reach <= radius_px[:, None]) & (np.abs(octave - predicted_octave[:, None]) <= 1.5)
+    rows, columns = np.nonzero(valid)
+    distance = np.full(near.shape, 512, np.int32)
+    distance[rows, columns] = hamming(descriptor[rows], features.descriptor[near[rows, columns]])
+    best = distance.argmin(axis=1)
+    index = np.arange(len(near))
+    best_distance = distance[index, best]
+    rival = (distance < 512) & (np.abs(octave - octave[index, best][:, None]) < 0.5)
+    rival[index, best] = False
+    second = np.where(rival, distance, 512).min(axis=1)
+    accepted = (best_distance <= MAX_HAMMING) & (best_distance <= MAX_RATIO * second)
+    points = np.flatnonzero(accepted)
+    return one_to_one(points, near[points, best[points]], best_distance[points])
+
+
+def match_unguided(query: NDArray[np.uint8], train: NDArray[np.uint8]) -> Matches:
+    """Match descriptors (N, 32) and (M, 32) by mutual nearest neighbours; returns (query rows,
+    train rows).
+    """
+    if len(query) == 0 or len(train) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(query, train)
+    pairs = np.array(
+        [(m.queryIdx, m.trainIdx) for m in found if m.distance <= MAX_HAMMING], np.intp
+    ).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def one_to_one(a: NDArray[np.intp], b: NDArray[np.intp], distance: NDArray[np.int32]) -> Matches:
+    """Keep the pairs (a[i], b[i]) that are the nearest of both their ends; ties go to the
+    lower index.
+    """
+    order = np.lexsort((b, a, distance))
+    a, b = a[order], b[order]
+    best_of_a = np.zeros(len(a), bool)
+    best_of_a[np.unique(a, return_index=True)[1]] = True
+    best_of_b = np.zeros(len(b), bool)
+    best_of_b[np.unique(b, return_index=True)[1]] = True
+    keep = best_of_a & best_of_b
+    a, b = a[keep], b[keep]
+    by_a = np.argsort(a, kind='stable')
+    return a[by_a], b[by_a]

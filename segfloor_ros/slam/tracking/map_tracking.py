@@ -21,27 +21,23 @@ from scipy.spatial import cKDTree
 
 from segfloor_ros.camera.images import Region
 from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.slam.places.known_views import (
-    SEEN_BY_SEVERAL,
-    View,
-    is_keyframe,
-    novelty,
-    view_novelty,
-    views_near,
-)
+from segfloor_ros.slam.places.views import View, is_keyframe, novelty, view_novelty, views_near
 from segfloor_ros.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, in_view
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking.features import (
+from segfloor_ros.slam.tracking.images import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
+    SIGMA_FLOW_PX,
     Features,
+    Images,
     Matches,
+    follow_pixels,
+    is_inside,
     match_predicted,
     match_unguided,
     spread,
 )
-from segfloor_ros.slam.tracking.images import SIGMA_FLOW_PX, Images, follow_pixels, is_inside
 from segfloor_ros.slam.tracking.patch_alignment import (
     MIN_SIGMA_PIXEL,
     align_patches,
@@ -304,7 +300,7 @@ class LocalMap:
         order, _ = self._map.covisible(track.point_ids)
         reference = self._map.keyframes[order[0]]
         known = reference.point_id[reference.point_id != NO_POINT]
-        reliable = known[self._map.observer_count[known] >= SEEN_BY_SEVERAL]
+        reliable = known[self._map.observer_count[known] > 1]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
         novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m)
         num_reliable = min(len(reliable), TRACKED_POINTS)

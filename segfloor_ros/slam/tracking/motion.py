@@ -1,12 +1,21 @@
-"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`."""
+"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`.
+
+How far the camera turned since the last image, from the images alone: on a thumbnail a rotation
+looks like a shift. It is found without features by phase correlation, so that tracking survives a
+turn that its motion model did not foresee (the "small blurry image" of Klein and Murray, Improving
+the Agility of Keyframe-Based SLAM, 2008).
+"""
 
 from __future__ import annotations
 
 from enum import Enum
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import (
     Array,
     adjoint,
@@ -20,13 +29,17 @@ from segfloor_ros.geometry import (
 from segfloor_ros.slam.results import SAME, LastPose
 from segfloor_ros.slam.rig import is_gated
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
-from segfloor_ros.slam.sensors.inertial_odometry import FIRST_SPEED_SIGMA_M_S
+from segfloor_ros.slam.sensors.inertial_odometry import SPEED_SIGMA
+from segfloor_ros.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.slam.tracking.pose import PoseEstimate
 
 MAX_TURN_RADPS = 6.0
 """A robot does not spin faster than once a second."""
 
 MIN_STEP_S = 1e-3
+
+MIN_RESPONSE = 0.05
+"""Of the phase correlation of two images that have something in common."""
 
 ACCELERATION = 2.0
 """Of a robot on wheels, m/s² and rad/s²."""
@@ -148,9 +161,7 @@ class CameraMotion:
             return True
         error, P = se3_log(T_camera_world @ invert(prior[0])), prior[1] + covariance
         if not measured.by_wheels:
-            P[:3, :3] += (
-                FIRST_SPEED_SIGMA_M_S * _step_s(self._last_stamp_ns, stamp_ns)
-            ) ** 2 * np.eye(3)
+            P[:3, :3] += (SPEED_SIGMA * _step_s(self._last_stamp_ns, stamp_ns)) ** 2 * np.eye(3)
         return is_gated(error, P)
 
     def is_heading_possible(self, T_camera_world: Array, stamp_ns: int) -> bool:
@@ -340,3 +351,36 @@ def _without_drift(T: Array) -> Array:
     so the rounding errors of repeated products would grow threefold each time.
     """
     return make_transform(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+
+
+class ImageRotation:
+    """Compares each image with the one before."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._scale = SMALL_WIDTH_PX / 4 / camera.width
+        height = max(8, round(camera.height * self._scale))
+        self._size = (SMALL_WIDTH_PX // 4, height)
+        self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
+        self._focal = (camera.fx * self._scale, camera.fy * height / camera.height)
+        self._last: NDArray[np.float32] | None = None
+        self._now: NDArray[np.float32] | None = None
+
+    def see(self, image: NDArray[np.float32]) -> None:
+        """Take in the next image (H, W)."""
+        small = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        self._last, self._now = self._now, np.asarray(cv2.GaussianBlur(small, (0, 0), 0.75))
+
+    def turn_since_last(self) -> Array:
+        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
+        centre.
+
+        The identity where there was no image before, or where the two have too little in common.
+        """
+        if self._last is None or self._now is None:
+            return np.eye(4)
+        (du, dv), response = cv2.phaseCorrelate(self._last, self._now, self._window)
+        if response < MIN_RESPONSE:
+            return np.eye(4)
+        # A scene point that moves right by du lies further to the right now: it turned about +y.
+        angles = [-np.arctan2(dv, self._focal[1]), np.arctan2(du, self._focal[0]), 0.0]
+        return make_transform(Rotation.from_euler('xyz', angles).as_matrix(), np.zeros(3))

@@ -37,7 +37,8 @@ AFFINE_SIGMA = 0.3
 """
 
 GREY_NOISE = 2.0
-"""Standard deviation of a grey level that the camera alone explains; a lower residual is luck."""
+"""Standard deviation of a grey level that the camera alone explains; a lower residual is luck, and
+an image that varies by less shows nothing."""
 
 ALIGNED_PX, MAX_SHIFT_STEP_PX = 2.0, 1.0
 """From so far away a patch is brought to where it lies, by no more than this in one step."""
@@ -49,9 +50,6 @@ MIN_CORRELATION = 0.7
 """Of the patches of one point in both images."""
 
 Patches = NDArray[np.float32]
-
-NOISE_SLOPE = 0.04
-"""Mean square of a slope of noise of unit variance, smoothed by one pixel: 1 / (8 pi)."""
 
 ALIASED = 0.3
 """Share of the slopes across an edge that its sampling in steps of pixels shows along it."""
@@ -337,7 +335,8 @@ def _known_shift(image: NDArray[Any], uv_px: Array) -> tuple[Array, Array]:
     by_v = (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]) / 2
     slopes = np.stack([by_u, by_v], axis=1).reshape(len(uv_px), 2, SIDE_PX**2)
     energy, axes = np.linalg.eigh(slopes @ np.swapaxes(slopes, 1, 2))
-    of_noise = NOISE_SLOPE * GREY_NOISE**2 * SIDE_PX**2
+    # The mean square of a slope of white noise of unit variance, smoothed by one pixel.
+    of_noise = GREY_NOISE**2 * SIDE_PX**2 / (8 * np.pi)
     apparent = 2 * of_noise + ALIASED * energy[:, 1:]
     known = np.maximum(energy - apparent, 0.0) / GREY_NOISE**2
     known /= 1 + MIN_SIGMA_PIXEL**2 * known

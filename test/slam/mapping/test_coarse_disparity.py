@@ -10,8 +10,7 @@ from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper, guess_dispar
 from segfloor_ros.slam.results import NO_POINT, ObservedFeatures
 from segfloor_ros.slam.rig import Observations, Rig
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking.features import Features
-from segfloor_ros.slam.tracking.images import Images
+from segfloor_ros.slam.tracking.images import Features, Images
 
 
 def shifted_pair(width, height, disparity):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.geometry import invert, se3_exp
+from segfloor_ros.geometry import invert, se3_exp, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -47,6 +47,20 @@ def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
     assert before > 0.1
     assert errors_m(bent).max() < 0.05 * before
     np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
+
+
+def test_a_world_that_turns_takes_points_their_directions_and_retired_keyframes_along(bent):
+    T = se3_exp(np.array([0.3, -0.2, 0.1, 0.1, 0.2, 0.5]))
+    bent.retire(bent.keyframes[30], bent.keyframes[31])
+    alive = bent.alive.copy()
+    xyz, direction = bent.xyz_world[alive], bent.viewing_direction[alive]
+    poses = np.stack([k.T_camera_world for k in bent.keyframes])
+    turned = poses @ invert(T)
+    turned[30] = np.eye(4)  # where the one stands that it follows is what counts
+    move_keyframes(bent, turned)
+    np.testing.assert_allclose(bent.xyz_world[alive], transform_points(T, xyz), atol=1e-9)
+    np.testing.assert_allclose(bent.viewing_direction[alive], direction @ T[:3, :3].T, atol=1e-9)
+    np.testing.assert_allclose(bent.keyframes[30].T_camera_world, poses[30] @ invert(T), atol=1e-9)
 
 
 def test_what_was_mapped_meanwhile_moves_along(bent):

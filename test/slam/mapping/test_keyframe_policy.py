@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import make_transform, se3_exp
-from segfloor_ros.slam.places.known_views import View, is_keyframe, novelty
-from segfloor_ros.slam.tracking.images import RepeatCheck, image_fault
+from segfloor_ros.slam.places.views import View, is_keyframe, novelty
+from segfloor_ros.slam.tracking.front_end import RepeatCheck, image_fault
 
 STILL = np.eye(4)
 MOVED = make_transform(np.eye(3), np.array([0.0, 0.0, 0.2]))

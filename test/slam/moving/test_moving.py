@@ -114,6 +114,10 @@ def test_a_late_mask_takes_the_points_back_that_its_keyframe_has_made():
     wide = dilate(drive.mask(keyframe.frame_index), 6)
     far = own & ~is_inside(wide, keyframe.observations.uvd_px[:, :2])
     np.testing.assert_array_equal(keyframe.point_id[far], ids[far])
+    # What keyframes before it have made is not its to take back.
+    older = (ids != NO_POINT) & inside & ~own
+    assert older.any()
+    np.testing.assert_array_equal(keyframe.point_id[older], ids[older])
 
 
 @pytest.mark.parametrize('place', [lambda index: None, standing])

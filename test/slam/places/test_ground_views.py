@@ -7,10 +7,11 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert
-from segfloor_ros.slam.places.ground_views import NOTHING, GroundViews, motion_between
+from segfloor_ros.slam.places.views import GroundViews, motion_between
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
+from segfloor_ros.slam.sparse_map import NOTHING
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)

@@ -6,12 +6,7 @@ from hand_made_maps import WALL, row_of_views
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import se3_exp
-from segfloor_ros.slam.places.known_views import (
-    SECOND_VISIT,
-    covered_share,
-    view_novelty,
-    views_near,
-)
+from segfloor_ros.slam.places.views import SECOND_VISIT, covered_share, view_novelty, views_near
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.rig import NEIGHBOURS
 from segfloor_ros.slam.stereo_slam import StereoSlam

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.camera.model import ImuSample, Mount, WheelPose
 from segfloor_ros.geometry import adjoint, invert, make_transform, se3_exp, se3_log
 from segfloor_ros.slam.sensors.body_motion import BodyMotion, RelativeMotion
-from segfloor_ros.slam.sensors.gyroscope import Gyroscope
+from segfloor_ros.slam.sensors.gyroscope import KEPT_NS, STEP_NS, Gyroscope, TimedSeries
 from segfloor_ros.slam.sensors.wheel_odometry import (
     MAX_WINDOWS,
     Stretch,
@@ -39,6 +39,27 @@ def test_wheels_are_interpolated_and_late_ones_find_their_place():
     assert wheels.motion(-10 * MS, 20 * MS) is None
     wheels.add(WheelPose(700 * MS, base_pose(5.0, 3.0, np.pi / 2)))
     assert wheels.motion(0, 500 * MS) is None
+
+
+def test_a_steady_circle_speeds_nothing_up():
+    wheels, rate, speed = WheelOdometry(), 0.8, 0.5
+    for t in range(0, 3001, 20):
+        turn = 1e-3 * t * rate
+        place = speed / rate * np.array([np.sin(turn), 1 - np.cos(turn)])
+        wheels.add(WheelPose(t * MS, base_pose(*place, turn)))
+    stretch = wheels.stretch(500 * MS, 2500 * MS)
+    # Both ends are measured over a tenth of a second before them.
+    np.testing.assert_allclose(stretch.speeding_up_m_s, 0.0, atol=0.05 * speed)
+    assert stretch.turning_up_rad_s == pytest.approx(0.0, abs=1e-9)
+
+
+def test_of_a_long_drive_the_latest_samples_are_kept():
+    series = TimedSeries(STEP_NS)
+    for k in range(400):
+        series.add(WheelPose(k * STEP_NS, np.eye(4)))
+        stamps = [pose.stamp_ns for pose in series]
+        assert stamps[-1] == k * STEP_NS
+        assert min(k * STEP_NS, KEPT_NS) <= stamps[-1] - stamps[0] <= 2 * KEPT_NS
 
 
 def gyroscope(rate, bias=(0.0, 0.0, 0.0), until=1000):

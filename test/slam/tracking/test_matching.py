@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.tracking.features import (
+from segfloor_ros.slam.tracking.images import (
     FeatureExtractor,
     Features,
     hamming,

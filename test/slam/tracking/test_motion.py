@@ -56,6 +56,17 @@ def test_the_map_moves_the_camera_with_its_keyframe_and_not_in_odom():
     np.testing.assert_allclose(motion.T_odom_camera, T_odom_camera, atol=1e-9)
 
 
+def test_what_wheels_measure_since_a_keyframe_counts_from_where_the_map_has_moved_it():
+    body = body_on_wheels([planar_pose(0.01 * k, 0.0, 0.01 * k) for k in range(40)])
+    motion = CameraMotion(2.0, body)
+    motion.take(SOMEWHERE, 1e-8 * np.eye(6), 0)
+    motion.since_keyframe.start(motion.T_camera_world, motion.covariance)
+    before = motion.prior(STEP_NS).T_camera_world
+    T = se3_exp(np.array([0.03, -0.01, 0.02, 0.01, 0.02, -0.01]))
+    motion.move_map(SOMEWHERE, SOMEWHERE @ T)
+    np.testing.assert_allclose(motion.prior(STEP_NS).T_camera_world, before @ T, atol=1e-9)
+
+
 def test_a_lost_camera_turns_where_it_stands():
     body, rate = BodyMotion(), np.array([0.0, 0.4, 0.0])
     for k in range(60):

@@ -1,5 +1,5 @@
-"""Keyframes by place: those that a camera stands near to and looks the same way as, whether or
-not it has seen their points lately.
+"""Views of places: which keyframes a camera stands near to and looks the same way as, when its own
+view is new, and the floor before it as seen from above, the same from every direction.
 
 A place that is seen again is recognised by them, as long as the path has drifted by no more than
 what patches are searched within, and needs few keyframes and no points again: the map follows the
@@ -7,6 +7,11 @@ space covered, not the time driven.
 
 When a frame becomes a keyframe: A1, A2 or A3 of the ORB-SLAM2 / OpenVSLAM design. Their condition
 B, enough points for a pose, holds for every frame that is tracked.
+
+A corridor driven back shows other sides of things, but the same floor. The image is projected onto
+the floor (inverse perspective mapping: Mallot et al., Biol. Cybern. 1991), with corners described
+where it is sharp; two views of the same floor differ by a motion in the plane, found by RANSAC.
+Floor that looks the same in many places, such as tiles, gives several motions: then none is known.
 """
 
 from __future__ import annotations
@@ -14,14 +19,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import Array, invert, rotation_angle, transform_points
-from segfloor_ros.slam.results import MAJORITY
-from segfloor_ros.slam.rig import NEIGHBOURS, in_view
-from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.geometry import Array, invert, make_transform, rotation_angle, transform_points
+from segfloor_ros.slam.results import (
+    CHANCE_SHARE,
+    ENOUGH,
+    MAJORITY,
+    NEARLY_ALL,
+    POINTS_PER_KEYFRAME,
+)
+from segfloor_ros.slam.rig import FITTING, NEIGHBOURS, SAME_PX, Rig, in_view
+from segfloor_ros.slam.sparse_map import NOTHING, GroundView, SparseMap
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
@@ -44,14 +56,10 @@ SECOND_VISIT = 3.0
 as far. What is known may have changed: so far and as far again from the latest keyframe the map is
 kept up to date, and twice as far with every visit that made a keyframe."""
 
-COVERED_SHARE = 0.95
 COLUMNS, ROWS = 4, 3
 """Parts of an image, in each of which something is asked for."""
 
 DEPTH_FACTORS = (0.5, 1.0, 2.0)
-
-SEEN_BY_SEVERAL = 2
-"""Keyframes that must observe a point for it to count as reliable."""
 
 TRACKED_RATIO = 0.25
 """Condition A3 as published: a keyframe is due when fewer of the reliable points are tracked."""
@@ -60,6 +68,10 @@ MUCH_NEW = 2.5
 """Novelty at which condition A2 does not count frames any more, as where the smaller part of the
 points is found again: the next frame finds fewer still.
 """
+
+CELL, AHEAD = 0.025, 4.5
+"""Side of a pixel of the view, and how far ahead of the camera it reaches, in units of the camera's
+height: farther away a pixel of the image covers several of the view, along the ray."""
 
 
 def views_near(
@@ -101,7 +113,7 @@ def view_novelty(
     known = np.isin(ids, sparse_map.points_of(earlier)).mean()
     views = [sparse_map.keyframes[k].T_camera_world for k in earlier]
     covered = covered_share(sparse_map.rig.camera, views, T_camera_world, depth_m)
-    if known < ALIKE_SHARE or covered < COVERED_SHARE:
+    if known < ALIKE_SHARE or covered < NEARLY_ALL:
         return nearest
     # The keyframes of one visit follow each other, also those that are retired by now.
     visits = 1 + (np.diff(np.flatnonzero(new < SECOND_VISIT)) > 1).sum()
@@ -174,3 +186,99 @@ def novelty(T_known_now: Array, median_depth_m: float) -> Array:
     moved_m = np.linalg.norm(T_known_now[..., :3, 3], axis=-1)
     turned_rad = rotation_angle(T_known_now[..., :3, :3])
     return np.maximum(moved_m / (NEW_MOTION_RATIO * median_depth_m), turned_rad / NEW_TURN_RAD)
+
+
+class GroundViews:
+    """Takes views of the floor with the camera of a rig."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._mount: Mount | None = None
+        self._orb = cv2.ORB.create(POINTS_PER_KEYFRAME, nlevels=1, fastThreshold=5)
+        self._contrast = cv2.createCLAHE(3.0, (4, 4))
+
+    def take(self, left: NDArray[np.uint8]) -> GroundView:
+        """Return what a rectified left image (H, W) shows of the floor; nothing while it is not
+        known how the camera is mounted.
+        """
+        if self._rig.mount is None:
+            return NOTHING
+        if self._mount != self._rig.mount:
+            self._mount = self._rig.mount
+            self._corner_xy_m, self._maps, self._inside = _projection(self._rig.camera, self._mount)
+        view = self._contrast.apply(cv2.remap(left, *self._maps, cv2.INTER_LINEAR))
+        corners, descriptor = self._orb.detectAndCompute(view, self._inside)
+        if not corners:
+            return NOTHING
+        column, row = cv2.KeyPoint_convert(corners).T
+        cell_m = CELL * self._mount.height_m
+        xy_m = self._corner_xy_m + cell_m * np.stack([row, column], axis=1)
+        return GroundView(xy_m.astype(np.float32), np.asarray(descriptor, np.uint8))
+
+
+def _projection(
+    camera: StereoCamera, mount: Mount
+) -> tuple[Array, tuple[NDArray[np.float32], NDArray[np.float32]], NDArray[np.uint8]]:
+    """Return where on the floor pixel (0, 0) of the view lies, the pixels (u, v) of the image that
+    its pixels show, x along rows and y along columns, and where there are such.
+    """
+    h = mount.height_m
+    steps = np.arange(0.0, AHEAD, CELL)
+    x, y = np.meshgrid(
+        mount.forward_m + h * steps, mount.left_m + h * (steps - AHEAD / 2), indexing='ij'
+    )
+    floor = np.stack([x, y, np.zeros_like(x), np.ones_like(x)], axis=-1)
+    points = floor @ invert(mount.T_base_left)[:3].T
+    uvw = points @ camera.K.T
+    ahead = points[..., 2] > CELL * h
+    depth_m = np.where(ahead, points[..., 2], np.inf)
+    u, v = ((uvw[..., k] / depth_m).astype(np.float32) for k in (0, 1))
+    inside = ahead & (u > 1) & (u < camera.width - 2) & (v > 1) & (v < camera.height - 2)
+    inside = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8))
+    return np.array([x[0, 0], y[0, 0]]), (u, v), inside
+
+
+def seen_ahead_m(mount: Mount) -> float:
+    """Return how far ahead of the base the middle of its view of the floor lies."""
+    return mount.forward_m + AHEAD / 2 * mount.height_m
+
+
+def motion_between(view: GroundView, other: GroundView, height_m: float) -> Array | None:
+    """Return T_base_other (4, 4), where the base stood at another view of the same floor; None
+    where too little is the same, or another motion fits as well.
+    """
+    if min(len(view.xy_m), len(other.xy_m)) < ENOUGH:
+        return None
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
+        other.descriptor, view.descriptor
+    )
+    rows = np.array([(m.queryIdx, m.trainIdx) for m in matches], np.intp).reshape(-1, 2)
+    if len(rows) < ENOUGH:
+        return None
+    # Complex numbers are motions in the plane: q = turn * p + shift.
+    p, q = (xy @ (1.0, 1j) for xy in (other.xy_m[rows[:, 0]], view.xy_m[rows[:, 1]]))
+    tolerance_m = SAME_PX * CELL * height_m
+    # So many pairs that a motion is among them which no more corners show than chance allows.
+    pairs = int(np.log(1 - FITTING) / np.log(1 - CHANCE_SHARE**2))
+    draws = np.random.default_rng(0).integers(len(p), size=(pairs, 2))
+    of_p, of_q = np.diff(p[draws])[:, 0], np.diff(q[draws])[:, 0]
+    alike = (np.abs(np.abs(of_p) - np.abs(of_q)) < tolerance_m) & (np.abs(of_p) > 2 * tolerance_m)
+    draws, turn = draws[alike], of_q[alike] / of_p[alike]
+    turn /= np.abs(turn)
+    shift = q[draws[:, 0]] - turn * p[draws[:, 0]]
+    fits = np.abs(turn[:, None] * p + shift[:, None] - q) < tolerance_m
+    count = fits.sum(axis=1)
+    best = int(count.argmax()) if len(count) else 0
+    if len(count) == 0 or count[best] < ENOUGH:
+        return None
+    middle = p[fits[best]].mean()
+    elsewhere = np.abs((turn - turn[best]) * middle + shift - shift[best]) > 2 * tolerance_m
+    if (count[elsewhere] > MAJORITY * count[best]).any():
+        return None
+    p, q = p[fits[best]], q[fits[best]]
+    turn_by = ((q - q.mean()) * (p - p.mean()).conj()).sum()
+    turn_by /= np.abs(turn_by)
+    shift_by = q.mean() - turn_by * p.mean()
+    c, s = turn_by.real, turn_by.imag
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return make_transform(R, np.array([shift_by.real, shift_by.imag, 0.0]))
