@@ -61,6 +61,9 @@ _MAX_STRIDE_M = 2.0
 """Between keyframes farther apart than this the base's way is not known."""
 
 
+_AROUND = np.ones((3, 3), np.uint8)
+"""A cell and its neighbours."""
+
 BEHIND_M = 0.1
 """Nothing is free so close behind a face: walls are no thinner."""
 
@@ -171,7 +174,7 @@ def mark_standing(
     keyframe, at = keyframe[inside], tuple(cells[inside].T)
     seen = np.zeros(grid.cells.shape, np.uint8)
     seen[at] = 1
-    count, label = cv2.connectedComponents(cv2.dilate(seen, np.ones((3, 3), np.uint8)))
+    count, label = cv2.connectedComponents(cv2.dilate(seen, _AROUND))
     thing, keeps = label[at], grid.cells[at] != FREE
     first, last = np.full(count, len(evidence)), np.zeros(count, np.intp)
     np.minimum.at(first, thing[keeps], keyframe[keeps])
@@ -342,7 +345,7 @@ class EvidenceFolder:
         near = self._draw_near(cells.shape, placed)
         in_the_way = self._standing(cells, near) & touched
         if cv2.countNonZero(in_the_way):
-            in_the_way &= 1 - cv2.dilate(hits, np.ones((3, 3), np.uint8))
+            in_the_way &= 1 - cv2.dilate(hits, _AROUND)
         hidden = self._draw_hidden(in_the_way, placed.fan)
         visible = 1 - (hits if hidden is None else hits | hidden)
         free &= visible
