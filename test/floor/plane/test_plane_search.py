@@ -125,14 +125,22 @@ def test_a_plane_is_that_of_the_first_camera_also_where_others_are_elsewhere() -
     assert (other.sigma > 2 * fit.sigma).all()
 
 
-@pytest.mark.parametrize(('share_below', 'is_known'), [(0.0, True), (0.02, True), (0.1, False)])
-def test_a_plane_below_which_much_is_seen_is_no_floor(share_below: float, is_known: bool) -> None:
-    """A floor hides what is below it: a mirror, or a table, lets one see through."""
+@pytest.mark.parametrize(
+    ('share_below', 'share_above', 'is_known'),
+    [(0.0, 0.0, True), (0.02, 0.0, True), (0.2, 0.0, False), (0.01, 0.8, True), (0.04, 0.8, False)],
+)
+def test_a_plane_below_which_much_is_seen_is_no_floor(
+    share_below: float, share_above: float, is_known: bool
+) -> None:
+    """A floor hides what is below it: a mirror, or a table, lets one see through. Where little of
+    the floor is seen, little below it is much.
+    """
     rng = np.random.default_rng(1)
     u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.1, 0.8, 3000)
     rays = np.stack([u, v, np.ones(3000)], axis=1)
     disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.2, 3000)
     disparity[: int(share_below * 3000)] *= 0.5
+    disparity[3000 - int(share_above * 3000) :] += rng.uniform(5, 40, int(share_above * 3000))
     search = PlaneSearch(UNKNOWN)
     for _ in range(4):
         fit = search.add(
