@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert, se3_exp
+from segfloor_ros.slam.places.loop_closing import as_seen_by
 from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, StereoSlamSettings
-from segfloor_ros.slam.rig import OffsetEstimate
-from segfloor_ros.slam.saved_slam import load_slam, moved, save_slam
+from segfloor_ros.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.slam.saved_slam import fill_map, load_slam, moved, save_slam
+from segfloor_ros.slam.sparse_map import SparseMap
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -249,3 +252,37 @@ def test_a_map_in_another_frame_looks_the_same_from_its_keyframes() -> None:
             there = before[kind] @ old[:3, :3].T + shift * old[:3, 3]
             here = after[kind] @ new[:3, :3].T + shift * new[:3, 3]
             np.testing.assert_allclose(here, there, atol=1e-9)
+
+
+def test_loops_of_a_map_behind_another_join_its_own_keyframes(mapped):
+    own = mapped.to_arrays()
+    own |= {
+        'loop_ends': np.array([[4, 1]], np.int32),
+        'loop_T_i_j': planar_pose(0.1, 0.2, 0.3)[None],
+        'loop_by_floor': np.array([True]),
+    }
+    count, ever = len(own['keyframe_stamp_ns']), own['num_ever']
+    sparse_map = SparseMap(Rig(CAMERA))
+    fill_map(sparse_map, own)
+    later = {'point_stable_id': own['point_stable_id'] + ever[0], 'num_ever': 2 * ever}
+    fill_map(sparse_map, own | later)
+    ends = [(loop.i, loop.j, loop.by_floor) for loop in sparse_map.loops]
+    assert ends == [(4, 1, True), (4 + count, 1 + count, True)]
+
+
+def test_a_map_of_another_camera_is_as_this_one_would_have_measured_it():
+    own = StereoCamera(640, 480, 400.0, 410.0, 310.0, 250.0, 0.12)
+    camera = StereoCamera(320, 240, 210.0, 200.0, 165.0, 115.0, 0.07)
+    point = np.array([[0.4, -0.3, 2.5]])
+
+    def measured(by, offset_px):
+        u, v, u_right = by.project(point)[0]
+        return [u, v, u - u_right + offset_px]
+
+    arrays = {
+        'feature_uvd_px': np.array([measured(own, 0.2)], np.float32),
+        'feature_sigma_px': np.ones((1, 3), np.float16),
+        'disparity_offset': np.array([0.2, 100.0]),
+    }
+    found = as_seen_by(camera, -0.4, own, arrays)['feature_uvd_px']
+    np.testing.assert_allclose(found, [measured(camera, -0.4)], atol=1e-3)
