@@ -113,8 +113,8 @@ as standard deviations: robots sway, and where they are is known so well.
 _INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
 """One and two sigmas to either side of the median: a few wrong planes do not count."""
 _LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
-"""A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and wrong
-matches, is so small a share of that: of true floors 0.11 at most, of boards above one 0.2 to 0.4.
+"""A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
+wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
 """
 
 
