@@ -96,7 +96,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'segfloor = segfloor_ros.cli.start:main',
+            'segfloor = segfloor_ros.cli:start',
             *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, *FURTHER_NODES)),
         ]
     },

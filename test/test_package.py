@@ -155,7 +155,7 @@ def test_what_pip_installs_is_what_rosdep_installs() -> None:
 
 def test_without_its_libraries_the_command_ends_with_one_line(tmp_path) -> None:
     (tmp_path / 'typer.py').write_text("raise ModuleNotFoundError('No typer', name='typer')\n")
-    command = [sys.executable, '-c', 'from segfloor_ros.cli.start import main; main()', '--help']
+    command = [sys.executable, '-c', 'from segfloor_ros.cli import start; start()', '--help']
     found = subprocess.run(
         command,
         cwd=REPOSITORY,

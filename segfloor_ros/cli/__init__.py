@@ -1,5 +1,27 @@
 """The segfloor command."""
 
+import sys
+
 from segfloor_ros.processes import limit_blas_threads
 
 limit_blas_threads()
+
+
+def start() -> None:
+    """Run the command line; without its libraries, end with one line and status 2."""
+    try:
+        from segfloor_ros.cli.main import main as run
+        from segfloor_ros.files.images import own_standard_error
+    except ModuleNotFoundError as error:
+        if (error.name or '').startswith('segfloor_ros'):
+            raise
+        name = (error.name or '').partition('.')[0]
+        print(
+            f'segfloor: the command needs the Python package {name}, which is not installed: '
+            f'apt install python3-{name}, or pip install {name} in a virtual environment; the ROS '
+            'nodes do without it',
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    own_standard_error()
+    run()

@@ -22,7 +22,7 @@ def test_a_converted_recording_is_tracked_as_it_is_played(make_graph, tmp_path, 
     frames, _ = room_drive(FRAMES)
     drive = write_kitti(tmp_path / 'drive', frames)
     bag = tmp_path / 'out.mcap'
-    start = 'from segfloor_ros.cli.start import main; main()'
+    start = 'from segfloor_ros.cli import start; start()'
     words = ['convert', str(drive), str(bag), '--images', coding]
     done = subprocess.run(
         [sys.executable, '-c', start, *words], capture_output=True, text=True, timeout=CONVERT_S
