@@ -258,7 +258,7 @@ class Pipeline:
         keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].stamp_ns == frame.stamp_ns:
             mask = self.labeller.moving(frame.stamp_ns, frame.left)
-            self.slam.add_late_mask(frame.stamp_ns, mask)
+            self.slam.late_masks.add(frame.stamp_ns, mask)
 
     def _submit(self, keyframe: Keyframe) -> None:
         while len(self._pending) >= MAX_KEYFRAMES_UNDER_WAY:

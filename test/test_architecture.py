@@ -124,3 +124,11 @@ def test_what_a_program_runs_comes_after_all_that_it_defines():
             for part in ast.parse(path.read_text()).body
         ]
         assert not any(mains[:-1]), path
+
+
+def test_no_class_is_above_twenty_methods() -> None:
+    for path in MODULES:
+        for part in ast.walk(ast.parse(path.read_text())):
+            if isinstance(part, ast.ClassDef):
+                methods = [one for one in part.body if isinstance(one, ast.FunctionDef)]
+                assert len(methods) <= 20, f'{path}: {part.name}'

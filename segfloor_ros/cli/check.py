@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from segfloor_ros.cli.terminal import View, console, figure_table, number_option, print_error
-from segfloor_ros.cli.view import open_view
+from segfloor_ros.cli.view import open_view, show_results
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.files.results import add_files, check_target, check_writable
 from segfloor_ros.files.whole import read_json, read_text
@@ -108,7 +108,7 @@ def check_suite(
             found[checked.name] = checked
             _print_progress(checked, len(found), len(todo))
             if shown is not None and not outcome.problem:
-                shown.results(out / outcome.name, outcome.name)
+                show_results(shown, out / outcome.name, outcome.name)
         result = SuiteResult(described.name, [found[entry.name] for entry in described.entries])
         _finish(result, out, described, known)
     if baseline_to_write is not None:

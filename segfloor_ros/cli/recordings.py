@@ -28,7 +28,7 @@ from segfloor_ros.camera.sources.opening import Inspection, Stream, inspect_reco
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.cli import terminal
 from segfloor_ros.cli.terminal import console, figure_table, number_option, value_table
-from segfloor_ros.cli.view import open_view
+from segfloor_ros.cli.view import open_view, show_recording, show_results
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.files.results import is_map_file
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
@@ -223,9 +223,9 @@ def view(
                 from segfloor_ros.cli.replay_recorder import watch
             watch(shown, options.input)
         elif (folder / 'summary.json').is_file():
-            shown.results(folder)
+            show_results(shown, folder)
         else:
-            shown.recording(open_source(options.configuration().stereo_camera))
+            show_recording(shown, open_source(options.configuration().stereo_camera))
 
 
 @terminal.with_options

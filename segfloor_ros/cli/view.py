@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -104,7 +105,7 @@ def open_view(target: str | None) -> Iterator[View | None]:
         console.print(f'view: {page}', highlight=False, soft_wrap=True)
         is_served = True
     try:
-        yield View(stream, rerun)
+        yield View(Canvas(stream, rerun))
     finally:
         stream.flush()
     if target:
@@ -116,19 +117,61 @@ def open_view(target: str | None) -> Iterator[View | None]:
                 time.sleep(1.0)
 
 
-class View:
-    """Shows a drive in a stream of rerun, below an entity `root`."""
+class Canvas:
+    """A stream of rerun, below an entity `root`, by the time since its first stamp."""
 
     def __init__(self, stream: Any, rerun: ModuleType, root: str = '') -> None:
-        self._stream, self._rr, self._root = stream, rerun, root
+        self.rerun = rerun
+        self._stream, self._root = stream, root
         self._start_ns: int | None = None
+        self._tabs: list[str] = []
+        self.log(None, 'world', rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        if not root:
+            self._lay_out()
+
+    def below(self, root: str) -> Canvas:
+        """Return a canvas behind a tab of its own."""
+        self._tabs.append(root)
+        self._lay_out()
+        return Canvas(self._stream, self.rerun, root)
+
+    def log(self, stamp_ns: int | None, entity: str, what: Any) -> None:
+        """Log something at a stamp, or for all of the drive."""
+        if stamp_ns is not None:
+            self._start_ns = stamp_ns if self._start_ns is None else self._start_ns
+            self._stream.set_time('time', duration=1e-9 * (stamp_ns - self._start_ns))
+        self._stream.log(f'{self._root}/{entity}', what, static=stamp_ns is None)
+
+    def picture(self, stamp_ns: int, entity: str, picture: NDArray[np.uint8]) -> None:
+        """Log a picture (H, W) or (H, W, 3) BGR."""
+        height = round(WIDTH_PX / picture.shape[1] * picture.shape[0])
+        small = cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_LINEAR)
+        image = self.rerun.EncodedImage(contents=jpeg_bytes(small), media_type='image/jpeg')
+        self.log(stamp_ns, entity, image)
+
+    def text(self, stamp_ns: int, words: str, level: str = 'INFO') -> None:
+        """Log a line of words."""
+        self.log(stamp_ns, TEXT, self.rerun.TextLog(words, level=level))
+
+    def _lay_out(self) -> None:
+        """Lay the panes out: those of every drive behind a tab of its name."""
+        import rerun.blueprint as rrb
+
+        tabs = [_panes(rrb, root) for root in self._tabs or ['']]
+        everything = rrb.Tabs(*tabs) if self._tabs else tabs[0]
+        time_panel = rrb.TimePanel(timeline='time', state='collapsed')
+        sides = rrb.BlueprintPanel(state='collapsed'), rrb.SelectionPanel(state='collapsed')
+        self._stream.send_blueprint(rrb.Blueprint(everything, *sides, time_panel))
+
+
+class View:
+    """Shows a drive on a canvas of rerun."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self.canvas, self._rr = canvas, canvas.rerun
         self._next_s: dict[str, float] = {}
         self._state = ''
         self._loops_ns: list[int] = []
-        self._shown: list[str] = []
-        self._log(None, 'world', rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
-        if not root:
-            self._lay_out()
 
     def on_frame(
         self, frame: StereoFrame, results: Sequence[FrameResult], pipeline: Pipeline
@@ -138,14 +181,8 @@ class View:
         for result in results:
             self.state(result.stamp_ns, result.state)
         if results:
-            self.paced(BASE, lambda: self._pose_of(results[-1]))
+            self.paced(BASE, partial(_show_newest, self, results[-1]))
         self.loops(frame.stamp_ns, pipeline.slam.back_end.loop_count)
-
-    def _pose_of(self, result: FrameResult) -> None:
-        if result.tracked:
-            self.pose(result.stamp_ns, result.T_map_odom @ result.T_odom_base)
-        if result.moving is not None:
-            self.moving_points(result.stamp_ns, result.moving)
 
     def on_keyframe(self, keyframe: Keyframe, floor: FloorObservation, pipeline: Pipeline) -> None:
         """Show a keyframe of a run that has come to the map."""
@@ -175,7 +212,7 @@ class View:
                 names = [*labels.classes, *[''] * (UNLABELLED + 1 - len(labels.classes))]
                 self.classes(stamp_ns, result.labelled, [names[i] for i in labels.points])
             if result.grid is not None:
-                self._picture(stamp_ns, CLASSES, draw_labels(result.grid, labels))
+                self.canvas.picture(stamp_ns, CLASSES, draw_labels(result.grid, labels))
         self.about('Result', summary_rows(result.summary))
 
     def paced(self, what: str, show: Callable[[], None]) -> None:
@@ -188,18 +225,18 @@ class View:
 
     def image(self, stamp_ns: int, left: NDArray[np.uint8]) -> None:
         """Show the rectified left image (H, W) of a frame."""
-        self._picture(stamp_ns, CAMERA, left)
+        self.canvas.picture(stamp_ns, CAMERA, left)
 
     def pair(self, frame: StereoFrame) -> None:
         """Show both images of a frame; a disparity as grey levels."""
         self.image(frame.stamp_ns, frame.left)
         levels = cv2.normalize(frame.right.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX)
-        is_image = frame.right.dtype == np.uint8
-        self._picture(frame.stamp_ns, RIGHT, frame.right if is_image else levels.astype(np.uint8))
+        right = frame.right if frame.right.dtype == np.uint8 else levels.astype(np.uint8)
+        self.canvas.picture(frame.stamp_ns, RIGHT, right)
 
     def overlay(self, stamp_ns: int, picture: NDArray[np.uint8]) -> None:
         """Show a keyframe (H, W, 3) BGR tinted by its floor and what moves."""
-        self._picture(stamp_ns, KEYFRAME, picture)
+        self.canvas.picture(stamp_ns, KEYFRAME, picture)
 
     def camera(self, K: Array, size: tuple[int, int], T_base_left: Array) -> None:
         """Show a camera of intrinsics (3, 3) and size (width, height) where it is on the base."""
@@ -209,31 +246,30 @@ class View:
             resolution=(WIDTH_PX, round(scale * size[1])),
             image_plane_distance=CAMERA_M,
         )
-        self._log(None, CAMERA, pinhole)
-        self._log(None, CAMERA, self._transform(T_base_left))
+        self.canvas.log(None, CAMERA, pinhole)
+        self.canvas.log(None, CAMERA, _transform(self._rr, T_base_left))
 
     def pose(self, stamp_ns: int, T_map_base: Array) -> None:
         """Show where the base (4, 4) is."""
-        self._log(stamp_ns, BASE, self._transform(T_map_base))
-
-    def _transform(self, T: Array) -> Any:
-        return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+        self.canvas.log(stamp_ns, BASE, _transform(self._rr, T_map_base))
 
     def path(self, stamp_ns: int, path: KeyframePath) -> None:
         """Show the keyframes as they are now, and where loops were closed."""
         rr, xyz = self._rr, path.T_map_base[:, :3, 3]
-        self._log(stamp_ns, 'world/path', rr.LineStrips3D([xyz], colors=PATH_RGB, radii=PATH_M))
+        self.canvas.log(
+            stamp_ns, 'world/path', rr.LineStrips3D([xyz], colors=PATH_RGB, radii=PATH_M)
+        )
         dots = rr.Points3D(xyz, colors=KEYFRAME_RGB, radii=2 * PATH_M)
-        self._log(stamp_ns, 'world/keyframes', dots)
+        self.canvas.log(stamp_ns, 'world/keyframes', dots)
         closed = np.searchsorted(path.stamp_ns, self._loops_ns).clip(max=len(xyz) - 1)
         dots = rr.Points3D(xyz[closed.astype(int)], colors=LOOP_RGB, radii=5 * PATH_M)
-        self._log(stamp_ns, 'world/loops', dots)
+        self.canvas.log(stamp_ns, 'world/loops', dots)
 
     def loops(self, stamp_ns: int, count: int) -> None:
         """Note how many loops are closed."""
         if count > len(self._loops_ns):
             self._loops_ns += [stamp_ns] * (count - len(self._loops_ns))
-            self._text(stamp_ns, f'loop {count} closed: the path is corrected')
+            self.canvas.text(stamp_ns, f'loop {count} closed: the path is corrected')
 
     def cloud(self, stamp_ns: int, points: LabelledPoints | None) -> None:
         """Show the labelled cloud: floor green, obstacles by height, others grey."""
@@ -244,7 +280,7 @@ class View:
         rgb[points.label != OBSTACLE] = UNKNOWN_PIXEL
         rgb[points.label == FLOOR] = FLOOR_RGB
         cloud = self._rr.Points3D(points.xyz_map, colors=rgb, radii=POINT_M)
-        self._log(stamp_ns, 'world/cloud', cloud)
+        self.canvas.log(stamp_ns, 'world/cloud', cloud)
 
     def classes(self, stamp_ns: int, points: LabelledPoints, names: Sequence[str]) -> None:
         """Show the points by the names of their classes (N,), '' for none."""
@@ -254,13 +290,13 @@ class View:
             dots = self._rr.Points3D(
                 points.xyz_map[of == i], colors=bgr[::-1], radii=POINT_M, labels=name
             )
-            self._log(stamp_ns, f'world/{CLASSES}/{name.replace(" ", "_")}', dots)
+            self.canvas.log(stamp_ns, f'world/{CLASSES}/{name.replace(" ", "_")}', dots)
 
     def moving_points(self, stamp_ns: int, moving: MovingPoints) -> None:
         """Show what moves, with the way it moves in a second."""
         way = np.nan_to_num(moving.velocity_m_s)
         arrows = self._rr.Arrows3D(origins=moving.xyz_map, vectors=way, colors=MOVING_RGB)
-        self._log(stamp_ns, 'world/moving', arrows)
+        self.canvas.log(stamp_ns, 'world/moving', arrows)
 
     def grid(self, stamp_ns: int, grid: OccupancyGrid | None) -> None:
         """Show the map on the ground."""
@@ -277,115 +313,96 @@ class View:
             cell_size=grid.resolution_m,
             translation=[*grid.origin_xy_m, 0.0],
         )
-        self._log(stamp_ns, 'world/map', drawn)
+        self.canvas.log(stamp_ns, 'world/map', drawn)
 
     def duration(self, stamp_ns: int, stage: str, duration_s: float) -> None:
         """Show how long a stage has taken."""
-        self._log(stamp_ns, f'{TIMES}/{stage}', self._rr.Scalars(1e3 * duration_s))
+        self.canvas.log(stamp_ns, f'{TIMES}/{stage}', self._rr.Scalars(1e3 * duration_s))
 
     def state(self, stamp_ns: int, words: str) -> None:
         """Show the state of tracking where it changes."""
         if words != self._state:
             self._state = words
-            self._text(stamp_ns, words, 'WARN' if words.startswith('lost') else 'INFO')
+            self.canvas.text(stamp_ns, words, 'WARN' if words.startswith('lost') else 'INFO')
 
     def about(self, title: str, rows: Sequence[tuple[str, str]]) -> None:
         """Show what is known of all of the drive."""
         lines = [f'# {title}', '', '| | |', '|---|---|', *(f'| {a} | {b} |' for a, b in rows)]
         document = self._rr.TextDocument('\n'.join(lines), media_type='text/markdown')
-        self._log(None, ABOUT, document)
+        self.canvas.log(None, ABOUT, document)
 
-    def recording(self, source: StereoSource) -> None:
-        """Show the images of a recording."""
-        sensors = [(sensor.name, f'{sensor.messages} messages') for sensor in source.sensors]
-        size = f'{source.camera.width} x {source.camera.height}, {source.rate_hz:.1f} Hz'
-        self.about(Path(source.name).name, [('images', size), *sensors])
-        with progress_bar('reading', source.frame_count) as progress:
-            for done, frame in enumerate(source.frames(), 1):
-                self.pair(frame)
-                progress(done)
 
-    def results(self, folder: Path, name: str = '') -> None:
-        """Show what a run has left in a folder, below `name`, with the images of its recording
-        where that is still there. Raises InputError.
-        """
-        shown = View(self._stream, self._rr, name) if name else self
-        if name:
-            self._shown.append(name)
-            self._lay_out()
-        shown._results(folder)
+def show_recording(view: View, source: StereoSource) -> None:
+    """Show the images of a recording."""
+    sensors = [(sensor.name, f'{sensor.messages} messages') for sensor in source.sensors]
+    size = f'{source.camera.width} x {source.camera.height}, {source.rate_hz:.1f} Hz'
+    view.about(Path(source.name).name, [('images', size), *sensors])
+    with progress_bar('reading', source.frame_count) as progress:
+        for done, frame in enumerate(source.frames(), 1):
+            view.pair(frame)
+            progress(done)
 
-    def _results(self, folder: Path) -> None:
-        summary = read_summary(folder / 'summary.json')
-        times_s, T_map_base = read_trajectory(folder / 'trajectory.txt')
-        keyframe_s, T_map_keyframe = read_trajectory(folder / 'keyframes.txt')
-        stamps_ns, keyframe_ns = (np.rint(1e9 * t).astype(np.int64) for t in (times_s, keyframe_s))
-        first_ns = int(stamps_ns[0])
-        figures = ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'loops')
-        rows = [(figure.replace('_', ' '), str(summary[figure])) for figure in figures]
-        stages = summary['stages'].items()
-        rows += [(stage, f'{times["p50_ms"]:.1f} ms, median') for stage, times in stages]
-        self.about(folder.name, rows)
-        self.state(first_ns, f'{summary["tracked_frames"]} of {summary["frames"]} frames tracked')
-        for count, at_s in enumerate(summary.get('loop_times_s', []), 1):
-            self.loops(round(1e9 * at_s), count)
-        self.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
-        cloud = read_ply(folder / 'labelled_cloud.ply')
-        self.cloud(first_ns, cloud)
-        if (folder / POINT_LABELS).is_file():
-            lines = read_text(folder / POINT_LABELS).splitlines()[1:]
-            self.classes(first_ns, cloud, [line.partition(',')[2] for line in lines])
-        if (folder / SEMANTIC).is_file():
-            self._picture(first_ns, CLASSES, read_picture(folder / SEMANTIC))
-        if (folder / MAP).is_file():
-            self.grid(first_ns, load_map(folder / MAP))
-        for stamp_ns, T in zip(stamps_ns, T_map_base, strict=True):
-            self.pose(int(stamp_ns), T)
-        try:
-            source = open_source(resolve(folder / 'settings.yaml').stereo_camera)
-        except InputError as error:
-            return self._text(first_ns, f'without images: {error}', 'WARN')
-        camera = source.camera
-        mount = Mount(*(summary[name] or 0.0 for name in MOUNT_FIGURES))
-        self.camera(camera.K, (camera.width, camera.height), mount.T_base_left)
-        with progress_bar('reading', source.frame_count) as progress:
-            for done, frame in enumerate(source.frames(), 1):
-                self.image(frame.stamp_ns, frame.left)
-                mask, moving = (
-                    folder / masks / f'{frame.index:06d}.png'
-                    for masks in ('floor_masks', 'moving_masks')
-                )
-                if mask.is_file():
-                    found = read_mask(moving) if moving.is_file() else None
-                    tinted = mask_overlay(frame.left, read_mask(mask), found)
-                    self.overlay(frame.stamp_ns, tinted)
-                progress(done)
 
-    def _picture(self, stamp_ns: int, entity: str, picture: NDArray[np.uint8]) -> None:
-        height = round(WIDTH_PX / picture.shape[1] * picture.shape[0])
-        small = cv2.resize(picture, (WIDTH_PX, height), interpolation=cv2.INTER_LINEAR)
-        image = self._rr.EncodedImage(contents=jpeg_bytes(small), media_type='image/jpeg')
-        self._log(stamp_ns, entity, image)
+def show_results(view: View, folder: Path, tab: str = '') -> None:
+    """Show what a run has left in a folder, behind a tab if it gets one, with the images of its
+    recording where that is still there. Raises InputError.
+    """
+    view = View(view.canvas.below(tab)) if tab else view
+    summary = read_summary(folder / 'summary.json')
+    times_s, T_map_base = read_trajectory(folder / 'trajectory.txt')
+    keyframe_s, T_map_keyframe = read_trajectory(folder / 'keyframes.txt')
+    stamps_ns, keyframe_ns = (np.rint(1e9 * t).astype(np.int64) for t in (times_s, keyframe_s))
+    first_ns = int(stamps_ns[0])
+    figures = ('frames', 'tracked_frames', 'lost_intervals', 'keyframes', 'loops')
+    rows = [(figure.replace('_', ' '), str(summary[figure])) for figure in figures]
+    stages = summary['stages'].items()
+    rows += [(stage, f'{times["p50_ms"]:.1f} ms, median') for stage, times in stages]
+    view.about(folder.name, rows)
+    view.state(first_ns, f'{summary["tracked_frames"]} of {summary["frames"]} frames tracked')
+    for count, at_s in enumerate(summary.get('loop_times_s', []), 1):
+        view.loops(round(1e9 * at_s), count)
+    view.path(first_ns, KeyframePath(keyframe_ns, T_map_keyframe))
+    cloud = read_ply(folder / 'labelled_cloud.ply')
+    view.cloud(first_ns, cloud)
+    if (folder / POINT_LABELS).is_file():
+        lines = read_text(folder / POINT_LABELS).splitlines()[1:]
+        view.classes(first_ns, cloud, [line.partition(',')[2] for line in lines])
+    if (folder / SEMANTIC).is_file():
+        view.canvas.picture(first_ns, CLASSES, read_picture(folder / SEMANTIC))
+    if (folder / MAP).is_file():
+        view.grid(first_ns, load_map(folder / MAP))
+    for stamp_ns, T in zip(stamps_ns, T_map_base, strict=True):
+        view.pose(int(stamp_ns), T)
+    try:
+        source = open_source(resolve(folder / 'settings.yaml').stereo_camera)
+    except InputError as error:
+        return view.canvas.text(first_ns, f'without images: {error}', 'WARN')
+    camera = source.camera
+    mount = Mount(*(summary[name] or 0.0 for name in MOUNT_FIGURES))
+    view.camera(camera.K, (camera.width, camera.height), mount.T_base_left)
+    with progress_bar('reading', source.frame_count) as progress:
+        for done, frame in enumerate(source.frames(), 1):
+            view.image(frame.stamp_ns, frame.left)
+            mask, moving = (
+                folder / masks / f'{frame.index:06d}.png'
+                for masks in ('floor_masks', 'moving_masks')
+            )
+            if mask.is_file():
+                found = read_mask(moving) if moving.is_file() else None
+                tinted = mask_overlay(frame.left, read_mask(mask), found)
+                view.overlay(frame.stamp_ns, tinted)
+            progress(done)
 
-    def _text(self, stamp_ns: int, words: str, level: str = 'INFO') -> None:
-        self._log(stamp_ns, TEXT, self._rr.TextLog(words, level=level))
 
-    def _log(self, stamp_ns: int | None, entity: str, what: Any) -> None:
-        """Log something at a stamp, or for all of the drive."""
-        if stamp_ns is not None:
-            self._start_ns = stamp_ns if self._start_ns is None else self._start_ns
-            self._stream.set_time('time', duration=1e-9 * (stamp_ns - self._start_ns))
-        self._stream.log(f'{self._root}/{entity}', what, static=stamp_ns is None)
+def _show_newest(view: View, result: FrameResult) -> None:
+    if result.tracked:
+        view.pose(result.stamp_ns, result.T_map_odom @ result.T_odom_base)
+    if result.moving is not None:
+        view.moving_points(result.stamp_ns, result.moving)
 
-    def _lay_out(self) -> None:
-        """Lay the panes out: those of every drive behind a tab of its name."""
-        import rerun.blueprint as rrb
 
-        tabs = [_panes(rrb, root) for root in self._shown or ['']]
-        everything = rrb.Tabs(*tabs) if self._shown else tabs[0]
-        time_panel = rrb.TimePanel(timeline='time', state='collapsed')
-        sides = rrb.BlueprintPanel(state='collapsed'), rrb.SelectionPanel(state='collapsed')
-        self._stream.send_blueprint(rrb.Blueprint(everything, *sides, time_panel))
+def _transform(rerun: ModuleType, T: Array) -> Any:
+    return rerun.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
 
 def _panes(rrb: ModuleType, root: str) -> Any:

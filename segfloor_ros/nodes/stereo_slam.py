@@ -102,7 +102,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         last_ns = self._last_stamp_ns
         if self.slam is not None and last_ns is not None and stamp_ns <= last_ns:
             mask = self.masks.mask_of(stamp_ns, self._camera.rectifier)
-            self.slam.add_late_mask(stamp_ns, mask)
+            self.slam.late_masks.add(stamp_ns, mask)
 
     def _look(self) -> None:
         if self._camera.pairs:

@@ -329,10 +329,11 @@ class HeldResults:
     def __init__(self) -> None:
         self._held: list[FrameResult] = []
 
-    def add(self, result: FrameResult) -> None:
-        """Take in the next result."""
+    def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
+        """Take in the next result and return what is ready: nothing while it is of a submap."""
         self._held.append(result)
         self._thin_out()
+        return [] if result.in_submap else self.release(mount)
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
         """Change the results that are held of a submap."""

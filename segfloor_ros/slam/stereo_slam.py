@@ -17,7 +17,7 @@ from segfloor_ros.camera.images import Region
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig.check import RigCheck
 from segfloor_ros.files.results import Arrays
-from segfloor_ros.geometry import Array, adjoint, invert, transform_points
+from segfloor_ros.geometry import Array, adjoint, invert, rotation_angle, transform_points
 from segfloor_ros.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.slam.moving.moving_regions import MovingRegions, Searched
 from segfloor_ros.slam.places.views import GroundViews
@@ -61,6 +61,33 @@ UNSURE_M = 0.005
 """A place that the images leave more uncertain than this is said to be."""
 
 
+class LateMasks:
+    """Takes back the points of keyframes where masks that come later show what moves."""
+
+    def __init__(self, front_end: FrontEnd, sparse_map: SparseMap, dilation_px: int) -> None:
+        self._front_end, self._map, self._dilation_px = front_end, sparse_map, dilation_px
+        self._masks: list[tuple[KeyframeRecord, Region]] = []
+
+    def add(self, stamp_ns: int, mask: Region) -> None:
+        """Take in a mask (H, W) of the left image of a keyframe, 255 where something moves, for
+        the next frame. A stamp of no keyframe says nothing.
+        """
+        recent = self._map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
+        keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
+        if keyframe is not None and not self._front_end.is_fixed:
+            self._masks.append((keyframe, dilate(mask, self._dilation_px)))
+
+    def take_points_back(self) -> None:
+        """Remove the points; while nothing is being adjusted."""
+        for keyframe, mask in self._masks:
+            ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
+            ids = ids[ids != NO_POINT]
+            self._map.remove_points(ids[self._map.points['born'][ids] >= keyframe.index])
+        if self._masks:
+            self._masks.clear()
+            self._front_end.drop_dead()
+
+
 class StereoSlam:
     """Tracks a stereo camera and maps what it sees.
 
@@ -70,7 +97,7 @@ class StereoSlam:
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
     adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
     what is wrong with the images. sessions: the drives that made the map it goes on with.
-    front_end, back_end: tracking and mapping.
+    front_end, back_end: tracking and mapping. late_masks: of keyframes, when they come.
     """
 
     def __init__(
@@ -99,7 +126,7 @@ class StereoSlam:
         self._lost_ns: int | None = None
         self._looked_ns = 0
         self._began_unsure: tuple[Array, Array] | None = None
-        self._late: list[tuple[KeyframeRecord, Region]] = []
+        self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
 
     @property
     def mount(self) -> Mount | None:
@@ -138,14 +165,18 @@ class StereoSlam:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
-            self._take_points_back()
+            if not self.back_end.holds_one:
+                self.late_masks.take_points_back()
             self.sensors.T_base_left = self.mount.T_base_left if self.mount else None
             fault = self.front_end.fault(frame)
             if self.front_end.repeats.is_carried and not fault:
                 result = self._result(frame, None, '', None)
-                return self._hold(_carried(result, self.front_end.motion, self._covariance()))
+                result = _carried(result, self.front_end.motion, self._covariance())
+                return self._held.take(result, self.mount)
             if not fault:
-                self.rig_check.watch(frame, self.front_end.motion.turn_rad(frame.stamp_ns))
+                motion = self.front_end.motion
+                turned = motion.steady(frame.stamp_ns) @ invert(motion.T_camera_world)
+                self.rig_check.watch(frame, float(rotation_angle(turned[:3, :3])))
                 frame = self.rig_check.corrected(frame)
             images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
             track = (
@@ -178,33 +209,7 @@ class StereoSlam:
         result = self._result(frame, track, fault, keyframe)
         if searched is not None:
             result = replace(result, moving=searched.points)
-        return self._hold(result)
-
-    def _hold(self, result: FrameResult) -> list[FrameResult]:
-        """Add a result to those that are held back, and return what is ready."""
-        self._held.add(result)
-        return [] if self.back_end.submap is Submap.LOST else self._held.release(self.mount)
-
-    def add_late_mask(self, stamp_ns: int, mask: Region) -> None:
-        """Take the points back that a keyframe has made where, as a mask (H, W) of its left image
-        says that comes later, something moves (255); with the next frame. A stamp of no keyframe
-        says nothing.
-        """
-        recent = self.map.keyframes[-LOCAL_KEYFRAMES:]  # others hardly change any more
-        keyframe = next((k for k in recent if k.stamp_ns == stamp_ns), None)
-        if keyframe is not None and not self.front_end.is_fixed:
-            self._late.append((keyframe, dilate(mask, self._settings.mask_dilation_px)))
-
-    def _take_points_back(self) -> None:
-        """Remove the points that late masks concern, once nothing is being adjusted."""
-        if not self._late or self.back_end.holds_one:
-            return
-        for keyframe, mask in self._late:
-            ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
-            ids = ids[ids != NO_POINT]
-            self.map.remove_points(ids[self.map.points['born'][ids] >= keyframe.index])
-        self._late.clear()
-        self.front_end.drop_dead()
+        return self._held.take(result, self.mount)
 
     def finish(self) -> list[FrameResult]:
         """Return the results that are still held back after the last frame: as lost, for no place

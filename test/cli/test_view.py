@@ -175,7 +175,7 @@ def test_what_takes_long_is_shown_less_often(monkeypatch):
     rerun = pytest.importorskip('rerun', reason='rerun is not installed')
     clock = {'wall': 0.0}
     monkeypatch.setattr(view.time, 'perf_counter', lambda: clock['wall'])
-    shown = view.View(rerun.RecordingStream('test'), rerun)
+    shown = view.View(view.Canvas(rerun.RecordingStream('test'), rerun))
     times = []
 
     def show() -> None:

@@ -142,7 +142,7 @@ class FrontEnd:
             self.follower.reset()
             return None
         if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
-            covariance = self._information(track, images).covariance(track.T_camera_world)
+            covariance = _information(self._map, track, images).covariance(track.T_camera_world)
             track = replace(track, sigma_m=sigma_m(covariance))
         T_seen = track.T_camera_world
         track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
@@ -172,15 +172,6 @@ class FrontEnd:
             return len(track.point_ids) >= 2 * PLENTY and _recognised(track, MAJORITY)
         return len(track.point_ids) >= PLENTY and _recognised(track, ALIKE_SHARE)
 
-    def _information(self, track: Track, images: Images) -> PoseInformation:
-        return PoseInformation(
-            self._camera,
-            images.left,
-            self._map.xyz_world[track.point_ids],
-            track.observations.without_offset(self._map.rig.offset.value_px),
-            track.estimate.noise_factor,
-        )
-
     def _weighed(self, track: Track, images: Images) -> Track:
         """Return a track with the likeliest pose by images and prior; that of the images where the
         prior contradicts it.
@@ -188,7 +179,7 @@ class FrontEnd:
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
             return replace(track, prior=None, is_prior_better=False)
-        information = self._information(track, images)
+        information = _information(self._map, track, images)
         return replace(
             track,
             estimate=information.fused(track.estimate, prior),
@@ -338,6 +329,16 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if live.mean() < MOST:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
+
+
+def _information(sparse_map: SparseMap, track: Track, images: Images) -> PoseInformation:
+    return PoseInformation(
+        sparse_map.rig.camera,
+        images.left,
+        sparse_map.xyz_world[track.point_ids],
+        track.observations.without_offset(sparse_map.rig.offset.value_px),
+        track.estimate.noise_factor,
+    )
 
 
 def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:

@@ -134,11 +134,6 @@ class CameraMotion:
             se3_exp(self._velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
         )
 
-    def turn_rad(self, stamp_ns: int) -> float:
-        """Return how far the camera has turned since the last frame, if it moves on as it did."""
-        step_s = _step_s(self._last_stamp_ns, stamp_ns)
-        return step_s * float(np.linalg.norm(self._velocity[3:]))
-
     def expected(self, stamp_ns: int) -> PoseEstimate:
         """Return where the camera will be if its motion goes on, as far as that of a robot does."""
         sigma = 0.5 * _step_s(self._last_stamp_ns, stamp_ns) ** 2 * ACCELERATION

@@ -106,8 +106,8 @@ def test_a_late_mask_takes_the_points_back_that_its_keyframe_has_made():
     ids = keyframe.point_id.copy()
     own = (ids != NO_POINT) & (slam.map.points['born'][ids] == keyframe.index)
     assert (own & inside).any() and (own & ~inside).any()
-    slam.add_late_mask(keyframe.stamp_ns + 1, drive.mask(keyframe.frame_index))
-    slam.add_late_mask(keyframe.stamp_ns, drive.mask(keyframe.frame_index))
+    slam.late_masks.add(keyframe.stamp_ns + 1, drive.mask(keyframe.frame_index))
+    slam.late_masks.add(keyframe.stamp_ns, drive.mask(keyframe.frame_index))
     assert slam.process(drive.frame(12))[0].tracked
     assert (keyframe.point_id[own & inside] == NO_POINT).all()
     assert not slam.map.alive[ids[own & inside]].any()
