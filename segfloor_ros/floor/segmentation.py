@@ -31,10 +31,12 @@ from segfloor_ros.floor.disparity.profile import (
     BINS_PER_PX,
     FloorLine,
     FloorProfile,
+    FloorView,
+    column_step,
+    filtered_v_disparity,
     fit_profile,
     pixels_where,
 )
-from segfloor_ros.floor.disparity.view import FloorView, column_step, filtered_v_disparity
 from segfloor_ros.floor.mask.filling import (
     NetworkFloor,
     beside_something,

@@ -18,8 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.floor.disparity.matching import SAME_PX
-from segfloor_ros.floor.disparity.profile import FloorProfile, pixels_where
-from segfloor_ros.floor.disparity.view import STEP_PX, FloorView, surface_above
+from segfloor_ros.floor.disparity.profile import (
+    STEP_PX,
+    FloorProfile,
+    FloorView,
+    pixels_where,
+    surface_above,
+)
 from segfloor_ros.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 

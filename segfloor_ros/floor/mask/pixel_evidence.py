@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import SUBPIXEL, measured_sigma_px
 from segfloor_ros.floor.disparity.matching import BLOCK_PX, MEAN_NOISE, NOISE_PX, SAME_PX, SIGMAS
-from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
-from segfloor_ros.floor.disparity.view import STEP_PX, FloorView
+from segfloor_ros.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 
 _MIN_DISPARITY_PX = 2.5

@@ -24,8 +24,7 @@ from segfloor_ros.floor.disparity.matching import (
     disparity_range,
     stereo_view,
 )
-from segfloor_ros.floor.disparity.profile import pixels_where
-from segfloor_ros.floor.disparity.view import STEP_PX, column_step, surface_above
+from segfloor_ros.floor.disparity.profile import STEP_PX, column_step, pixels_where, surface_above
 from segfloor_ros.floor.mask.pixel_evidence import (
     EDGE_SLOPE,
     TEXTURE_WINDOW_PX,

@@ -20,9 +20,11 @@ from segfloor_ros.floor.disparity.profile import (
     HEIGHT_SIGMA,
     PITCH_SIGMA_RAD,
     FloorLine,
+    column_step,
+    is_rise,
     pixels_where,
+    rising,
 )
-from segfloor_ros.floor.disparity.view import column_step, is_rise, rising
 from segfloor_ros.geometry import Array
 
 MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])

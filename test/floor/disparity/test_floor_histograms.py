@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.disparity.view import (
+from segfloor_ros.floor.disparity.profile import (
     FloorView,
     filtered_v_disparity,
     obstacle_rows,

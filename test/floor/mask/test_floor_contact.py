@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile
-from segfloor_ros.floor.disparity.view import FloorView
+from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile, FloorView
 from segfloor_ros.floor.mask.filling import fill_to_contact
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR

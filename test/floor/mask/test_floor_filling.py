@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
-from segfloor_ros.floor.disparity.view import FloorView
+from segfloor_ros.floor.disparity.profile import FloorView
 from segfloor_ros.floor.mask.filling import beside_something, drop_islands
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
