@@ -291,11 +291,13 @@ def run_benchmark(
     many are done.
     """
     workloads = [
-        run_apart(measure_images, plan, configuration, on_progress=announce('images', plan.frames))
+        run_in_process(
+            measure_images, plan, configuration, on_progress=announce('images', plan.frames)
+        )
     ]
     for size in plan.sizes:
         report = announce(f'{size} keyframes', size)
-        workloads.append(run_apart(measure_map, plan, size, configuration, on_progress=report))
+        workloads.append(run_in_process(measure_map, plan, size, configuration, on_progress=report))
     return workloads
 
 
@@ -368,7 +370,7 @@ def machine() -> dict[str, str]:
     }
 
 
-def run_apart(work: Callable[..., Any], *arguments: Any, on_progress: Progress) -> Any:
+def run_in_process(work: Callable[..., Any], *arguments: Any, on_progress: Progress) -> Any:
     """Return `work(*arguments, on_progress)`, done by a new process.
 
     work: a function of a module; its arguments and result are pickled. Its known errors are raised

@@ -43,7 +43,7 @@ _COLUMNS = {
     'confidence': np.float32,
 }
 """All begin with 0. belief: what the evidence says, with hysteresis; label, confidence: what
-is told of it. judged_z_m: where the point was when that was decided, in frame `map`.
+gets it. judged_z_m: where the point was when that was decided, in frame `map`.
 """
 
 UNKNOWN, FLOOR, OBSTACLE = range(3)

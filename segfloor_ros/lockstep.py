@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar('T')
 
 ProgressListener = Callable[[int, str], None]
-"""Told after every frame: how many are done, and the state in words."""
+"""Called after every frame: how many are done, and the state in words."""
 
 
 class Watcher(Protocol):
@@ -379,9 +379,9 @@ class LockstepRun:
 
     def _sensors_used(self) -> dict[str, int]:
         """Return the messages used of each sensor besides the stereo images."""
-        told = self._pipeline.slam.sensors.messages
+        counts = self._pipeline.slam.sensors.messages
         return {
-            sensor.name: told.get(sensor.name, self._frames)
+            sensor.name: counts.get(sensor.name, self._frames)
             for sensor in self._source.sensors
             if sensor.used
         }

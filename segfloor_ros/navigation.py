@@ -198,7 +198,7 @@ STOP = (0.0, 0.0)
 
 @dataclass
 class Explorer:
-    """Decides how to drive, from what has been told of map, obstacles and free floor. goals: how
+    """Decides how to drive, from what is known of map, obstacles and free floor. goals: how
     many to draw at random once everything is explored, or which.
     """
 

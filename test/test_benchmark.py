@@ -20,7 +20,7 @@ from segfloor_ros.benchmark import (
     UpdateTimes,
     floor_mask,
     measure_map,
-    run_apart,
+    run_in_process,
 )
 from segfloor_ros.cli.commands import DRIVE
 from segfloor_ros.cli.evaluate import benchmark
@@ -208,16 +208,16 @@ def half(number, on_progress):
 
 
 @pytest.mark.slow
-def test_work_apart():
+def test_work_in_a_process():
     done = []
-    value, process = run_apart(half, 3, on_progress=done.append)
+    value, process = run_in_process(half, 3, on_progress=done.append)
     assert value == 1.5
     assert process != os.getpid()
     assert done == [1, 2]
     with pytest.raises(MapError, match='-1: negative'):
-        run_apart(half, -1, on_progress=done.append)
+        run_in_process(half, -1, on_progress=done.append)
     with pytest.raises(SegfloorError, match='status 3'):
-        run_apart(half, 0, on_progress=done.append)
+        run_in_process(half, 0, on_progress=done.append)
     assert multiprocessing.active_children() == []
 
 

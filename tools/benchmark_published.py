@@ -22,7 +22,7 @@ from segfloor_ros.benchmark import (
     Progress,
     Workload,
     machine,
-    run_apart,
+    run_in_process,
 )
 from segfloor_ros.cli import terminal as options
 from segfloor_ros.cli.evaluate import stage_table, workload_table
@@ -92,7 +92,7 @@ def run_scene(
     render_once(scene, recording, on_start=lambda count: announce(f'rendering {name}', count))
     frames = open_recording(recording, configuration).frame_count
     report = announce(f'mapping {name}', frames or 0)
-    workload, grid = run_apart(
+    workload, grid = run_in_process(
         map_recording, name, recording, configuration, threads, on_progress=report
     )
     truth = load_truth(recording)

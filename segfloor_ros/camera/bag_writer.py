@@ -69,7 +69,7 @@ def convert(
     `/left/image_raw` and `/right/image_raw`, or `image_rect` where they are rectified already; what
     wheels and IMU measured, to `/wheel_odometry` and `/imu`. Depth images go to `/depth/image_raw`
     (32FC1, m): those of the source, or of `depth`, the same recording opened with them. on_progress
-    is told the number of pairs done. Raises InputError.
+    gets the number of pairs done. Raises InputError.
     """
     done, log = 0, MeasurementLog(source.sensors)
     depths = _by_stamp(depth)
@@ -290,7 +290,7 @@ class BagWriter:
         self.write_message(DEPTH_TOPIC, IMAGE, pair.stamp_ns, message)
 
     def write_measurement(self, measurement: Measurement) -> None:
-        """Append what wheels told, or an IMU, which goes with the frame of the raw left images."""
+        """Append what wheels or an IMU measured, the latter in the raw left optical frame."""
         stamp_ns = measurement.stamp_ns
         if isinstance(measurement, WheelPose):
             odometry = self.messages.odometry(stamp_ns, WHEELS_FRAME, measurement.T_wheels_base)

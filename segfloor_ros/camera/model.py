@@ -149,7 +149,7 @@ class StereoFrame:
     """One rectified grey stereo pair: images (H, W) uint8, the frame's number in its recording,
     its stamp in ns. right: of a depth camera, in its place, the disparity (H, W) float32 (see
     `depth`). excluded: mask (H, W) uint8 of the left image, 255 where something moves, as
-    far as a segmentation network told. colour: the left image (H, W, 3) BGR, if it was asked
+    far as a segmentation network says. colour: the left image (H, W, 3) BGR, if it was asked
     for and there is one.
     """
 

@@ -401,7 +401,7 @@ def joined(arrays: list[NDArray[Any]], empty: NDArray[Any]) -> tuple[NDArray[Any
 def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
     """Return the arrays that `joined` made one of. Raises ValueError where lengths do not fit."""
     if lengths.sum() != len(array):
-        raise ValueError(f'{len(array)} rows, but {lengths.sum()} are told')
+        raise ValueError(f'{len(array)} rows, but {lengths.sum()} are expected')
     return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
 
 

@@ -110,7 +110,7 @@ class FloorScanner:
     ) -> FloorScan:
         """Return the scan of floor, (N,) at `cells_xy`, of points that stand up, (2, M) in the
         base's x-y plane, of the feet of what is blank, (2, F), and of points of what is of a class
-        that moves, (2, P): nothing is free behind it, nor is it told to stand there.
+        that moves, (2, P): nothing is free behind it, nor is it said to stand there.
 
         A ray ends at the first thing that stands up or at the first gap in the floor longer than
         what is tolerated, and never beyond the last floor that both cameras saw: at the image's
@@ -321,13 +321,13 @@ class OverheadMatcher:
             # A slope along the row gets steeper as the image gets smaller.
             textured = texture_grey(halves[0], _TEXTURE_WINDOW_PX) > _SCALE * min_texture_grey
             known = (disparity > 0) & ~_fringes(disparity)
-            telling = _with_boards(disparity, known, known & textured)
+            certain = _with_boards(disparity, known, known & textured)
         else:
             disparity = shrunk(measured[first:last], size)
-            telling = disparity > 0
+            certain = disparity > 0
         if moving is not None:
-            telling &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
-        rows, columns = np.nonzero(telling)
+            certain &= cv2.resize(moving[first:last], size, interpolation=cv2.INTER_NEAREST) == 0
+        rows, columns = np.nonzero(certain)
         disparity_px = _SCALE * disparity[rows, columns].astype(np.float64)
         centre = 0.5 * (_SCALE - 1)
         uv_px = np.stack([_SCALE * columns + centre, _SCALE * rows + first + centre], axis=1)
@@ -344,9 +344,9 @@ class OverheadMatcher:
 
 
 def _with_boards(
-    disparity: NDArray[np.float32], known: NDArray[np.bool_], telling: NDArray[np.bool_]
+    disparity: NDArray[np.float32], known: NDArray[np.bool_], certain: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return what tells (H, W) where to `telling` comes all of a board: above and below it
+    """Return what is certain (H, W) and all of each board: above and below it
     something farther is seen. known: where the disparity counts.
 
     The edge and the grain of a board run along the rows and match anywhere. Its ends do not, and
@@ -361,13 +361,13 @@ def _with_boards(
         board &= step <= SAME_SURFACE_SHARE * np.maximum(disparity, 1)
     count, label = cv2.connectedComponents(board.astype(np.uint8), connectivity=4)
     size = np.bincount(label[board], minlength=count)
-    share = np.bincount(label[board & telling], minlength=count) / np.maximum(size, 1)
-    found: NDArray[np.bool_] = telling | (board & (share >= _BOARD_SHARE)[label])
+    share = np.bincount(label[board & certain], minlength=count) / np.maximum(size, 1)
+    found: NDArray[np.bool_] = certain | (board & (share >= _BOARD_SHARE)[label])
     return found
 
 
 def _fringes(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell which pixels (H, W) have a farther neighbour in their row: there the block that is
+    """Return which pixels (H, W) have a farther neighbour in their row: there the block that is
     matched still holds the nearer surface, which makes things wider than they are.
     """
     known = np.where(disparity > 0, disparity, np.float32(np.inf))

@@ -104,7 +104,7 @@ MASK_COLOURS = {
 
 
 class FloorSegmentation:
-    """Finds the floor in rectified stereo pairs of one camera. times: told what each step takes.
+    """Finds the floor in rectified stereo pairs of one camera. times: gets what each step takes.
     checks_mount: whether the mount in use is compared with what the floor shows. network: how far
     what a network says of the floor can be believed.
     """

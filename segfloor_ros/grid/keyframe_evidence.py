@@ -340,7 +340,7 @@ class Fan:
         return area
 
     def edges(self) -> NDArray[np.bool_]:
-        """Tell which bearings (S,) bound the fan: the outermost ones, and those that see past
+        """Return which bearings (S,) bound the fan: the outermost ones, and those that see past
         something. A single bearing that reaches farther than both its neighbours does not.
         """
         first, second = self.lengths[:-1], self.lengths[1:]
@@ -357,7 +357,7 @@ class Fan:
         return left, right
 
     def _contains(self, x: Array, y: Array, left: Array, right: Array) -> NDArray[np.bool_]:
-        """Tell which points (N,), (N,), relative to the centre, lie within their wedge."""
+        """Return which points (N,), (N,), relative to the centre, lie within their wedge."""
         bearing = np.remainder(np.arctan2(y, x) - self.first_rad, math.tau)
         index = (bearing * (1 / self.step_rad)).astype(np.intp)
         within = index < left.shape[1]

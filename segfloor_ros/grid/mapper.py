@@ -75,7 +75,7 @@ class OccupancyGridMapper:
         self._settings = settings
         self._history = EvidenceHistory(EvidenceFolder(settings))
         self._stamp_ns = np.zeros(0, np.int64)
-        self._aside: tuple[NDArray[np.int64], EvidenceHistory] | None = None
+        self._set_back: tuple[NDArray[np.int64], EvidenceHistory] | None = None
 
     def change_settings(self, settings: OccupancyGridSettings) -> None:
         """Map with changed live settings from now on, old evidence included."""
@@ -129,7 +129,7 @@ class OccupancyGridMapper:
         row = np.minimum(np.searchsorted(stamp_ns, self._stamp_ns), len(stamp_ns) - 1)
         gone = stamp_ns[row] != self._stamp_ns
         if len(gone) and gone.all():
-            self._aside = self._stamp_ns, self._history
+            self._set_back = self._stamp_ns, self._history
             self._history = EvidenceHistory(EvidenceFolder(self._settings))
             self._stamp_ns, row = self._stamp_ns[:0], row[:0]
         elif gone.any():
@@ -144,13 +144,13 @@ class OccupancyGridMapper:
             self._history.move(int(moved[0]), now[moved[0] :])
 
     def _bring_back(self, stamp_ns: NDArray[np.int64]) -> None:
-        """Take in what was put aside, once its keyframes, which are older, are in the path again:
+        """Take in what was set back, once its keyframes, which are older, are in the path again:
         a drive with a map of its own has recognised the one that was loaded.
         """
-        if self._aside is None or not np.isin(self._aside[0], stamp_ns).any():
+        if self._set_back is None or not np.isin(self._set_back[0], stamp_ns).any():
             return
-        (earlier, before), latest = self._aside, self._history
-        self._history, self._aside = EvidenceHistory(EvidenceFolder(self._settings)), None
+        (earlier, before), latest = self._set_back, self._history
+        self._history, self._set_back = EvidenceHistory(EvidenceFolder(self._settings)), None
         for history in (before, latest):
             self._history.extend(history.evidence, history.poses)
         self._stamp_ns = np.concatenate([earlier, self._stamp_ns])

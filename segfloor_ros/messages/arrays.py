@@ -238,7 +238,7 @@ def map_start_message(
     stamp_ns: int, frame_id: str, start_ns: int, is_loaded: bool = False
 ) -> TimeReference:
     """Return that the keyframe of a stamp belongs to the map that was begun at `start_ns`.
-    is_loaded: with what a file told.
+    is_loaded: with what was loaded.
     """
     return TimeReference(
         header=make_header(stamp_ns, frame_id),

@@ -189,7 +189,7 @@ def _stamp_ns(message: Odometry | Imu) -> int:
 
 class MaskInput:
     """Receives masks and gives each frame the one of its stamp, or the latest that is not too old:
-    a network is slower than the camera, and no frame waits for it. on_mask: told the stamp of each.
+    a network is slower than the camera, and no frame waits for it. on_mask: gets the stamp of each.
     """
 
     def __init__(

@@ -85,7 +85,7 @@ def yolo_seg(outputs: list[NDArray[Any]], network: Described, size: Size) -> Seg
     best, number = scores.max(axis=1), scores.argmax(axis=1)
     low = found[:, :2] - found[:, 2:BOX] / 2
     boxes = np.hstack([low, low + found[:, 2:BOX]])
-    kept = _apart(boxes, best, number, network.score)
+    kept = _without_overlaps(boxes, best, number, network.score)
     weights = found[kept, -num_masks:] @ prototypes.reshape(num_masks, -1)
     masks = weights.reshape(-1, *prototypes.shape[1:]) > 0  # a probability above one half
     scale = np.array(size * 2) / np.array([*network.input, *network.input])
@@ -120,7 +120,7 @@ KINDS: dict[str, Reader] = {'semantic': semantic, 'yolo_seg': yolo_seg, 'mask_rc
 or StopIteration for outputs of another kind."""
 
 
-def _apart(
+def _without_overlaps(
     boxes: NDArray[Any], scores: NDArray[Any], numbers: NDArray[np.intp], least: float
 ) -> list[int]:
     """Return the boxes (N, 4), as corners, that are certain enough, the surest of those that

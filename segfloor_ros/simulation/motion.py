@@ -204,12 +204,12 @@ def wheel_readings(scene: Scene, motion: RigMotion) -> WheelReadings:
     ).as_rotvec()[:, 2]  # fmt: skip
     half = turn_rad * wheels.track_m / 2
     rng = np.random.default_rng([scene.seed, 5])
-    told = [
+    ways_m = [
         way * _slip(wheels, times_s[1:], side) * wheels.scale
         + rng.standard_normal(len(way)) * wheels.noise_m * np.sqrt(np.abs(way))
         for side, way in enumerate((forward_m - half, forward_m + half))
     ]
-    forward_m, turn_rad = (told[0] + told[1]) / 2, (told[1] - told[0]) / wheels.track_m
+    forward_m, turn_rad = (ways_m[0] + ways_m[1]) / 2, (ways_m[1] - ways_m[0]) / wheels.track_m
     return WheelReadings(times_s, _dead_reckoning(forward_m, turn_rad))
 
 

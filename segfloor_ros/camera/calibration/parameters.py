@@ -370,8 +370,8 @@ def deblocked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def is_blocky(image: NDArray[np.uint8]) -> bool:
-    """Tell whether quiet parts of a grey image (H, W) have larger steps on the grid of eight pixels
-    than within its blocks, along the rows or along the columns.
+    """Return whether quiet parts of a grey image (H, W) have larger steps on the grid of eight
+    pixels than within its blocks, along the rows or along the columns.
     """
     half = _BLOCK_PX // 2
     return max(_blockiness(image[::half]), _blockiness(image[:, ::half].T)) > _MIN_RATIO

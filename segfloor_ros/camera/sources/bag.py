@@ -238,8 +238,8 @@ def _T_raw_imu(bag: BagFile, left_topic: str, imu_topic: str) -> Array | None:
     if T_left_imu is not None:
         return T_left_imu
     some = islice(bag.messages([imu_topic]), FIRST_MESSAGES)
-    felt = np.nanmedian([xyz(message.linear_acceleration) for _, message in some], axis=0)
-    return np.eye(4) if is_upright(felt) else None
+    accel_m_s2 = np.nanmedian([xyz(message.linear_acceleration) for _, message in some], axis=0)
+    return np.eye(4) if is_upright(accel_m_s2) else None
 
 
 def _frame_of(bag: BagFile, topic: str) -> str:

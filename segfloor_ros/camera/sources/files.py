@@ -58,7 +58,7 @@ WHEEL_FILE, IMU_FILE = 'wheel_odometry.txt', 'imu.csv'
 TUM_COLUMNS = 't x y z qx qy qz qw'
 IMU_COLUMNS = 'stamp in ns, angular velocity x y z in rad/s, acceleration x y z in m/s²'
 ACCEL_RANGE_M_S2 = (7.0, 13.0)
-"""Median acceleration felt on earth; outside of it the unit or the columns are wrong."""
+"""Median acceleration measured on earth; outside of it the unit or the columns are wrong."""
 
 UPRIGHT = 0.8
 """Cosine of the angle between gravity and the image's vertical up to which a camera is upright."""
@@ -311,11 +311,11 @@ def read_imu(path: Path, T_left_imu: Array | None = None) -> list[ImuSample]:
 
 def check_gravity(where: str, accel_m_s2: Array) -> None:
     """Raise InputError unless accelerations (N, 3) are about those on earth."""
-    felt = float(np.nanmedian(np.linalg.norm(accel_m_s2, axis=1)))
-    if not ACCEL_RANGE_M_S2[0] <= felt <= ACCEL_RANGE_M_S2[1]:
+    median_m_s2 = float(np.nanmedian(np.linalg.norm(accel_m_s2, axis=1)))
+    if not ACCEL_RANGE_M_S2[0] <= median_m_s2 <= ACCEL_RANGE_M_S2[1]:
         raise InputError(
-            f'{where}: the median acceleration is {felt:.3g}, but gravity alone is 9.81 m/s²; '
-            'correct the unit or the columns, or leave it out with --ignore imu'
+            f'{where}: the median acceleration is {median_m_s2:.3g}, but gravity alone is 9.81 '
+            'm/s²; correct the unit or the columns, or leave it out with --ignore imu'
         )
 
 

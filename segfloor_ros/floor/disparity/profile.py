@@ -371,7 +371,7 @@ def rising(disparity: NDArray[np.float32], slope: float) -> NDArray[np.bool_]:
 
 
 def is_rise(rise: NDArray[np.floating], slope: float) -> NDArray[np.bool_]:
-    """Tell which of how much disparities grow per row are, more or less, a floor's `slope`."""
+    """Return which of how much disparities grow per row are, more or less, a floor's `slope`."""
     return np.abs(rise / slope - 1) < _RISE_TOLERANCE
 
 

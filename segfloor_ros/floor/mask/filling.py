@@ -334,9 +334,9 @@ class Runs:
     def of(cls, picture: NDArray[np.bool_]) -> Runs:
         """Return the stretches of a picture (R, W) bool."""
         height, width = picture.shape
-        apart = np.zeros(height * (width + 1) + 1, np.bool_)
-        apart[:-1].reshape(height, width + 1)[:, 1:] = picture
-        edges = np.flatnonzero(apart[1:] != apart[:-1]) + 1
+        padded = np.zeros(height * (width + 1) + 1, np.bool_)
+        padded[:-1].reshape(height, width + 1)[:, 1:] = picture
+        edges = np.flatnonzero(padded[1:] != padded[:-1]) + 1
         row, first = np.divmod(edges[::2], width + 1)
         first -= 1
         return cls((height, width), row, first, first + edges[1::2] - edges[::2])

@@ -215,8 +215,8 @@ def mean_height(heights: Heights) -> NDArray[np.float32]:
 def lies_on_floor(
     view: FloorView, disparity: NDArray[np.float32], heights: Heights
 ) -> NDArray[np.bool_]:
-    """Tell which pixels (R, W) have a disparity of a floor, and rise down the image as one does in
-    the mean of their neighbours: the foot of what stands is no higher than a floor, but steeper.
+    """Return which pixels (R, W) have a disparity of a floor, and rise down the image as one does
+    in the mean of their neighbours: the foot of what stands is no higher than a floor, but steeper.
 
     They are compared with so far above and below that floor differs by more than noise.
     """
@@ -268,7 +268,7 @@ def _below_contact(
 
 
 def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which pixels of an image (R, W) are darker or brighter than nearly all of the floor
+    """Return which pixels of an image (R, W) are darker or brighter than nearly all of the floor
     (R, W) around them.
 
     What is measured as floor may be a thing that is hardly higher: the mean is taken twice, the

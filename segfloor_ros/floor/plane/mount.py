@@ -166,8 +166,8 @@ class MountEstimator:
         return self.mount is not None
 
     def _is_possible(self, fit: PlaneFit) -> bool:
-        """Tell whether a robot drove on the plane: on its way the camera keeps its place above it.
-        A hand does not, and on uneven ground or with a wrong plane nothing does.
+        """Return whether a robot drove on the plane: on its way the camera keeps its place above
+        it. A hand does not, and on uneven ground or with a wrong plane nothing does.
         """
         if not plausible(fit.angles_height):
             return False
@@ -250,7 +250,7 @@ class PlaneSearch:
         return fit
 
     def is_known(self) -> bool:
-        """Tell whether the last plane is known: by its own covariance and by how much it varies
+        """Return whether the last plane is known: by its own covariance and by how much it varies
         from frame to frame, as what is wrong in all frames of a scene is in no covariance. One view
         is enough where that of a single one is much smaller. In the end a plane that is off by some
         per cent is better than none.

@@ -179,7 +179,7 @@ def angles_height_of(planes: Array) -> Array:
 
 
 def plausible(angles_height: Array) -> NDArray[np.bool_]:
-    """Tell which of pitch, roll and height (..., 3) a floor can have."""
+    """Return which of pitch, roll and height (..., 3) a floor can have."""
     pitch, roll, height = np.moveaxis(angles_height, -1, 0)
     level = (np.abs(pitch) < MAX_PITCH_RAD) & (np.abs(roll) < MAX_ROLL_RAD)
     return level & (height > HEIGHT_RANGE_M[0]) & (height < HEIGHT_RANGE_M[1])

@@ -77,15 +77,15 @@ class KeyframeJoin:
         self._waiting: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEYFRAMES.depth)
         self._left_ns: int | None = None
         self.map_start_ns: int | None = None
-        """When the map was begun; None where nobody has told."""
+        """When the map was begun; None where nobody has said."""
         self.is_loaded = False
         """Whether the map goes on from a file."""
 
-        def is_told(topic: str) -> bool:
+        def is_published(topic: str) -> bool:
             return bool(node.inputs.subscriptions[topic].get_publisher_count())
 
-        told = {topic: partial(is_told, topic) for topic in (MAP_START, *optional)}
-        node.inputs.join(parts, self._take, optional=told)
+        published = {topic: partial(is_published, topic) for topic in (MAP_START, *optional)}
+        node.inputs.join(parts, self._take, optional=published)
 
     @property
     def waiting_count(self) -> int:
@@ -194,7 +194,7 @@ class MapPart:
 
     def _take_loaded(self, message: UInt8MultiArray) -> None:
         saved = map_file_of(message, MAP_LOADED)
-        # Who subscribes anew is told again.
+        # Who subscribes anew gets it again.
         if saved.header['start_ns'] != self._loaded_ns:
             self._node.reset('stereo_slam has loaded a map')
             self._node.restore(saved)

@@ -224,8 +224,8 @@ class PlaceMatcher:
             return False
         depth_m = median_depth_m(self._map, self._map.keyframes[self.matches[-1].keyframe])
         poses = np.stack([match.T_camera_world for match in self.matches])
-        apart = novelty(poses[:, None] @ invert(poses), depth_m)
-        return bool(apart.max() >= self._needed - 1)
+        novelties = novelty(poses[:, None] @ invert(poses), depth_m)
+        return bool(novelties.max() >= self._needed - 1)
 
     def agree(self, before: Match, latest: Match) -> bool:
         """Whether two keyframes show the same drift, up to what two loops err."""
