@@ -205,7 +205,10 @@ class PlaceMatcher:
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
             track = self._places.confirm(images, keyframe.features, ids, pose)
         if track is None:
-            track = self._places.find(images, keyframe.features, may_show, own_ids)
+            is_bounded = self._known is self._map
+            track = self._places.find(
+                images, keyframe.features, may_show, own_ids, is_bounded=is_bounded
+            )
         if track is None:
             return None
         assert track.observed is not None

@@ -145,13 +145,17 @@ class PlaceRecognition:
         may_show: NDArray[np.bool_],
         own_ids: NDArray[np.int32] | tuple[()] = (),
         is_possible: Callable[[Array], bool] = lambda T_camera_world: True,
+        is_bounded: bool = False,
     ) -> Track | None:
         """Return a view with its pose; None where no place is seen, or two that look alike.
 
         may_show: which keyframes (K,) may be of the place. own_ids: points (N,) that are none of
         the place's. is_possible: whether the camera can be at a pose T_camera_world (4, 4).
+        is_bounded: whether drift alone says where the place is; then only the one that looks most
+        like the view is tried.
         """
-        groups = self.groups(self.score(features) * may_show, LOCAL_KEYFRAMES)
+        score = self.score(features) * may_show
+        groups = self.groups(score, 1 if is_bounded else LOCAL_KEYFRAMES)
         chosen, others = groups[:BEST_GROUPS], groups[BEST_GROUPS:]
         if others:
             chosen.append(others[self._turn % len(others)])

@@ -11,8 +11,10 @@ from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import plan_closing
 from segfloor_ros.slam.places.loops import PlaceMatcher
+from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import PROOF, StereoSlamSettings
-from segfloor_ros.slam.sparse_map import Match
+from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
+from segfloor_ros.slam.sparse_map import Match, SparseMap
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -109,3 +111,22 @@ def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
     assert (graph.sigma[links:] > graph.sigma[:links].max(axis=0)).all()
     assert (graph.i[-1], graph.j[-1]) == (keyframes[-1].index, 0)
     np.testing.assert_allclose(graph.T_i_j[-1], relative, atol=1e-9)
+
+
+@pytest.mark.parametrize('is_bounded', [False, True])
+def test_two_places_that_look_alike_are_none_unless_drift_bounds_where_the_camera_is(
+    closed, is_bounded
+):
+    """The room stands twice in the map, 20 m apart."""
+    slam, _ = closed
+    twice = SparseMap(slam.rig)
+    once, words = map_to_arrays(slam.map), slam.back_end.places.to_arrays()
+    fill_map(twice, once)
+    fill_map(twice, moved(once, make_transform(np.eye(3), np.array([20.0, 0.0, 0.0]))))
+    places = PlaceRecognition(twice)
+    places.from_arrays(words)
+    places.from_arrays(words)
+    view = slam.map.keyframes[-1]
+    everywhere = np.ones(len(twice.keyframes), bool)
+    track = places.find(view.observations, view.features, everywhere, is_bounded=is_bounded)
+    assert (track is not None) is is_bounded
