@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from segfloor_ros.floor.observation import CELL_M, FloorScan
 from segfloor_ros.geometry import Array, invert, planar, transform_points
@@ -29,13 +30,14 @@ LOOKAHEAD_S = 1.5
 """The way ahead that pure pursuit aims at, in time; less where it would cut a corner."""
 
 TURN_ON_SPOT_RAD = np.radians(50)
-"""The robot turns on the spot towards a way that is further off its heading."""
+"""The robot turns on the spot towards a way that is further off its heading, or to which no arc is
+free."""
 
 ARRIVED_M = 0.15
 
 LOOK_S = 3.0
-"""So long the robot stands and looks: what stays unknown then cannot be seen, and where it does not
-know where it is, it turns back to where it came from, where the map is."""
+"""So long the robot stands and looks where it does not know where it is; then it turns back to
+where it came from, where the map is."""
 
 FACED_RAD = np.radians(10)
 
@@ -112,16 +114,17 @@ class Costmap:
         trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
-        standing = (grid.cells >= OCCUPIED) | (marked & ~trodden)
-        standing &= ~self._discs(driven[-1:], radius_m)
+        standing = (grid.cells >= OCCUPIED) | marked
+        standing &= ~self._discs(driven[-1:], radius_m / 2)
         self.free = ((grid.cells == FREE) | trodden) & ~standing
         unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
         dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         self.dark = dark[1:-1, 1:-1] > 0
         """What is unknown, but for slits that the map leaves along walls."""
-        self._dark_m = grid.away_m(dark > 0)[1:-1, 1:-1]
+        beside = cv2.dilate(dark, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        self._edge_m = grid.away_m(beside & self.free)
         standing_m = grid.away_m(standing)
-        self.room_m = np.minimum(standing_m, self._dark_m)
+        self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
         self._cells = np.argwhere(self.places)
@@ -143,11 +146,18 @@ class Costmap:
         nearest = int(np.argmin(away_m))
         return nearest, float(away_m[nearest])
 
-    def least_room_m(self, start: Array, end: Array) -> float:
-        """Return how near what may be in the way comes to the straight line between points (2,)."""
-        count = 2 + int(2 * np.hypot(*(end - start)) / self.grid.resolution_m)
-        cells = self._on_map(np.linspace(start, end, count))
-        return float(self.room_m[tuple(cells.T)].min(initial=np.inf))
+    def least_room_m(self, pose: Array, point: Array) -> float:
+        """Return how near what may be in the way comes to the arc that leads from a pose x, y, yaw
+        to a point (2,).
+        """
+        off, away_m = float(_bearings(point, pose)), float(np.hypot(*(point - pose[:2])))
+        count = 2 + int(2 * away_m / self.grid.resolution_m)
+        # The chord to a point of the arc turns by as much as the arc that is left.
+        turned = off * np.linspace(0, 1, count)
+        chord_m = away_m * (np.sin(turned) / np.sin(off) if off else np.linspace(0, 1, count))
+        heading = pose[2] + turned
+        arc = pose[:2] + chord_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        return float(self.room_m[tuple(self._on_map(arc).T)].min(initial=np.inf))
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -165,9 +175,11 @@ class Costmap:
         return mask > 0
 
     def frontiers(self) -> list[Cells]:
-        """Return the places next to what is unknown, (N, 2) for each connected stretch of them."""
-        near_m = self._radius_m + 2 * self.grid.resolution_m
-        border = (self.places & (self._dark_m <= near_m)).astype(np.uint8)
+        """Return the places next to free floor that borders on what is unknown, (N, 2) for each
+        connected stretch of them. Behind a wall there is no such floor.
+        """
+        near_m = self._radius_m + self.grid.resolution_m
+        border = (self.places & (self._edge_m <= near_m)).astype(np.uint8)
         count, labels = cv2.connectedComponents(border, connectivity=8)
         return [np.argwhere(labels == label) for label in range(1, count)]
 
@@ -186,11 +198,14 @@ class Body:
 
 @dataclass
 class Goal:
-    """A place (2,) in the map to drive to. is_reached: None while it lies ahead."""
+    """A place (2,) in the map to drive to. is_reached: None while it lies ahead. was_blocked: once;
+    it is driven to again after the others.
+    """
 
     point: Array
     name: str = ''
     is_reached: bool | None = None
+    was_blocked: bool = False
 
 
 STOP = (0.0, 0.0)
@@ -264,7 +279,7 @@ class Explorer:
         pose = planar(T_map_base)
         if not self._driven or np.hypot(*(self._driven[-1] - pose[:2])) > self.body.radius_m / 2:
             self._driven.append(pose[:2])
-        if time_s >= self._planned_s + REPLAN_S:
+        if time_s >= self._planned_s + REPLAN_S or self._is_blocked(pose):
             self._planned_s = time_s
             self._plan(time_s, pose)
         forward, turn = self._drive(time_s, pose)
@@ -279,6 +294,17 @@ class Explorer:
             return STOP
         return 0.0, self._turn_back * self.body.turn_rad_s / 2
 
+    def _is_blocked(self, pose: Array) -> bool:
+        """Whether something has come to stand on the next stretch of the way."""
+        assert self.grid is not None
+        away_m = np.hypot(*(self.path - pose[:2]).T)
+        ahead = self.path[away_m < self.body.radius_m + LOOKAHEAD_S * self.body.speed_m_s]
+        occupied = self.grid.centres_of(np.argwhere(self.grid.cells >= OCCUPIED))
+        standing = np.vstack([self.obstacles, occupied])
+        if not len(ahead) or not len(standing):
+            return False
+        return bool(np.min(cKDTree(ahead).query(standing)[0]) < self.body.radius_m)
+
     def _plan(self, time_s: float, pose: Array) -> None:
         """Choose what to drive to, and the way there."""
         assert self.grid is not None
@@ -289,7 +315,7 @@ class Explorer:
         )
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
         if ways is not None and self.phase == 'exploring':
-            self._aim_at(time_s, self._frontier(costmap, ways))
+            self._aim_at(time_s, self._frontier(costmap, ways, pose))
             if self._target is None and self._tries >= MOST_TRIES:
                 self._begin_goals(costmap, ways)
         if self.phase == 'driving':
@@ -303,13 +329,17 @@ class Explorer:
             way = self.grid.centres_of(ways.cells[ways.to(number)])
             self.path = np.vstack([way, self._target])
 
-    def _frontier(self, costmap: Costmap, ways: Ways) -> Array | None:
-        """Return the frontier to drive to: the nearest, or the present one while it is one."""
+    def _turning_m(self, points: Array, pose: Array) -> Array:
+        """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
+        return np.abs(_bearings(points, pose)) / self.body.turn_rad_s * self.body.speed_m_s
+
+    def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
+        """Return the frontier to drive to: the soonest, or the present one while it is one."""
         least = self.body.radius_m
         best, best_cost = None, np.inf
         for cells in costmap.frontiers():
             points = costmap.grid.centres_of(cells)
-            cost = ways.cost[costmap.numbers_of(cells)]
+            cost = ways.cost[costmap.numbers_of(cells)] + self._turning_m(points, pose)
             for given_up in self._given_up:
                 cost = np.where(np.hypot(*(points - given_up).T) < 2 * least, np.inf, cost)
             if self._target is not None:
@@ -362,25 +392,30 @@ class Explorer:
         if self.phase == 'driving':
             self._end_goal(True)
             return STOP
-        off = _bearing(self._facing, pose)
+        off = float(_bearings(self._facing, pose))
         if abs(off) < FACED_RAD:
             self._faced_s = time_s if self._faced_s is None else self._faced_s
-            if time_s >= self._faced_s + LOOK_S:
+            if time_s >= self._faced_s + REPLAN_S:
                 self._give_up()
             return STOP
         return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
 
     def _recover(self, time_s: float) -> tuple[float, float]:
-        """Turn to see more; what cannot be reached after some tries is given up."""
+        """Turn to see more; what cannot be reached after some tries is given up, a goal when that
+        was so once before.
+        """
         self._tries += 1
         self._progress_s = time_s
         self._turn_until_s = time_s + np.pi / 2 / self.body.turn_rad_s
         if self._tries >= MOST_TRIES and self._target is not None:
             self._tries = 0
-            if self.phase == 'driving':
+            if self.phase == 'exploring':
+                self._give_up()
+            elif self._ahead[0].was_blocked:
                 self._end_goal(False)
             else:
-                self._give_up()
+                self._ahead[0].was_blocked = True
+                self._ahead.append(self._ahead.pop(0))
         return STOP
 
     def _give_up(self) -> None:
@@ -403,19 +438,19 @@ class Explorer:
         while (
             ahead + 1 < len(self.path)
             and away_m[ahead] < LOOKAHEAD_S * body.speed_m_s
-            and self._costmap.least_room_m(pose[:2], self.path[ahead + 1])
-            > body.radius_m + CELL_M / 2
+            and self._costmap.least_room_m(pose, self.path[ahead + 1]) > body.radius_m + CELL_M / 2
         ):
             ahead += 1
-        off = _bearing(self.path[ahead], pose)
-        if abs(off) > TURN_ON_SPOT_RAD:
+        off = float(_bearings(self.path[ahead], pose))
+        is_free = self._costmap.least_room_m(pose, self.path[ahead]) > body.radius_m
+        if abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
             return 0.0, float(np.sign(off)) * body.turn_rad_s
         turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9))
         return body.speed_m_s * slower, float(turn) * slower
 
 
-def _bearing(point: Array, pose: Array) -> float:
-    """Return where a point (2,) lies from a pose x, y, yaw: radians to the left of ahead."""
-    angle = np.arctan2(point[1] - pose[1], point[0] - pose[0]) - pose[2]
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+def _bearings(points: Array, pose: Array) -> Array:
+    """Return where points (..., 2) lie from a pose x, y, yaw: radians (...) left of ahead."""
+    angle = np.arctan2(points[..., 1] - pose[1], points[..., 0] - pose[0]) - pose[2]
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -96,6 +96,15 @@ def test_frontiers_are_places_a_radius_away_from_unknown_floor_but_not_from_slit
     assert frontier[:, 1].min() >= 14
 
 
+def test_what_is_unknown_behind_a_wall_is_no_frontier() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[:, 14:] = UNKNOWN
+    grid.cells[3:8, 13] = OCCUPIED
+    assert costmap_of(grid).frontiers() == []
+    grid.cells[3:8, 13] = FREE
+    assert len(costmap_of(grid).frontiers()) == 1
+
+
 def test_a_scan_clears_what_it_passes_and_nothing_else() -> None:
     explorer = Explorer(BODY, 0)
     ahead, aside, far = (1.0, 0.0, 0.1), (0.0, 1.0, 0.1), (5.0, 0.0, 0.1)
@@ -120,12 +129,16 @@ def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None
 
 
 class Drive:
-    """A robot on a true map, of which it sees what lies before it within some metres."""
+    """A robot on a true map, of which it sees what lies before it within some metres.
+    is_known: all of it was seen before.
+    """
 
-    def __init__(self, truth: OccupancyGrid, explorer: Explorer, pose: np.ndarray) -> None:
+    def __init__(
+        self, truth: OccupancyGrid, explorer: Explorer, pose: np.ndarray, is_known: bool = False
+    ) -> None:
         self.truth, self.explorer, self.pose = truth, explorer, pose
         self.time_s, self.nearest_m = 0.0, np.inf
-        self._known = np.full_like(truth.cells, UNKNOWN)
+        self._known = truth.cells.copy() if is_known else np.full_like(truth.cells, UNKNOWN)
         room = cv2.distanceTransform((truth.cells == FREE).astype(np.uint8), cv2.DIST_L2, 5)
         self._room_m = room * CELL_M
 
@@ -135,6 +148,8 @@ class Drive:
             for way in np.arange(0.25, 2.0, CELL_M / 3):
                 cell = (int((y + way * np.sin(angle)) / CELL_M),
                         int((x + way * np.cos(angle)) / CELL_M))  # fmt: skip
+                if not self.truth.holds(np.array([cell]))[0]:
+                    break  # between two cells that touch at a corner
                 self._known[cell] = self.truth.cells[cell]
                 if self._known[cell] == OCCUPIED:
                     break
@@ -173,6 +188,57 @@ def test_goals_that_are_given_are_driven_to_in_their_order_and_one_in_a_wall_is_
         ('desk', True),
         ('wall', False),
     ]
+
+
+DOORS = """
+##########################
+#............#...........#
+#........................#
+#........................#
+#........................#
+#........................#
+#............#...........#
+#............#...........#
+#........................#
+#........................#
+#........................#
+#........................#
+#............#...........#
+##########################
+"""
+LOWER, UPPER = slice(2, 6), slice(8, 12)
+
+
+START = np.array([0.6, 0.4, 0.0])
+
+
+def shut(truth: OccupancyGrid, rows: slice, is_shut: bool = True) -> None:
+    truth.cells[rows, 13] = OCCUPIED if is_shut else FREE
+
+
+def test_a_door_that_shuts_is_driven_around() -> None:
+    truth = grid_of(DOORS)
+    goal = Goal(np.array([2.0, 0.4]))
+    drive = Drive(truth, Explorer(BODY, [goal], phase='driving'), START, is_known=True)
+    drive.go_on(1.0)
+    shut(truth, LOWER)
+    drive.go_on(60.0)
+    assert goal.is_reached
+    assert drive.nearest_m > BODY.radius_m - CELL_M  # as finely as the map is
+
+
+def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_open_again() -> None:
+    truth = grid_of(DOORS)
+    goals = [Goal(np.array([2.0, 0.4]), 'behind'), Goal(np.array([0.35, 0.9]), 'here')]
+    drive = Drive(truth, Explorer(BODY, goals, phase='driving'), START, is_known=True)
+    for rows in (LOWER, UPPER):
+        shut(truth, rows)
+    drive.go_on(45.0)
+    assert [(goal.name, goal.is_reached) for goal in drive.explorer.ended] == [('here', True)]
+    for rows in (LOWER, UPPER):
+        shut(truth, rows, False)
+    drive.go_on(100.0)
+    assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
 
 
 def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:

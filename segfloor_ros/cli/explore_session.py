@@ -15,10 +15,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import typer
 import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3
+from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
 from segfloor_ros.cli.commands import ExploreOptions
@@ -38,9 +40,15 @@ from segfloor_ros.evaluation.exploration import (
 from segfloor_ros.files.results import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.files.whole import read_json, read_yaml
 from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.geometry import Array, planar
+from segfloor_ros.geometry import Array, Pose2d, planar
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
-from segfloor_ros.messages.arrays import MAP_POINT_DTYPE, cloud_array, grid_of, scan_arrays
+from segfloor_ros.messages.arrays import (
+    MAP_POINT_DTYPE,
+    cloud_array,
+    grey8_image,
+    grid_of,
+    scan_arrays,
+)
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import (
     CAMERA,
@@ -56,7 +64,7 @@ from segfloor_ros.messages.topics import (
 )
 from segfloor_ros.navigation import Body, Explorer, Goal
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
-from segfloor_ros.simulation.robot import DrivenRobot, open_robot
+from segfloor_ros.simulation.robot import DrivenRobot, Robot, open_robot
 from segfloor_ros.simulation.scene_file import open_scene
 from segfloor_ros.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.slam.results import UNKNOWN_COVARIANCE
@@ -68,6 +76,9 @@ FILES = (GOALS, SAVED, 'map.pgm', 'map.yaml', 'true_map.pgm', 'true_map.yaml', '
 
 CRUISE_M_S, TURN_RAD_S = 0.4, 0.6
 """No faster, whatever the robot can: SLAM follows these surely."""
+
+SEEN_PX = 320
+"""Width of the images that are kept for the strip."""
 
 GIVEN = ('height_m', 'pitch_rad', 'roll_rad', 'forward_m', 'left_m')
 """Of the mount of the camera: what SLAM is given."""
@@ -142,6 +153,7 @@ class Pilot:
         self._scans: dict[int, FloorScan] = {}
         self._poses: dict[int, Array | None] = {}
         self._obstacles = np.zeros((0, 3))
+        self._image: Image | None = None
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
         self._commands = graph.recorder.create_publisher(topic.type, topic.name, topic.profile)
@@ -151,6 +163,7 @@ class Pilot:
             ('obstacle_points', self._take_obstacles),
             ('map', self._take_map),
             ('contact', self._take_contact),
+            ('left/image_raw', self._take_image),
             ('ground_truth', self._take_truth),
             ('frame_done', lambda message: self.answer()),
             ('keyframe/done', lambda message: self.answer()),
@@ -223,11 +236,64 @@ class Pilot:
         grid = self._explorer.grid = grid_of(message)
         self._map_ns = to_ns(message.header.stamp)
         self.found.maps.append((self._map_ns, grid))
+        if self._image is not None:
+            image = grey8_image(self._image, 'left/image_raw')
+            size = SEEN_PX, SEEN_PX * image.shape[0] // image.shape[1]
+            small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            self.found.seen[stamp_of(self._image)] = small
         self._on_map(self.time_s, grid, self._explorer.phase)
         self.answer()
 
+    def _take_image(self, message: Image) -> None:
+        self._image = message
+
     def _take_contact(self, message: Any) -> None:
         self.found.bumps_ns.append(stamp_of(message))
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be explored. values: of the scene. truth: its map. start: where the frame of the
+    map lies in the scene. slam: values of `stereo_slam`. named: places by name.
+    """
+
+    values: list[str]
+    robot: Robot
+    body: Body
+    truth: OccupancyGrid
+    start: Pose2d
+    slam: dict[str, Any]
+    named: dict[str, Any]
+
+    @classmethod
+    def of(cls, options: ExploreOptions) -> Task:
+        """Open the scene with the robot in it. Raises SegfloorError."""
+        robot, of_camera = open_robot(options.robot)
+        values = [f'seed={options.seed}', *(options.set_values or ())]
+        scene = open_scene(options.scene, [*of_camera, *values])
+        with about(options.scene):
+            driven = DrivenRobot(scene, robot)
+            x, y, yaw = planar(driven.T_world_base(0.0)).tolist()
+            truth = true_map(scene, obstacles(scene), floors(scene), np.array([x, y]))
+            reachable_floor(truth, robot.radius_m, (x, y, yaw))
+        mount = asdict(driven.mount)
+        slam: dict[str, Any] = {f'camera_{name}': mount[name] for name in GIVEN}
+        start, named = (x, y, yaw), {}
+        if options.start_in is not None:
+            slam['load_map'] = str((options.start_in / SAVED).absolute())
+            named = read_yaml(options.start_in / GOALS, 'names and places')
+            summary = read_json(options.start_in / 'summary.json', 'an exploration')
+            start = tuple(summary['map_in_scene'])
+        speeds = min(robot.speed_m_s, CRUISE_M_S), min(robot.turn_rate_rad_s, TURN_RAD_S)
+        body = Body(robot.radius_m, driven.nearest_floor_m(scene), *speeds)
+        return cls(values, robot, body, truth, start, slam, named)
+
+    def explorer(self, options: ExploreOptions) -> Explorer:
+        """Return who explores, or drives to the goals that are given."""
+        if not options.goal:
+            return Explorer(self.body, options.goals, options.seed)
+        wanted = [Goal(_place(text, self.named), text) for text in options.goal]
+        return Explorer(self.body, wanted, options.seed, phase='driving')
 
 
 def explore_scene(options: ExploreOptions) -> None:
@@ -235,28 +301,10 @@ def explore_scene(options: ExploreOptions) -> None:
     where nothing can come of it, typer.Exit after an interrupt.
     """
     check_target(options.out, FILES)
-    robot, of_camera = open_robot(options.robot)
-    values = [f'seed={options.seed}', *(options.set_values or ())]
-    scene = open_scene(options.scene, [*of_camera, *values])
-    with about(options.scene):
-        driven = DrivenRobot(scene, robot)
-        x, y, yaw = planar(driven.T_world_base(0.0)).tolist()
-        truth = true_map(scene, obstacles(scene), floors(scene), np.array([x, y]))
-    found = Exploration((x, y, yaw))
-    slam: dict[str, Any] = {f'camera_{n}': v for n, v in asdict(driven.mount).items() if n in GIVEN}
-    named: dict[str, Any] = {}
-    if options.start_in is not None:
-        slam['load_map'] = str((options.start_in / SAVED).absolute())
-        named = read_yaml(options.start_in / GOALS, 'names and places')
-        summary = read_json(options.start_in / 'summary.json', 'an exploration')
-        found.start = tuple(summary['map_in_scene'])
-    floor = reachable_floor(truth, robot.radius_m, found.start)
-    speeds = min(robot.speed_m_s, CRUISE_M_S), min(robot.turn_rate_rad_s, TURN_RAD_S)
-    body = Body(robot.radius_m, driven.nearest_floor_m(scene), *speeds)
-    explorer = Explorer(body, options.goals, options.seed)
-    if options.goal:
-        wanted = [Goal(_place(text, named), text) for text in options.goal]
-        explorer = Explorer(body, wanted, options.seed, phase='driving')
+    task = Task.of(options)
+    explorer, found = task.explorer(options), Exploration(task.start)
+    floor = reachable_floor(task.truth, task.robot.radius_m, task.start)
+    goals = len(options.goal) if options.goal else options.goals
     with (
         folder_in_the_making(options.out) as made,
         first_interrupt_noted() as interrupt,
@@ -264,40 +312,33 @@ def explore_scene(options: ExploreOptions) -> None:
     ):
 
         def show(time_s: float, grid: OccupancyGrid, phase: str) -> None:
-            share = mapped_share(grid, truth, floor, found.start)
-            ended = f', {len(explorer.ended)} of {options.goals} goals' * (phase == 'driving')
+            share = mapped_share(grid, task.truth, floor, task.start)
+            ended = f', {len(explorer.ended)} of {goals} goals' * (phase == 'driving')
             progress(round(100 * share), note=f'of the floor mapped at {time_s:.0f} s{ended}')
 
-        session = ExploreSession(
-            resolve(options.params, ()),
-            options.params,
-            {
-                'scene': options.scene,
-                'scene_values': shlex.join(values),
-                'robot': options.robot,
-                'depth': options.depth,
-            },
-            slam,
-            explorer,
-            found,
-            60 * options.minutes,
-            made / SAVED,
-            show,
-            interrupt,
-        )
-        session.execute()
+        robot = {
+            'scene': options.scene,
+            'scene_values': shlex.join(task.values),
+            'robot': options.robot,
+            'depth': options.depth,
+        }
+        configuration, most_s = resolve(options.params, ()), 60 * options.minutes
+        ExploreSession(
+            configuration, options.params, robot, task.slam, explorer, found, most_s, made / SAVED,
+            show, interrupt,
+        ).execute()  # fmt: skip
         if not found.maps:
             raise MapError(f'{options.scene}: no map came of {len(found.true_poses)} frames')
         summary = {
-            **figures(found, truth, robot.radius_m),
-            'goals_total': len(options.goal) if options.goal else options.goals,
+            **figures(found, task.truth, task.robot.radius_m),
+            'goals_total': goals,
             'scene': options.scene,
             'robot': options.robot,
             'seed': options.seed,
             'map_in_scene': found.start,
         }
         with os_errors(f'{options.out}: cannot be written'):
-            _write(made, found, truth, summary, named)
+            _write(made, found, task.truth, summary, task.named)
             move_into_place(made, options.out)
     rows = [(name, str(value)) for name, value in summary.items() if name != 'cpu_s']
     console.print(value_table('exploration', rows, options.scene))

@@ -15,8 +15,10 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.map_score import COLOURS, coloured, compare, score_cells
 from segfloor_ros.evaluation.maps import MapTruth, Mask, from_frame, resample
+from segfloor_ros.files.images import png_bytes
 from segfloor_ros.geometry import Array, Pose2d
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
 from segfloor_ros.navigation import ARRIVED_M, Goal
@@ -24,12 +26,15 @@ from segfloor_ros.navigation import ARRIVED_M, Goal
 FILM_FRAMES = 60
 """At most, ten of them in a second."""
 
+STRIP_IMAGES = 8
+
 
 @dataclass
 class Exploration:
     """An exploration as it went. start: where the frame of the map truly lies. Poses by stamp in
     ns: where SLAM had the base in the map at the time, and where it truly was in the scene. maps:
-    with their stamps. goals: with the true pose at the end of each.
+    with their stamps. goals: with the true pose at the end of each. seen: small left images (H, W)
+    uint8 by stamp.
     """
 
     start: Pose2d
@@ -40,13 +45,21 @@ class Exploration:
     goals: list[tuple[Goal, Array]] = field(default_factory=list)
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
+    seen: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 def reachable_floor(truth: OccupancyGrid, radius_m: float, start: Pose2d) -> Mask:
-    """Return the floor (rows, columns) that a robot of some radius can stand on."""
+    """Return the floor (rows, columns) that a robot of some radius can stand on. Raises InputError
+    where it cannot turn at the start.
+    """
     room_m = truth.away_m(truth.cells == OCCUPIED)
     _, labels = cv2.connectedComponents((room_m > radius_m).astype(np.uint8), connectivity=4)
     at_start = labels[tuple(truth.cells_of(np.array(start[:2])))]
+    if not at_start:
+        raise InputError(
+            f'the robot turns within {radius_m:.2f} m, but something stands nearer to its start at '
+            f'x {start[0]:.2f}, y {start[1]:.2f} m; choose a smaller robot or another path'
+        )
     away_m = truth.away_m(labels == at_start)
     return np.asarray((away_m <= radius_m) & (truth.cells == FREE))
 
@@ -92,7 +105,7 @@ def _is_at(goal: Goal, T_world_base: Array, start: Pose2d) -> bool:
 
 
 def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
-    """Draw the map on the truth with the way, bumps and goals, as PNG."""
+    """Draw the map on the truth with way, bumps and goals, below it what was seen, as PNG."""
     figure, show = _canvas(found, truth)
     show(len(found.maps) - 1)
     axes = figure.axes[0]
@@ -109,7 +122,30 @@ def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
     axes.legend(loc='upper left', bbox_to_anchor=(1.01, 1.0), fontsize=8)
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=110, bbox_inches='tight')
-    return buffer.getvalue()
+    drawn = cv2.imdecode(np.frombuffer(buffer.getvalue(), np.uint8), cv2.IMREAD_COLOR)
+    return png_bytes(np.vstack([drawn, *_strip(found, drawn.shape[1])]))
+
+
+def _strip(found: Exploration, width: int) -> list[NDArray[np.uint8]]:
+    """Return rows of images seen on the way, evenly over the time, each with its time."""
+    stamps = sorted(found.seen)
+    chosen = np.unique(np.linspace(0, len(stamps) - 1, min(STRIP_IMAGES, len(stamps))).astype(int))
+    beside = STRIP_IMAGES // 2
+    images = [_with_time(found.seen[stamps[i]], stamps[i], width // beside) for i in chosen]
+    rows = [np.hstack(images[i : i + beside]) for i in range(0, len(images), beside)]
+    white = 3 * [255]
+    return [
+        cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=white)
+        for row in rows
+    ]
+
+
+def _with_time(grey: NDArray[np.uint8], stamp_ns: int, width: int) -> NDArray[np.uint8]:
+    size = width, width * grey.shape[0] // grey.shape[1]
+    image = cv2.cvtColor(cv2.resize(grey, size), cv2.COLOR_GRAY2BGR)
+    text, font = f'{stamp_ns * 1e-9:.0f} s', cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(image, text, (6, size[1] - 8), font, 0.5, (0, 255, 255), 1, cv2.LINE_AA)
+    return np.asarray(image, np.uint8)
 
 
 def write_film(path: Path, found: Exploration, truth: OccupancyGrid) -> None:

@@ -20,7 +20,7 @@ from segfloor_ros.geometry import Array, invert, make_transform, quaternion_xyzw
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation.camera import rectified_camera
 from segfloor_ros.simulation.motion import plan_drive
-from segfloor_ros.simulation.scene import Imu, Scene
+from segfloor_ros.simulation.scene import Car, Imu, Mover, MovingBox, Person, Scene
 from segfloor_ros.simulation.scene_file import EXPECTED, shipped
 from segfloor_ros.simulation.solids import Prism, floor_height_m, floors, obstacles, place
 from segfloor_ros.simulation.world import import_mujoco
@@ -143,7 +143,7 @@ class DrivenRobot:
         """Let the time go on to a moment."""
         while self._steps < round(time_s * STEPS_PER_S):
             self._follow_command()
-            self._place_people()
+            self._place_movers()
             self._step(self._model, self._data)
             self._steps += 1
             self._poses.append(self._pose_now())
@@ -179,9 +179,11 @@ class DrivenRobot:
         turning = self._rims_m_s / self._robot.wheel_radius_m
         self._data.ctrl[:] = np.resize(turning, self._model.nu)
 
-    def _place_people(self) -> None:
-        for index, person in enumerate(self._scene.people):
-            self._data.mocap_pos[index, :2] = place(person, max(self.time_s, 0.0))[:2]
+    def _place_movers(self) -> None:
+        for index, mover in enumerate(self._scene.movers):
+            x, y, yaw = place(mover, max(self.time_s, 0.0))
+            self._data.mocap_pos[index, :2] = x, y
+            self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
     def _pose_now(self) -> Array:
         w, x, y, z = self._data.qpos[3:7]
@@ -240,7 +242,7 @@ def _document(scene: Scene, robot: Robot, mount: Mount, start: Array) -> str:
         wall_friction=WALL_FRICTION,
         meshes=''.join(f'<mesh name="{name}" vertex="{at}"/>' for name, at in meshes),
         solids=''.join(f'<geom name="{name}" type="mesh" mesh="{name}"/>' for name, _ in meshes),
-        people=''.join(_person(index) for index in range(len(scene.people))),
+        movers=''.join(_mover(index, mover) for index, mover in enumerate(scene.movers)),
         pose=f'pos="{x} {y} {z}" quat="{np.cos(yaw / 2)} 0 0 {np.sin(yaw / 2)}"',
         parts=_parts(robot),
         imu=_words(mount.T_base_left[:3, 3]),
@@ -296,10 +298,17 @@ def _motors(robot: Robot) -> str:
     )
 
 
-def _person(index: int) -> str:
+def _mover(index: int, mover: Mover) -> str:
+    """Return what moves as it stands in the way: a person as a post."""
+    if isinstance(mover, (Car, MovingBox)):
+        height_m = mover.size[2]
+        shape = f'type="box" size="{_words(np.array(mover.size) / 2)}"'
+    else:
+        height_m = Person.height_m
+        shape = f'type="cylinder" size="{PERSON_RADIUS_M} {height_m / 2}"'
     return (
-        f'<body name="person_{index}" mocap="true"><geom name="obstacle_person_{index}" '
-        f'type="cylinder" size="{PERSON_RADIUS_M} 1" pos="0 0 1"/></body>'
+        f'<body name="mover_{index}" mocap="true"><geom name="obstacle_mover_{index}" '
+        f'{shape} pos="0 0 {height_m / 2}"/></body>'
     )
 
 

@@ -81,29 +81,44 @@ class FloorPatch:
 
 
 @dataclass(frozen=True)
-class Person:
-    """Someone who stands at the first of `points` and from `start_s` on walks along them, to and
-    fro or, without `returns`, to the last one and stays.
+class Mover:
+    """What stands at the first of `points` and from `start_s` on moves along them, to and fro or,
+    without `returns`, to the last one and stays. stays_s: so long it stands at either end.
     """
 
     points: tuple[Point, ...]
     speed_m_s: float = 0.8
     start_s: float = 0.0
     returns: bool = True
+    stays_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Person(Mover):
+    """Someone who walks."""
+
     height_m: float = 1.75
     texture: str = 'cloth'
 
 
 @dataclass(frozen=True)
-class Car:
-    """A car of `size` (length, width, height) that drives as a `Person` walks."""
+class Car(Mover):
+    """A car of `size` (length, width, height)."""
 
-    points: tuple[Point, ...]
     speed_m_s: float = 8.0
-    start_s: float = 0.0
     returns: bool = False
     size: Point3 = (4.2, 1.8, 1.5)
     texture: str = 'goods'
+
+
+@dataclass(frozen=True)
+class MovingBox(Mover):
+    """A block of `size` (length along its way, width, height): a door that slides, or, at 100 m/s,
+    a crate that somebody puts down and takes away.
+    """
+
+    size: Point3 = (0.9, 0.06, 2.0)
+    texture: str = 'wood'
 
 
 @dataclass(frozen=True)
@@ -297,6 +312,7 @@ class Scene:
     floor_patches: tuple[FloorPatch, ...] = ()
     people: tuple[Person, ...] = ()
     cars: tuple[Car, ...] = ()
+    moving_boxes: tuple[MovingBox, ...] = ()
     lighting: Lighting = field(default_factory=Lighting)
     camera: CameraRig = field(default_factory=CameraRig)
     sensors: Sensors = field(default_factory=Sensors)
@@ -306,6 +322,6 @@ class Scene:
     step_height_m: float = 0.03
 
     @property
-    def movers(self) -> tuple[Person | Car, ...]:
+    def movers(self) -> tuple[Mover, ...]:
         """Everything that moves; it is not part of the true map."""
-        return (*self.people, *self.cars)
+        return (*self.people, *self.cars, *self.moving_boxes)

@@ -24,6 +24,8 @@ from segfloor_ros.simulation.scene import (
     Car,
     FloorPatch,
     Furniture,
+    Mover,
+    MovingBox,
     Person,
     Point,
     Scene,
@@ -37,8 +39,6 @@ POSTER_VARIANTS = 6
 
 SAMPLES_PER_CELL = 5
 MARGIN_M = 0.5
-
-Mover = Person | Car
 
 MOVING_WITHIN_S = 0.2
 """What changes its place within this time around a moment moves."""
@@ -321,6 +321,9 @@ def part_solids(mover: Mover) -> list[list[Prism]]:
     """Return the solids of each part of a mover, in the frame of the part's joint."""
     if isinstance(mover, Car):
         return [_labelled('car', _car_solids(mover))]
+    if isinstance(mover, MovingBox):
+        return [_labelled('box', [block((0.0, 0.0), mover.size, mover.texture)])]
+    assert isinstance(mover, Person)
     scale, cloth, trousers = mover.height_m / Person.height_m, mover.texture, 'cloth:7'
     torso = [
         block((0.0, 0.0), (0.22, 0.36, 0.54), cloth, bottom_m=0.0),
@@ -343,7 +346,7 @@ def part_poses(mover: Mover, time_s: float) -> Array:
     walked_m = _walked_m(mover, time_s)
     x, y, yaw = place(mover, time_s)
     T_world_mover = make_transform(Rotation.from_euler('Z', yaw).as_matrix(), np.array([x, y, 0]))
-    if isinstance(mover, Car):
+    if not isinstance(mover, Person):
         return T_world_mover[None]
     return T_world_mover @ _limbs(walked_m, mover.height_m / Person.height_m)
 
@@ -406,8 +409,12 @@ def _car_solids(car: Car) -> list[Prism]:
 
 
 def _walked_m(mover: Mover, time_s: float) -> float:
-    walked = max(0.0, time_s - mover.start_s) * mover.speed_m_s
-    return walked if mover.returns else min(walked, _lengths_m(mover).sum())
+    since_s, way_m = max(0.0, time_s - mover.start_s), _lengths_m(mover).sum()
+    way_s = way_m / mover.speed_m_s
+    ends, rest_s = divmod(since_s, way_s + mover.stays_s)
+    stood_s = ends * mover.stays_s + max(0.0, rest_s - way_s)
+    walked = (since_s - stood_s) * mover.speed_m_s
+    return walked if mover.returns else min(walked, way_m)
 
 
 def _lengths_m(mover: Mover) -> Array:
@@ -425,5 +432,5 @@ def place(mover: Mover, time_s: float) -> tuple[float, float, float]:
     stretch = int(np.clip(np.searchsorted(along, reached, side='right') - 1, 0, len(lengths) - 1))
     direction = (points[stretch + 1] - points[stretch]) / lengths[stretch]
     x, y = points[stretch] + direction * (reached - along[stretch])
-    heading = -direction if back else direction
+    heading = -direction if back and not isinstance(mover, MovingBox) else direction
     return float(x), float(y), float(np.arctan2(heading[1], heading[0]))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.evaluation.exploration import Exploration, figures, reachable_floor
+from segfloor_ros.errors import InputError
+from segfloor_ros.evaluation.exploration import Exploration, figures, picture, reachable_floor
 from segfloor_ros.evaluation.maps import from_frame
+from segfloor_ros.files.images import decode_colour
 from segfloor_ros.geometry import Array, make_transform
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
 from segfloor_ros.navigation import Goal
@@ -34,6 +36,11 @@ def test_only_the_room_of_the_start_can_be_reached() -> None:
     assert there[5:-5, 36:-5].all() and not there[:, :32].any()
 
 
+def test_a_robot_that_is_too_large_for_where_it_starts_is_refused() -> None:
+    with pytest.raises(InputError, match=r'turns within 1\.20 m'):
+        reachable_floor(two_rooms(), 1.2, START)
+
+
 def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     # In the map ahead is +x; in the scene the robot looks along +y.
     in_map = np.array([[0.0, 0.0], [0.3, 0.0], [0.4, -0.5]])
@@ -50,3 +57,20 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     assert told['path_rmse_m'] == pytest.approx(0.0, abs=1e-4)
     assert told['path_m'] == pytest.approx(0.3 + np.hypot(0.1, 0.5), abs=0.01)
     assert told['real_time_factor'] == pytest.approx(0.5)
+
+
+def test_the_picture_has_a_strip_of_what_was_seen_below_the_map() -> None:
+    grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
+    stamps = [10**9 * i for i in range(20)]
+    found = Exploration(START, {}, {t: pose(*START) for t in stamps}, [(stamps[-1], grid)])
+    bare = decode_colour(picture(found, two_rooms()), 'bare')
+    found.seen = {t: np.full((60, 80), 10 * i, np.uint8) for i, t in enumerate(stamps)}
+    drawn = decode_colour(picture(found, two_rooms()), 'drawn')
+    np.testing.assert_array_equal(drawn[: len(bare)], bare)
+    strip = drawn[len(bare) :]
+    width = bare.shape[1] // 4
+    assert strip.shape[0] == 2 * (width * 60 // 80)
+    levels = [
+        int(row[10, width * i + width // 2, 0]) for row in np.split(strip, 2) for i in range(4)
+    ]
+    assert levels == sorted(levels) and (levels[0], levels[-1]) == (0, 190)

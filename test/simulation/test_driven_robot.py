@@ -93,6 +93,18 @@ def test_someone_who_walks_into_it_bumps() -> None:
     assert [time_s for time_s, _ in driven.bumps] == [pytest.approx(1.7, abs=0.1)]
 
 
+def test_a_crate_stops_it_where_somebody_has_put_it_down_and_no_longer_when_it_is_gone() -> None:
+    crate = 'moving_boxes=[{points: [[0.5, 4], [0.5, 0]], size: [0.4, 0.2, 0.3], speed_m_s: 100, '
+    driven = robot_in('lane', 'turtlebot3_burger', crate + 'start_s: 0.5, stays_s: 4}]')
+    driven.drive(0.2, 0.0)
+    driven.advance(4.0)
+    front_m = -0.032 + 0.138 / 2
+    assert driven.T_world_base(4.0)[0, 3] + front_m == pytest.approx(0.4, abs=0.01)
+    assert len(driven.bumps) == 1
+    driven.advance(7.0)
+    assert driven.T_world_base(7.0)[0, 3] > 0.6
+
+
 def test_a_robot_that_there_is_not_is_refused_with_one_like_it() -> None:
     with pytest.raises(InputError, match=r'huski: no such robot.*husky'):
         open_robot('huski')

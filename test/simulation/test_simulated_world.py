@@ -7,7 +7,7 @@ import pytest
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, load_map, save_map
-from segfloor_ros.simulation.scene import Person, Scene
+from segfloor_ros.simulation.scene import MovingBox, Person, Scene
 from segfloor_ros.simulation.scene_file import (
     PLAN,
     merged_rectangles,
@@ -289,6 +289,16 @@ def test_people_without_return_stay_at_the_end_and_move_only_on_their_way():
     person = Person(points=((0.0, 0.0), (1.0, 0.0)), speed_m_s=0.5, start_s=4.0, returns=False)
     np.testing.assert_allclose(part_poses(person, 60.0)[0, :2, 3], (1, 0))
     assert [is_moving(person, t) for t in (1.0, 4.1, 5.0, 7.0)] == [False, True, True, False]
+
+
+def test_a_door_slides_shut_stays_and_opens_again_without_turning_round():
+    door = MovingBox(((1.0, 0.0), (1.0, 2.0)), speed_m_s=0.5, start_s=3.0, stays_s=10.0)
+    way = {2.0: 0, 5.0: 1, 7.0: 2, 16.9: 2, 19.0: 1, 21.0: 0, 30.9: 0, 33.0: 1, 40.0: 2}
+    for time_s, y in way.items():
+        T_world_door = part_poses(door, time_s)[0]
+        np.testing.assert_allclose(T_world_door[:2, 3], (1, y), atol=1e-9)
+        np.testing.assert_allclose(T_world_door[:2, 0], (0, 1), atol=1e-9)
+    assert [is_moving(door, t) for t in (2.0, 5.0, 12.0, 19.0, 25.0)] == [0, 1, 0, 1, 0]
 
 
 def test_a_foot_of_someone_who_walks_stays_on_the_floor_and_does_not_slide():
