@@ -136,6 +136,10 @@ class RigMotion:
         )
         return self.T_world_base(time_s) @ mount.T_base_left
 
+    def mover_times_s(self, time_s: float) -> list[float]:
+        """Return the time of each mover: nobody waits."""
+        return [time_s] * len(self.scene.movers)
+
     def T_world_base(self, time_s: float) -> Array:
         """Return the pose (4, 4) of the base, on the floor, at a time."""
         x, y, yaw = self.drive.at(np.array([time_s]))[0]

@@ -45,6 +45,9 @@ TYRE_FRICTION, WALL_FRICTION = 0.9, 0.3
 
 PERSON_RADIUS_M = 0.25
 
+LOOKS_S = 1.0
+"""People do not take a step that would bring them into the robot within this time."""
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -117,6 +120,8 @@ class DrivenRobot:
         self._wanted_m_s: Array = np.zeros(2)
         self._rims_m_s: Array = np.zeros(2)
         self._poses: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
+        self._mover_steps = [0] * len(scene.movers)
+        self._mover_times: deque[list[float]] = deque(maxlen=self._poses.maxlen)
         self._steps = -round(SETTLING_S * STEPS_PER_S)
         self._felt: list[Array] = []
         self._touched_s = -np.inf
@@ -147,6 +152,7 @@ class DrivenRobot:
             self._step(self._model, self._data)
             self._steps += 1
             self._poses.append(self._pose_now())
+            self._mover_times.append([steps / STEPS_PER_S for steps in self._mover_steps])
             self._felt.append(self._data.sensordata.copy())
             if self._steps % (STEPS_PER_S // MEASUREMENTS_PER_S) == 0:
                 self._measure()
@@ -163,8 +169,16 @@ class DrivenRobot:
 
     def T_world_base(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the base at a time not long past."""
+        return self._poses[self._index(time_s)]
+
+    def mover_times_s(self, time_s: float) -> list[float]:
+        """Return the time of each mover at a time not long past: people wait for the robot."""
+        return self._mover_times[self._index(time_s)]
+
+    def _index(self, time_s: float) -> int:
+        """Return where a time not long past is among what is remembered."""
         back = self._steps - round(time_s * STEPS_PER_S)
-        return self._poses[max(len(self._poses) - 1 - max(back, 0), 0)]
+        return max(len(self._poses) - 1 - max(back, 0), 0)
 
     def T_world_left(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the rectified left optical frame at a time not long
@@ -181,9 +195,22 @@ class DrivenRobot:
 
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
-            x, y, yaw = place(mover, max(self.time_s, 0.0))
+            if self._steps >= 0 and not self._waits(mover, self._mover_steps[index]):
+                self._mover_steps[index] += 1
+            x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
             self._data.mocap_pos[index, :2] = x, y
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+
+    def _waits(self, mover: Mover, steps: int) -> bool:
+        """Whether somebody would walk into the robot."""
+        if not isinstance(mover, Person):
+            return False
+        here = *self._data.qpos[:2], 0.0
+        now, soon = (
+            np.hypot(*np.subtract(place(mover, steps / STEPS_PER_S + later_s), here)[:2])
+            for later_s in (0.0, LOOKS_S)
+        )
+        return bool(soon < min(now, self._robot.radius_m + PERSON_RADIUS_M))
 
     def _pose_now(self) -> Array:
         w, x, y, z = self._data.qpos[3:7]

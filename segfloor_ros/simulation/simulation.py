@@ -5,7 +5,7 @@ MuJoCo without a display; and its files: images, calibration, poses, true map an
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -92,10 +92,13 @@ class FrameLabels:
 
 
 class Motion(Protocol):
-    """Tells where the rectified left optical frame is (4, 4) at a time."""
+    """Where the rectified left optical frame and the movers of a scene are at a time."""
 
     def T_world_left(self, time_s: float) -> Array:
-        """Return the pose."""
+        """Return the pose (4, 4)."""
+
+    def mover_times_s(self, time_s: float) -> Sequence[float]:
+        """Return the time that each mover has come to: less where it had to wait."""
 
 
 class Simulation:
@@ -191,7 +194,8 @@ class Simulation:
 
     def _show(self, time_s: float) -> None:
         """Let the cameras see what there is at a time."""
-        self._renderer.move(self._moved.T_world_left(time_s), time_s)
+        moved = self._moved
+        self._renderer.move(moved.T_world_left(time_s), moved.mover_times_s(time_s))
 
     def _depth_mm(self, index: int, time_s: float) -> NDArray[np.uint16] | None:
         if not self.scene.sensors.depth.max_m:

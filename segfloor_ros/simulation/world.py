@@ -5,6 +5,7 @@ what can be seen of it, rendered without a display.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from ctypes import ArgumentError
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -316,10 +317,10 @@ class WorldRenderer:
         instance = [owner.get(name, 0) for name in body]
         return np.array([*label, 255], np.uint8), np.array([*instance, 0], np.uint8)
 
-    def move(self, T_world_left: Array, time_s: float) -> None:
-        """Put the rig at a pose of the left optical frame, and what moves where it is at a time."""
+    def move(self, T_world_left: Array, times_s: Sequence[float]) -> None:
+        """Put the rig at a pose of the left optical frame, and each mover where it is at a time."""
         self._place(RIG, T_world_left[:3, 3], quaternion_xyzw(T_world_left[:3, :3]))
-        for mover, names in zip(self._scene.movers, self._movers, strict=True):
+        for mover, names, time_s in zip(self._scene.movers, self._movers, times_s, strict=True):
             for name, T_world_part in zip(names, part_poses(mover, time_s), strict=True):
                 self._place(name, T_world_part[:3, 3], quaternion_xyzw(T_world_part[:3, :3]))
         self.mujoco.mj_forward(self.model, self.data)

@@ -86,11 +86,28 @@ def test_a_wall_stops_it_and_is_one_bump_while_its_wheels_go_on() -> None:
     assert driven.wheels[-1].T_wheels_base[0, 3] > front_m + 0.3
 
 
-def test_someone_who_walks_into_it_bumps() -> None:
+def test_a_car_drives_into_it() -> None:
+    car = 'cars=[{points: [[4, 0], [-1, 0]], speed_m_s: 1.0, size: [2, 1, 1]}]'
+    driven = robot_in('lane', 'turtlebot3_burger', car)
+    driven.advance(4.0)
+    front_m = -0.032 + 0.138 / 2
+    assert driven.bumps[0][0] == pytest.approx(3.0 - front_m, abs=0.1)
+
+
+def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 1.0, returns: false}]'
     driven = robot_in('lane', 'turtlebot3_burger', person)
-    driven.advance(3.0)
-    assert [time_s for time_s, _ in driven.bumps] == [pytest.approx(1.7, abs=0.1)]
+    driven.advance(5.0)
+    assert not driven.bumps
+    (waited_s,) = driven.mover_times_s(5.0)
+    # In a second the person would touch the robot, which turns within 0.135 m.
+    assert 2.0 - waited_s - 1.0 == pytest.approx(0.135 + 0.25, abs=0.02)
+    driven.drive(-0.2, 0.6)
+    driven.advance(5.0 + 0.5 * np.pi / 0.6)
+    driven.drive(-0.2, 0.0)
+    driven.advance(12.0)
+    assert not driven.bumps
+    assert driven.mover_times_s(12.0)[0] > 3.0
 
 
 def test_a_crate_stops_it_where_somebody_has_put_it_down_and_no_longer_when_it_is_gone() -> None:
