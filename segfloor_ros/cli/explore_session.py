@@ -77,9 +77,6 @@ FILES = (GOALS, SAVED, 'map.pgm', 'map.yaml', 'true_map.pgm', 'true_map.yaml', '
 CRUISE_M_S, TURN_RAD_S = 0.4, 0.6
 """No faster, whatever the robot can: SLAM follows these surely."""
 
-SEEN_PX = 320
-"""Width of the images that are kept for the strip."""
-
 GIVEN = ('height_m', 'pitch_rad', 'roll_rad', 'forward_m', 'left_m')
 """Of the mount of the camera: what SLAM is given."""
 
@@ -238,9 +235,7 @@ class Pilot:
         self.found.maps.append((self._map_ns, grid))
         if self._image is not None:
             image = grey8_image(self._image, 'left/image_raw')
-            size = SEEN_PX, SEEN_PX * image.shape[0] // image.shape[1]
-            small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            self.found.seen[stamp_of(self._image)] = small
+            self.found.seen[stamp_of(self._image)] = np.asarray(cv2.pyrDown(image), np.uint8)
         self._on_map(self.time_s, grid, self._explorer.phase)
         self.answer()
 
