@@ -98,6 +98,21 @@ def test_depth_of_another_field_of_view_is_found(boxes) -> None:
     assert '0.92 times' in found['depth_unaligned'].finding
 
 
+def test_depth_of_a_lens_that_is_not_that_of_the_image_is_found(boxes) -> None:
+    """As a RealSense gives it that is not told to register depth to colour."""
+    wide = 1 / 1.59
+    zoom = np.array([[wide, 0, (1 - wide) * WIDTH / 2 + 6], [0, wide, (1 - wide) * HEIGHT / 2]])
+    found = faults(
+        with_depth(
+            [boxes.frame(i) for i in range(50)],
+            lambda d: cv2.warpAffine(d, zoom, d.shape[::-1], flags=cv2.INTER_NEAREST),
+        )
+    )
+    assert set(found) == {'depth_unaligned'}
+    assert '1.60 times as large' in found['depth_unaligned'].finding
+    assert found['depth_unaligned'].line().startswith('image and depth are not aligned')
+
+
 @pytest.mark.parametrize('lag', [1, 2])
 def test_depth_that_is_late_is_found_with_its_lag(boxes, lag) -> None:
     found = faults([boxes.frame(i, i - lag) for i in range(FRAMES)])

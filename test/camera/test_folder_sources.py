@@ -354,13 +354,30 @@ def test_image_folders_need_a_calibration_of_their_size(tmp_path: Path) -> None:
         opened(folder)
 
 
+def test_the_list_of_a_whole_recording_does_for_a_part_of_it(tmp_path: Path, caplog) -> None:
+    stamps = [0, 50 * MS, 100 * MS]
+    root = write_euroc(tmp_path, grey_pairs(3), stamps, stamps) / 'mav0'
+    for eye in ('cam0', 'cam1'):
+        (root / eye / 'data' / f'{stamps[2]}.png').unlink()
+    assert [frame.stamp_ns for frame in opened(tmp_path).frames()] == stamps[:2]
+    assert 'data.csv: 1 of 3 images do not exist' in caplog.text
+
+
+def test_an_imu_of_unknown_mount_is_left_out(tmp_path: Path, caplog) -> None:
+    root = write_euroc(tmp_path, grey_pairs(2), [0, 50 * MS], [0, 50 * MS]) / 'mav0'
+    (root / 'imu0').mkdir()
+    (root / 'imu0' / 'data.csv').write_text('0,0,0,0,0,9.8,0\n')
+    assert [sensor.used for sensor in opened(tmp_path).sensors] == [False]
+    assert 'imu0: no sensor.yaml says how the IMU is mounted; it is left out' in caplog.text
+
+
 def test_faults_of_euroc_folders_are_named(tmp_path: Path) -> None:
     stamps = [0, 50 * MS, 100 * MS]
     root = write_euroc(tmp_path, grey_pairs(3), stamps, stamps) / 'mav0'
     index = root / 'cam1' / 'data.csv'
     good = index.read_text()
-    index.write_text('#timestamp [ns],filename\n50,50.png\n0,0.png\n')
-    with pytest.raises(InputError, match=r'data.csv, line 2: .*50.png does not exist; complete'):
+    index.write_text('#timestamp [ns],filename\n50,50.png\n60,60.png\n')
+    with pytest.raises(InputError, match=r'data.csv: 2 of 2 images .* is .*/50.png; complete'):
         opened(tmp_path)
     index.write_text(good + '0,0.png\n')
     with pytest.raises(InputError, match=r'data.csv, line 5: the stamp goes backwards'):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice, pairwise
 
 import cv2
 import numpy as np
 import pytest
+from camera_recordings import opened
 from chessboards import BASELINE_M, K_TRUE, draw, plain_texture
 from chessboards import pose as board_pose
 from stereo_room import CAMERA, StereoRoom, planar_pose
@@ -275,3 +277,58 @@ def test_a_lag_shows_within_fifty_frames_of_motion_however_long_the_camera_stood
     drive = [*standing, *late(frames, 1.0)]
     drive = [replace(f, stamp_ns=round(1e9 * FRAME_S * i)) for i, f in enumerate(drive)]
     assert set(faults(drive)) == {'not_simultaneous'}
+
+
+def both(change: Callable[[np.ndarray], np.ndarray]) -> Callable[..., list[StereoFrame]]:
+    return lambda frames: changed(frames, change)
+
+
+def right(change: Callable[[np.ndarray], np.ndarray]) -> Callable[..., list[StereoFrame]]:
+    return lambda frames: [replace(f, right=change(f.right)) for f in frames]
+
+
+def rolled(image: np.ndarray) -> np.ndarray:
+    centre = image.shape[1] / 2, image.shape[0] / 2
+    M = cv2.getRotationMatrix2D(centre, 2.0, 1.0)  # degrees
+    return cv2.warpAffine(image, M, image.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+
+
+DAMAGES: dict[str, tuple[str, Callable[[list[StereoFrame]], list[StereoFrame]]]] = {
+    'three rows': ('rows_apart', right(lambda image: np.roll(image, 3, axis=0))),
+    'a roll of two degrees': ('rows_apart', right(rolled)),
+    'eyes exchanged': (
+        'eyes_swapped',
+        lambda frames: [replace(f, left=f.right, right=f.left) for f in frames],
+    ),
+    'one image twice': ('same_image', lambda frames: [replace(f, right=f.left) for f in frames]),
+    'an eye upside down': ('different_views', right(lambda image: image[::-1, ::-1].copy())),
+    'a frame late': (
+        'not_simultaneous',
+        lambda frames: [replace(f, right=b.right) for b, f in pairwise(frames)],
+    ),
+    'principal point +5 px': ('principal_points', right(lambda image: np.roll(image, -5, axis=1))),
+    'principal point -5 px': ('principal_points', right(lambda image: np.roll(image, 5, axis=1))),
+    'out of focus': ('blurred', both(lambda image: cv2.GaussianBlur(image, (0, 0), 3))),
+    'a tenth of the light': ('dark', both(lambda image: image // 10)),
+    'one eye darker': ('eyes_differ', right(lambda image: (image / 1.5).astype(np.uint8))),
+}
+"""Of each damage the fault that it is, and what it does to the frames."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('recording', ['corridor', 'library', 'kitti06'])
+def test_each_damage_of_a_real_camera_is_one_line_within_fifty_frames(
+    shared_data, recording
+) -> None:
+    """The eyes of the library's camera start to move after some looks: it is begun there."""
+    source = opened(shared_data / recording)
+    start = 80 if recording == 'library' else 0
+    drive = list(islice(source.frames(), start, start + SETTLED_FRAMES + 1))
+    assert faults(drive, source.camera) == {}
+    for damage, (name, change) in DAMAGES.items():
+        found = faults(change(drive)[:SETTLED_FRAMES], source.camera)
+        assert set(found) == {name}, damage
+        line = found[name].line()
+        assert '\n' not in line
+        assert ';' in line
+        assert name == 'same_image' or any(c.isdigit() for c in line), damage

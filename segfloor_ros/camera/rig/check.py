@@ -83,10 +83,11 @@ class InputFault:
     unit: str
     finding: str
     remedy: str
+    images: str = 'left and right images'
 
-    def line(self, images: str = 'left and right images') -> str:
-        """Return the fault in one line. images: their name."""
-        return f'{images} {self.finding}; {self.remedy}'
+    def line(self, images: str = '') -> str:
+        """Return the fault in one line. images: their name, if they have one of their own."""
+        return f'{images or self.images} {self.finding}; {self.remedy}'
 
 
 FAULTS = {
@@ -115,8 +116,8 @@ FAULTS = {
     ),
     'depth_unaligned': (
         'px',
-        'are not aligned: the edges of depth lie {value:.0f} px beside those of the image, which '
-        'is {scale:.2f} times as large',
+        'are not aligned: the edges of depth fit those of the image best moved by {value:.0f} px '
+        'and {scale:.2f} times as large',
         'give depth that is registered to the image (aligned_depth_to_color, depth_registered)',
     ),
     'not_simultaneous': (
@@ -137,7 +138,7 @@ FAULTS = {
         'have other principal points than their calibration: motion shows that all disparities are '
         '{value:+.1f} px off',
         'take the calibration of this camera, the right eye of which has a principal point of its '
-        'own, or calibrate again (segfloor calibrate)',
+        'own, or calibrate again (segfloor calibrate); the baseline goes with it',
     ),
     'blurred': (
         'px',
@@ -185,6 +186,7 @@ class RigCheck:
         self._point_count = 0
         self._orb = cv2.ORB_create(FEATURES, nlevels=LEVELS)
         self._frame_s = 0.0
+        self._images = InputFault.images
         self._moving_looks = self._watched = 0
         self._has_gap = False
         self._depth = DepthCheck()
@@ -196,7 +198,8 @@ class RigCheck:
         fifty frames, and turns until the calibration is known. turn_rad: since the frame before.
         """
         self._watched += 1
-        is_settled = self._moving_looks >= RECENT and not self.faults
+        is_seen = self._moving_looks >= RECENT or self._depth.is_done
+        is_settled = is_seen and not self.faults
         is_turn = turn_rad * (EVERY // 2) > MIN_TURN_RAD and not self._calibration.is_done
         if is_settled and not is_turn and self._watched % SETTLED_FRAMES >= BURST:
             self._has_gap = True
@@ -210,6 +213,7 @@ class RigCheck:
         """Take in a frame that shows something."""
         is_look = self.frames % EVERY == 0
         if is_disparity(frame.right):
+            self._images = 'image and depth'
             if is_look:
                 self._pictures.append(_picture([frame.left]))
                 self._judge_depth(frame)
@@ -252,7 +256,7 @@ class RigCheck:
     def _found(self, fault: str, value: float, **figures: Any) -> None:
         unit, finding, remedy = FAULTS[fault]
         words = finding.format(value=value, **figures)
-        self.faults[fault] = InputFault(fault, round(value, 2), unit, words, remedy)
+        self.faults[fault] = InputFault(fault, round(value, 2), unit, words, remedy, self._images)
 
     def _found_lag(self, lag_s: float, frame_s: float, late: str, early: str) -> None:
         """Note that one kind of image is late, or early where the lag is negative."""

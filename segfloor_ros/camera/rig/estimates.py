@@ -31,8 +31,10 @@ from segfloor_ros.geometry import Array, se3_exp, skew, transform_points
 WIDTH_PX = 320
 """Images are shrunk to about this width."""
 
-REACH_PX, SCALES, LAGS = 16, (0.92, 0.96, 1.0, 1.04, 1.08), (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""What is tried: shifts of shrunk pixels, sizes, and lags in frames."""
+REACH_PX, LAGS = 16, (-2.0, -1.0, 0.0, 1.0, 2.0)
+SCALES = tuple(1.04**step for step in range(-4, 15))
+"""What is tried: shifts of shrunk pixels, lags in frames, and sizes: the depth of a Kinect is 0.9
+times as large as its image, that of a RealSense D435 1.6 times, before they are registered."""
 
 BESIDE_PX = 2
 """Edges of depth are off by so much in a camera that is aligned: holes lie beside them."""
@@ -107,6 +109,11 @@ class DepthCheck:
     def __init__(self) -> None:
         self._looks: deque[tuple[Array, Array]] = deque(maxlen=MAX_LOOKS)
         self._factor = 1
+
+    @property
+    def is_done(self) -> bool:
+        """Whether as many looks as are kept were taken."""
+        return len(self._looks) == MAX_LOOKS
 
     def look(
         self, image: NDArray[np.uint8], before: NDArray[np.uint8], disparity: NDArray[np.float32]
@@ -253,6 +260,10 @@ class CalibrationCheck:
 
     def _learn(self, then: Array, now: Array) -> None:
         T, x, covariance, noise_px = _fit_motion(self._camera, then, now)
+        if np.median(then[:, 2]) < 0:  # an offset, or the eyes are exchanged
+            then, now = then * (1, 1, -1), now * (1, 1, -1)
+            if _fit_motion(self._camera, then, now)[-1] < noise_px:
+                return
         if noise_px < RETURN_PX:
             self._offsets.append(Measured(float(x[1]), float(covariance[1, 1]) ** 0.5))
             if _turn_rad(T) > MIN_TURN_RAD:

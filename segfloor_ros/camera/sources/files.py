@@ -177,14 +177,24 @@ def file_pair_source(
 
 def read_index(index: Path, parse: Callable[[str, str], Stamped[Path]]) -> list[Stamped[Path]]:
     """Return the images that the lines of a file name, those with `#` in front left out. parse:
-    gets the line and what to call it. Raises InputError, also for stamps that go backwards.
+    gets the line and what to call it. Images that are not there are counted in a warning and left
+    out: a part of a recording often has the list of the whole. Raises InputError where all are
+    missing, and for stamps that go backwards.
     """
     entries: list[Stamped[Path]] = []
     for where, line in read_lines(index):
         entry = parse(line, where)
         check_forward(where, [e.stamp_ns for e in entries[-1:]], entry.stamp_ns)
         entries.append(entry)
-    return entries
+    there = [entry for entry in entries if entry.item.exists()]
+    if len(there) < len(entries):
+        first = next(entry.item for entry in entries if entry not in there)
+        missing = f'{index}: {len(entries) - len(there)} of {len(entries)} images do not exist, '
+        missing += f'the first is {first}'
+        if not there:
+            raise InputError(f'{missing}; complete the copy')
+        logger.warning('%s; they are left out', missing)
+    return there
 
 
 def pairs_by_stamp(

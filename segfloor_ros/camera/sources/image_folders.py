@@ -6,6 +6,7 @@ and depth cameras: depth/ beside the left images, or a sequence of the TUM RGB-D
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
@@ -44,6 +45,8 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_grey
 from segfloor_ros.files.whole import END_NS, nanoseconds, whole_nanoseconds
 from segfloor_ros.geometry import Array, invert, make_transform
+
+logger = logging.getLogger(__name__)
 
 TIME_FILES = ('times.txt', 'timestamps.txt')
 NANOSECOND_DIGITS = len(str(END_NS))
@@ -205,17 +208,23 @@ def _sensors(
     imu, ignored = root / IMU_FOLDER / INDEX, settings.ignored_sensors
     if not imu.exists() or IMU in ignored:
         return folder_sensors(root, ignored, None, imu)
+    T_raw_imu = _T_raw_imu(root, folder)
+    if T_raw_imu is None:
+        logger.warning('%s: no %s says how the IMU is mounted; it is left out', imu.parent, SENSOR)
+        return folder_sensors(root, {*ignored, IMU}, None, imu)
     T_left_raw = make_transform(calibration.left.R, np.zeros(3))
-    return folder_sensors(root, ignored, T_left_raw @ _T_raw_imu(root, folder), imu)
+    return folder_sensors(root, ignored, T_left_raw @ T_raw_imu, imu)
 
 
-def _T_raw_imu(root: Path, folder: Path) -> Array:
-    """Return the IMU's frame in that of the raw left images (4, 4)."""
+def _T_raw_imu(root: Path, folder: Path) -> Array | None:
+    """Return the IMU's frame in that of the raw left images (4, 4), None where no file has it."""
     for chain in (place / name for place in (root, folder) for name in KALIBR_NAMES):
         if chain.exists():
             return read_kalibr_imu(chain)
-    poses = (read_body_pose(root / n / SENSOR) for n in (EUROC_CAMERAS[0], IMU_FOLDER))
-    T_body_left, T_body_imu = poses
+    mounts = [root / name / SENSOR for name in (EUROC_CAMERAS[0], IMU_FOLDER)]
+    if not all(mount.exists() for mount in mounts):
+        return None
+    T_body_left, T_body_imu = (read_body_pose(mount) for mount in mounts)
     return invert(T_body_left) @ T_body_imu
 
 
@@ -235,10 +244,7 @@ def _entry(folder: Path, line: str, where: str) -> Stamped[Path]:
         stamp_ns = whole_nanoseconds(stamp.strip())
     except ValueError as error:
         raise InputError(f'{where}: expected a stamp in ns and a file name ({error})') from None
-    image = folder / (name.strip() or f'{stamp.strip()}.png')
-    if not image.exists():
-        raise InputError(f'{where}: {image} does not exist; complete the copy, or remove the line')
-    return Stamped(stamp_ns, image)
+    return Stamped(stamp_ns, folder / (name.strip() or f'{stamp.strip()}.png'))
 
 
 def _named_by_stamp(images: Iterable[Path]) -> Iterator[Stamped[Path]]:
@@ -400,11 +406,8 @@ def _read_list(index: Path) -> list[Stamped[Path]]:
     def entry(line: str, where: str) -> Stamped[Path]:
         with contextlib.suppress(ValueError):
             seconds, name = line.split()
-            if (index.parent / name).exists():
-                return Stamped(nanoseconds(seconds), index.parent / name)
-        raise InputError(
-            f'{where}: expected a time in seconds and the name of an image that is there'
-        )
+            return Stamped(nanoseconds(seconds), index.parent / name)
+        raise InputError(f'{where}: expected a time in seconds and the name of an image')
 
     entries = files.read_index(index, entry)
     if not entries:
