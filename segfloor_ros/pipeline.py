@@ -17,13 +17,14 @@ from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import Arrays, MapFile
+from segfloor_ros.files.results import Arrays, MapFile, take
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
+from segfloor_ros.grid.keyframe_evidence import LENGTHS
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.semantics.label_map import LABELS, LabelMap, Labels
+from segfloor_ros.semantics.label_map import LABELS, SEEN_LENGTHS, LabelMap, Labels
 from segfloor_ros.semantics.network import ImageLabeller, Network
 from segfloor_ros.slam.results import (
     FrameResult,
@@ -33,7 +34,8 @@ from segfloor_ros.slam.results import (
     SparseCloud,
     StereoSlamSettings,
 )
-from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, save_slam
+from segfloor_ros.slam.saved_slam import PART as SLAM
+from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, prune_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes
 
@@ -167,6 +169,29 @@ class KeyframeStages:
         return self._mapper.grid() if self.map_updates or self._is_loaded else None
 
 
+def prune(saved: MapFile) -> MapFile:
+    """Return a saved map without the views that later ones show again: what its parts know of the
+    keyframes and points that go, goes with them. Raises KeyError, IndexError or ValueError for a
+    map that is damaged.
+    """
+    slam = prune_slam(saved.parts[SLAM])
+    parts = saved.parts | {SLAM: slam}
+    cloud, keyframes = saved.parts['cloud'], slam['keyframe_stamp_ns']
+    parts['cloud'] = take(cloud, np.isin(cloud['point_id'], slam['point_stable_id']), {})
+    for name, lengths in (('grid', LENGTHS), (LABELS, SEEN_LENGTHS)):
+        arrays = saved.parts.get(name, {})
+        of_keyframes = {column: array for column, array in arrays.items() if column != 'names'}
+        if arrays:
+            stays = np.isin(arrays['stamp_ns'], keyframes)
+            parts[name] = arrays | take(of_keyframes, stays, lengths)
+    return MapFile(saved.header, parts)
+
+
+def end_drive(saved: MapFile) -> MapFile:
+    """Return the map as the drive leaves it to the next one: pruned where it is of several."""
+    return prune(saved) if len(saved.header['sessions']) > 1 else saved
+
+
 class Pipeline:
     """SLAM on the calling thread, the other stages on one worker, in the order of the keyframes.
 
@@ -234,12 +259,12 @@ class Pipeline:
         return self.keyframe_stages.grid()
 
     def save(self) -> MapFile:
-        """Return the whole map, once all keyframes are finished. Raises MapError before there is
-        one.
+        """Return the whole map, once all keyframes are finished, as the drive leaves it. Raises
+        MapError before there is one.
         """
         saved = save_slam(self.slam, self.camera)
         saved.parts |= self.keyframe_stages.to_arrays()
-        return saved
+        return end_drive(saved)
 
     def load(self, saved: MapFile, name: str, localize: bool) -> None:
         """Go on with a saved map, before the first frame. localize: it stays as it is. Raises

@@ -1,5 +1,5 @@
 """`segfloor map`: what can be done with saved maps, the files of `--save-map`, without driving:
-look at them, compare them, make one of two.
+look at them, compare them, make one of two, leave out what is old.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from segfloor_ros.grid.map_file import (
     save_map,
 )
 from segfloor_ros.grid.mapper import OccupancyGridMapper
+from segfloor_ros.pipeline import prune
 from segfloor_ros.semantics.label_map import (
     LABELS,
     LabelMap,
@@ -59,7 +60,7 @@ KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
 SPEED = 'type: 1, base: 100.0, multiplier: -1.0'
 """Parameters of Nav2's server for each kind of mask."""
 
-app = typer.Typer(help='Look at saved maps, compare them, make one of two.')
+app = typer.Typer(help='Look at saved maps, compare, merge and prune them.')
 
 FirstMap = Annotated[Path, typer.Argument(metavar='A', help='File of --save-map.')]
 SecondMap = Annotated[Path, typer.Argument(metavar='B', help='File of --save-map.')]
@@ -149,6 +150,24 @@ def merge_maps(
     """
     write_map_file(out, merge(open_map(first), open_map(second)).file)
     typer.echo(f'map: {out}')
+
+
+@app.command('prune')
+def prune_map(
+    path: Annotated[Path, typer.Argument(metavar='FILE', help='File of --save-map.')],
+) -> None:
+    """Leave out what later visits have shown again, and with it what is not there any more, as is
+    done whenever a drive goes on with a map.
+
+    \b
+    segfloor map prune building.map
+    """
+    saved = open_map(path)
+    with _parts_that_fit(saved.name):
+        pruned = prune(saved.file)
+    write_map_file(path, pruned)
+    before, after = (len(file.parts[PART]['keyframe_stamp_ns']) for file in (saved.file, pruned))
+    typer.echo(f'map: {path}, {before} keyframes before, {after} now')
 
 
 @app.command('diff')

@@ -405,6 +405,16 @@ def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
     return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
 
 
+def take(arrays: Arrays, kept: NDArray[np.bool_], lengths: Mapping[str, str]) -> Arrays:
+    """Return the rows of columns (K, ...) that are kept (K,). lengths: of columns that `joined`
+    made by row, the names of those with their lengths; they need not be there. Raises IndexError or
+    ValueError where they do not fit.
+    """
+    there = {name: count for name, count in lengths.items() if name in arrays}
+    of_rows = {name: np.repeat(kept, arrays[count]) for name, count in there.items()}
+    return {name: array[of_rows.get(name, kept)] for name, array in arrays.items()}
+
+
 def check_lengths(arrays: Mapping[str, Sized]) -> None:
     """Raise ValueError unless all arrays have the same length."""
     if len({len(array) for array in arrays.values()}) > 1:

@@ -38,6 +38,9 @@ lies apart."""
 
 LEGEND_ROW_PX, LEAST_SIDE_PX = 22, 600
 
+SEEN_LENGTHS = {'cells': 'cell_count', 'points': 'point_count'}
+"""The arrays of a keyframe, and what holds their lengths."""
+
 
 @dataclass(frozen=True)
 class _Seen:

@@ -235,6 +235,13 @@ def _automatic(picture: Picture, shot: Shot) -> Picture:
     return picture * np.float32(min(gain, MAX_GAIN))
 
 
+def _curved(picture: Picture, shot: Shot) -> Picture:
+    """Grey levels that do not grow in proportion to the light."""
+    if shot.rig.gamma == 1:
+        return picture
+    return np.asarray(WHITE * (np.maximum(picture, 0) / WHITE) ** shot.rig.gamma, np.float32)
+
+
 def _in_steps(picture: Picture, shot: Shot) -> NDArray[np.uint8]:
     """Whole grey levels."""
     return np.clip(np.round(picture), 0, WHITE).astype(np.uint8)
@@ -257,7 +264,8 @@ def _compressed(picture: NDArray[np.uint8], shot: Shot) -> NDArray[np.uint8]:
 
 
 EFFECTS: tuple[Callable[[Any, Shot], Any], ...] = (
-    _off_its_rows, _soft, _vignetted, _lit, _noisy, _automatic, _in_steps, _mosaic, _compressed,
+    _off_its_rows, _soft, _vignetted, _lit, _noisy, _automatic, _curved, _in_steps, _mosaic,
+    _compressed,
 )  # fmt: skip
 """What happens to a picture on its way from the lens, in this order."""
 

@@ -141,11 +141,13 @@ class Ceiling:
 class Lighting:
     """Light. levels: pairs (time in s, brightness) between which the brightness is interpolated;
     empty keeps it at 1. ambient: share of the light that comes from everywhere. sun: how bright a
-    sun shines, whose shadows are hard; it needs a scene without ceiling.
+    sun shines, whose shadows are hard; it needs a scene without ceiling. turn_deg: how far around
+    the vertical the light comes from another side, as at another time of day.
     """
 
     ambient: float = 0.65
     sun: float = 0.0
+    turn_deg: float = 0.0
     levels: tuple[Point, ...] = ()
 
 
@@ -201,6 +203,7 @@ class CameraRig:
     exposure_s: float = 0.0
     rolling_s: float = 0.0
     auto_exposure: float = 0.0
+    gamma: float = 1.0
     vignetting: float = 0.0
     softness_px: float = 0.0
     bayer: bool = False

@@ -42,8 +42,9 @@ RANGES = {
     'hole_share': (0, 1), 'raster_phase': (0, 1),
     'right_gain': (0, 100), 'ambient': (0, 1), 'reflectance': (0, 1), 'shot_noise': (0, 255),
     'rolling_s': (0, 1), 'auto_exposure': (0, 1), 'vignetting': (0, 1), 'softness_px': (0, 100),
-    'jpeg': (0, 100), 'pair_focal': (-0.5, 0.5), 'lag_s': (0, 1), 'drift_s': (0, FARTHEST_M),
-    'flying_share': (0, 1), 'dark_grey': (0, 255), 'shiny_grey': (0, 255),
+    'gamma': (0.1, 10), 'jpeg': (0, 100), 'pair_focal': (-0.5, 0.5), 'lag_s': (0, 1),
+    'drift_s': (0, FARTHEST_M), 'flying_share': (0, 1), 'dark_grey': (0, 255),
+    'shiny_grey': (0, 255),
 }  # fmt: skip
 """Of numbers by name; all others, metres and degrees, are within `FARTHEST_M`."""
 

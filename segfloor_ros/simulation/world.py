@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.errors import SegfloorError
 from segfloor_ros.geometry import Array, quaternion_xyzw
@@ -262,6 +263,8 @@ def _document(world: World, width: int, height: int) -> str:
         ambient=_grey(scene.lighting.ambient),
         diffuse=_grey(diffuse),
         fill=_grey(0.8 * diffuse),
+        key_light=_from((0.45, 0.6, -0.75), scene.lighting),
+        fill_light=_from((-0.7, -0.35, -0.5), scene.lighting),
         sun=_sun(scene.lighting),
         bodies=''.join(world.bodies),
         rig=RIG,
@@ -269,11 +272,18 @@ def _document(world: World, width: int, height: int) -> str:
     )
 
 
+def _from(direction: tuple[float, float, float], lighting: Lighting) -> str:
+    """Return the direction of a light, turned about the vertical."""
+    turn = Rotation.from_euler('Z', lighting.turn_deg, degrees=True)
+    return _numbers(turn.apply(np.array(direction)))
+
+
 def _sun(lighting: Lighting) -> str:
     if lighting.sun == 0:
         return ''
     return (
-        '<light directional="true" castshadow="true" pos="-4 -3 6" dir="0.55 0.4 -0.7" '
+        '<light directional="true" castshadow="true" pos="-4 -3 6" '
+        f'dir="{_from((0.55, 0.4, -0.7), lighting)}" '
         f'ambient="0 0 0" diffuse="{_grey(lighting.sun)}" specular="0 0 0"/>'
     )
 

@@ -16,12 +16,19 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera, WheelPose
 from segfloor_ros.errors import CalibrationError, InputError, MapError
-from segfloor_ros.files.results import Arrays, MapFile, joined, split
+from segfloor_ros.files.results import Arrays, MapFile, joined, split, take
 from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.slam.places.views import views_to_keep
 from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud
-from segfloor_ros.slam.rig import Observations
+from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
-from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, Retirement, SparseMap
+from segfloor_ros.slam.sparse_map import (
+    OF_KEYFRAMES,
+    KeyframeRecord,
+    LoopEdge,
+    Retirement,
+    SparseMap,
+)
 from segfloor_ros.slam.tracking.images import Features
 
 if TYPE_CHECKING:  # which uses this module
@@ -32,6 +39,8 @@ BEFORE_ALL_NS = -MOMENT_NS
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
+OF_KEYFRAME = 'keyframe_', 'feature_', 'word'
+"""How the names of arrays begin that hold something for each keyframe."""
 LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
 
 LOST_IDS = 1_000_000
@@ -218,6 +227,60 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
     by_floor = arrays.get('loop_by_floor', np.zeros(len(ends), bool)).tolist()
     of_loops = zip(ends, T_i_j, by_floor, strict=True)
     sparse_map.loops += [LoopEdge(i, j, T, by) for (i, j), T, by in of_loops]
+
+
+def prune_slam(arrays: Arrays) -> Arrays:
+    """Return a map without the keyframes whose views later ones show again (`views_to_keep`), nor
+    the points that no other keyframe observes: what was taken away goes with the views that showed
+    it, and so does what looks different in today's light. Raises KeyError, IndexError or ValueError
+    for arrays that are no map.
+    """
+    poses, follows = arrays['keyframe_T_camera_world'], arrays['keyframe_follows']
+    numbers = np.arange(len(poses))
+    root = np.where(follows == NO_POINT, numbers, follows)
+    stands_in = views_to_keep(poses, _depth_m(arrays)[root], follows == NO_POINT)
+    stays = stands_in == numbers
+    number = (np.cumsum(stays) - 1)[stands_in].astype(np.int32)
+    by_keyframe = {n: a for n, a in arrays.items() if n.startswith(OF_KEYFRAME)}
+    of_features = dict.fromkeys(
+        (n for n in arrays if n.startswith('feature_')), 'keyframe_features'
+    )
+    links_and_words = {'keyframe_links': 'keyframe_link_count', 'words': 'word_count'}
+    pruned = arrays | take(by_keyframe, stays, of_features | links_and_words)
+
+    alive, point = np.unique(pruned['feature_point'], return_inverse=True)
+    pruned['feature_point'] = point.astype(np.int32)
+    pruned |= {n: array[alive] for n, array in arrays.items() if n.startswith('point_')}
+    pruned |= {f'point_{name}': number[pruned[f'point_{name}']] for name in OF_KEYFRAMES}
+
+    linking = np.repeat(numbers, arrays['keyframe_link_count'])
+    links = np.sort(number[np.column_stack([arrays['keyframe_links'], linking])], axis=1)
+    links = np.unique(links[links[:, 0] < links[:, 1]][:, ::-1], axis=0)
+    pruned['keyframe_links'] = links[:, 1]
+    pruned['keyframe_link_count'] = np.bincount(links[:, 0], minlength=stays.sum())
+
+    holder = stands_in[root[stays]]
+    pruned['keyframe_follows'] = np.where(follows[stays] == NO_POINT, NO_POINT, number[holder])
+    pruned['keyframe_T_camera_followed'] = poses[stays] @ invert(poses[holder])
+
+    ends = arrays['loop_ends']
+    i, j = stands_in[ends].T
+    to_i, from_j = poses[i] @ invert(poses[ends[:, 0]]), poses[ends[:, 1]] @ invert(poses[j])
+    loops = np.unique(number[ends], axis=0, return_index=True)[1]
+    loops = loops[i[loops] != j[loops]]
+    pruned['loop_ends'] = number[ends][loops]
+    pruned['loop_T_i_j'] = (to_i @ arrays['loop_T_i_j'] @ from_j)[loops]
+    if 'loop_by_floor' in arrays:
+        pruned['loop_by_floor'] = arrays['loop_by_floor'][loops]
+    return pruned
+
+
+def _depth_m(arrays: Arrays) -> Array:
+    """Return the median depth (K,) of what the keyframes of a map observe."""
+    observed = split(arrays['feature_point'], arrays['keyframe_features'])
+    seen = zip(observed, arrays['keyframe_T_camera_world'], strict=True)
+    depths = [transform_points(T, arrays['point_xyz_world'][ids])[:, 2] for ids, T in seen]
+    return np.array([max(np.median(z), MIN_DEPTH_M) if len(z) else MIN_DEPTH_M for z in depths])
 
 
 def moved(arrays: Arrays, T_new_old: Array) -> Arrays:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import segfloor
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoCamera
@@ -18,11 +19,11 @@ from segfloor_ros.cli.maps import (
 )
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.files.results import from_bytes, to_bytes
+from segfloor_ros.files.results import from_bytes, to_bytes, write_map_file
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
-from segfloor_ros.grid.map_file import FREE
-from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.grid.map_file import FREE, OCCUPIED
+from segfloor_ros.pipeline import Pipeline, prune
 from segfloor_ros.slam.saved_slam import loaded_map
 
 OTHER_CAMERA = StereoCamera(320, 240, 163.0, 162.0, 157.0, 120.5, 0.125)
@@ -106,9 +107,10 @@ def test_points_of_the_second_map_are_as_high_above_their_floor_as_before(first,
     assert np.median(gap_m) < 1e-5
 
 
-def test_a_robot_goes_on_with_a_merged_map(merged):
+@pytest.mark.parametrize('finish', [lambda saved: saved, prune], ids=['merged', 'pruned'])
+def test_a_robot_goes_on_with_a_merged_map(merged, finish):
     pipeline = Pipeline(CAMERA, resolve(assignments=[]))
-    pipeline.load(from_bytes(to_bytes(merged.file), 'x'), 'x', localize=True)
+    pipeline.load(from_bytes(to_bytes(finish(merged.file)), 'x'), 'x', localize=True)
     room, results = StereoRoom(0), []
     for k, pose in enumerate(BESIDE):
         results += pipeline.process(room.frame(k, pose))
@@ -158,6 +160,40 @@ def test_what_has_come_and_what_has_gone(first):
         assert {APPEARED_BGR, GONE_BGR} & set(map(tuple, colours.tolist())) == {
             APPEARED_BGR if sign > 0 else GONE_BGR
         }
+
+
+def test_what_is_gone_goes_with_the_views_that_showed_it(first, second, tmp_path):
+    xy_m = np.array([2.0, -1.2])  # where the second drive looks, but not from near
+    whole = merge(with_post(first, xy_m), second)
+    path = tmp_path / 'whole.map'
+    write_map_file(path, whole.file)
+    said = segfloor('map', 'prune', path)
+    pruned = open_map(path)
+    counts = [len(m.slam['keyframe_stamp_ns']) for m in (whole, pruned)]
+    assert f'{counts[0]} keyframes before, {counts[1]} now' in said.stdout
+    assert counts[1] <= 0.7 * counts[0]
+    assert len(pruned.slam['point_stable_id']) < len(whole.slam['point_stable_id'])
+    at = xy_m[None] + 0.02
+    for saved, stands in ((whole, True), (pruned, False)):
+        grid = saved.grid()
+        assert (grid.cells[tuple(grid.cells_of(at)[0])] == OCCUPIED) == stands
+    free_m2 = [m.facts()['free_m2'] for m in (whole, pruned)]
+    assert free_m2[1] > 0.9 * free_m2[0]
+
+
+def test_stages_agree_on_what_is_left_of_a_pruned_map(merged):
+    pruned = prune(merged.file)
+    slam, parts = pruned.parts['slam'], pruned.parts
+    np.testing.assert_array_equal(parts['cloud']['point_id'], slam['point_stable_id'])
+    assert np.isin(parts['grid']['stamp_ns'], slam['keyframe_stamp_ns']).all()
+    assert len(evidence_from_arrays(parts['grid'])) == len(parts['grid']['stamp_ns'])
+    again = prune(pruned)
+    for name, arrays in parts.items():
+        for column, array in arrays.items():
+            np.testing.assert_allclose(again.parts[name][column], array, atol=1e-9)
+    # What stays lies where it was.
+    row = np.searchsorted(merged.slam['point_stable_id'], slam['point_stable_id'])
+    np.testing.assert_array_equal(slam['point_xyz_world'], merged.slam['point_xyz_world'][row])
 
 
 def test_what_stands_beside_what_stood_has_not_come(first):

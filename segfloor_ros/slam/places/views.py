@@ -188,6 +188,28 @@ def novelty(T_known_now: Array, median_depth_m: float) -> Array:
     return np.maximum(moved_m / (NEW_MOTION_RATIO * median_depth_m), turned_rad / NEW_TURN_RAD)
 
 
+def views_to_keep(
+    T_camera_world: Array, depth_m: Array, may_stand_in: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Return for each view (K, 4, 4) of a map, the oldest first, which sees things at about depth_m
+    (K,), the view that stands for it: itself, or where a later visit shows the same, the nearest
+    of that visit that may (K,). Views then grow with the area, not with the visits. The first one
+    stays, since it holds the map.
+    """
+    stands_in, centres = np.arange(len(depth_m)), invert(T_camera_world)[:, :3, 3]
+    reach_m = SECOND_VISIT * NEW_MOTION_RATIO * depth_m
+    for k in reversed(range(1, len(depth_m))):
+        later = k + np.flatnonzero(np.linalg.norm(centres[k:] - centres[k], axis=1) < reach_m[k])
+        new = novelty(T_camera_world[later] @ invert(T_camera_world[k]), float(depth_m[k]))
+        later, new = later[new < SECOND_VISIT], new[new < SECOND_VISIT]
+        # The views of one visit follow each other.
+        again = later - k > np.arange(len(later))
+        again &= may_stand_in[later] & (stands_in[later] == later)
+        if again.any():
+            stands_in[k] = later[again][new[again].argmin()]
+    return stands_in
+
+
 class GroundViews:
     """Takes views of the floor with the camera of a rig."""
 

@@ -6,7 +6,13 @@ from hand_made_maps import WALL, row_of_views
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import se3_exp
-from segfloor_ros.slam.places.views import SECOND_VISIT, covered_share, view_novelty, views_near
+from segfloor_ros.slam.places.views import (
+    SECOND_VISIT,
+    covered_share,
+    view_novelty,
+    views_near,
+    views_to_keep,
+)
 from segfloor_ros.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.slam.rig import NEIGHBOURS
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -44,6 +50,42 @@ def test_near_views_come_nearest_first_and_not_beyond_reach():
     near = views_near(sparse_map, camera_at(0.62), 2.0, 99)
     np.testing.assert_array_equal(np.sort(near), [0, 1, 2, 3, 4, 5])
     assert len(views_near(sparse_map, turned(2.0), 2.0, 99)) == 0
+
+
+def kept_of(x_m, is_alive=True):
+    """Return which of the views at some places of a corridor, one after the other, stay, and what
+    stands for each. What they see is 2 m away: a view is new after 8 cm.
+    """
+    poses = np.array([camera_at(x) for x in x_m])
+    alive = np.broadcast_to(is_alive, len(poses))
+    stands_in = views_to_keep(poses, np.full(len(poses), 2.0), alive)
+    return np.flatnonzero(stands_in == np.arange(len(poses))).tolist(), stands_in
+
+
+def test_views_of_one_visit_stay_and_those_that_a_later_one_shows_again_go():
+    there = np.arange(0.0, 3.0, 0.1)
+    every, _ = kept_of(there)
+    assert every == list(range(30))
+    back = there[::-1][:20] - 0.03
+    kept, stands_in = kept_of([*there, *back])
+    # It came back to 0.97 m; what is within 24 cm of the turn is one visit.
+    assert kept == [*range(8), *range(27, 50)]
+    assert stands_in[15] == 44  # at 1.5 m and 1.47 m
+
+
+def test_views_do_not_grow_with_the_visits():
+    there = np.arange(0.0, 3.0, 0.1)
+    laps = [np.concatenate([there, there[::-1]]) + 0.004 * k for k in range(6)]
+    counts = [len(kept_of(np.concatenate(laps[:k]))[0]) for k in (1, 2, 6)]
+    assert counts[2] < 1.15 * counts[0]
+    assert counts[2] - counts[1] <= 2
+
+
+def test_a_view_without_points_stands_for_none():
+    there = np.arange(0.0, 3.0, 0.1)
+    alive = np.arange(60) < 30
+    kept, _ = kept_of([*there, *there], alive)
+    assert kept == list(range(60))
 
 
 @pytest.mark.parametrize(('depth_m', 'xyz'), SCENES)
