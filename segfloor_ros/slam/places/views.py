@@ -80,13 +80,17 @@ def views_near(
     """Return up to `limit` keyframes that a camera which sees things at about `depth_m` stands
     near to and looks the same way as, the nearest first.
     """
-    relative = _from_views(sparse_map, T_camera_world)
-    turned_rad = rotation_angle(relative[:, :3, :3])
-    moved_m = np.linalg.norm(relative[:, :3, 3], axis=1)
+    return _nearest(sparse_map, _from_views(sparse_map, T_camera_world), depth_m)[:limit]
+
+
+def _nearest(sparse_map: SparseMap, T_views_now: Array, depth_m: float) -> NDArray[np.intp]:
+    """Return the keyframes within reach of a camera, by the motions (K, 4, 4) to it."""
+    turned_rad = rotation_angle(T_views_now[:, :3, :3])
+    moved_m = np.linalg.norm(T_views_now[:, :3, 3], axis=1)
     distance = np.maximum(moved_m / (REACH[0] * depth_m), turned_rad / REACH[1])
     distance[[k.retired is not None for k in sparse_map.keyframes]] = np.inf
     order = np.argsort(distance, kind='stable')
-    return order[distance[order] < 1.0][:limit]
+    return order[distance[order] < 1.0]
 
 
 def view_novelty(
@@ -104,11 +108,14 @@ def view_novelty(
     latest = len(sparse_map.keyframes) - 1
     recent, shared = sparse_map.covisible(ids)
     recent = recent[(recent > latest - NEIGHBOURS) & (shared >= ALIKE_SHARE * len(ids))]
-    around = views_near(sparse_map, T_camera_world, depth_m, len(sparse_map.keyframes))
-    new = novelty(_from_views(sparse_map, T_camera_world), depth_m)
+    T_views_now = _from_views(sparse_map, T_camera_world)
+    new = novelty(T_views_now, depth_m)
     nearest = float(new[np.append(recent, latest)].min())
+    if nearest <= 1:
+        return nearest
+    around = _nearest(sparse_map, T_views_now, depth_m)
     earlier = around[(around <= latest - NEIGHBOURS) & (new[around] < SECOND_VISIT)]
-    if nearest <= 1 or len(earlier) == 0:
+    if len(earlier) == 0:
         return nearest
     known = np.isin(ids, sparse_map.points_of(earlier)).mean()
     views = [sparse_map.keyframes[k].T_camera_world for k in earlier]
