@@ -114,8 +114,9 @@ class Costmap:
         trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
-        standing = (grid.cells >= OCCUPIED) | marked
+        standing = (grid.cells >= OCCUPIED) | (marked & ~trodden)
         standing &= ~self._discs(driven[-1:], radius_m / 2)
+        self._trodden = trodden
         self.free = ((grid.cells == FREE) | trodden) & ~standing
         unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
         dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -158,6 +159,13 @@ class Costmap:
         heading = pose[2] + turned
         arc = pose[:2] + chord_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return float(self.room_m[tuple(self._on_map(arc).T)].min(initial=np.inf))
+
+    def untrodden(self, points: Array) -> Array:
+        """Return the points (N, 2) where the robot has not been."""
+        cells = self.grid.cells_of(np.reshape(points, (-1, 2)))
+        inside = self.grid.holds(cells)
+        inside[inside] = ~self._trodden[tuple(cells[inside].T)]
+        return points[inside]
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -299,9 +307,11 @@ class Explorer:
         assert self.grid is not None
         away_m = np.hypot(*(self.path - pose[:2]).T)
         ahead = self.path[away_m < self.body.radius_m + LOOKAHEAD_S * self.body.speed_m_s]
+        if not len(ahead):
+            return False
         occupied = self.grid.centres_of(np.argwhere(self.grid.cells >= OCCUPIED))
-        standing = np.vstack([self.obstacles, occupied])
-        if not len(ahead) or not len(standing):
+        standing = np.vstack([self._costmap.untrodden(self.obstacles), occupied])
+        if not len(standing):
             return False
         return bool(np.min(cKDTree(ahead).query(standing)[0]) < self.body.radius_m)
 
