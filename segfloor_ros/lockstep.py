@@ -35,7 +35,14 @@ from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_d
 from segfloor_ros.pipeline import CAMERA_AS_BASE, Pipeline
 from segfloor_ros.semantics.network import Network
 from segfloor_ros.slam.mapping.back_end import Submap
-from segfloor_ros.slam.results import MAJORITY, FrameResult, Keyframe, KeyframePath, lost_frame
+from segfloor_ros.slam.results import (
+    MAJORITY,
+    FrameResult,
+    Keyframe,
+    KeyframePath,
+    left_out,
+    lost_frame,
+)
 from segfloor_ros.slam.saved_slam import check_camera, new_keyframes
 from segfloor_ros.timing import MemoryLog
 from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory
@@ -202,6 +209,7 @@ class LockstepRun:
             self._say_faults()
             for result in self._attempt(self._frames, self._pipeline.finish_tracking) or []:
                 self._note(result)
+            self._leave_out_unmapped()
             grid = self._pipeline.finish()
             self._say_faults()
         finally:
@@ -225,6 +233,14 @@ class LockstepRun:
             self._configuration,
             stages.labels(grid),
         )
+
+    def _leave_out_unmapped(self) -> None:
+        """Leave out what was mapped before the map began: a larger submap took its place."""
+        if self._map_options.load is None and len(self._path.stamp_ns):
+            began = self._path.stamp_ns[0]
+            self._results = [
+                left_out(r) if r.tracked and r.stamp_ns < began else r for r in self._results
+            ]
 
     @property
     def _known_mount(self) -> Mount | None:

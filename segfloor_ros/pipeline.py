@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -232,11 +232,7 @@ class Pipeline:
         results = self.slam.process(frame)
         if self.labeller is not None and self.labeller.is_late:
             self._add_late_mask(frame)
-        for result in results:
-            if result.keyframe is not None and self.path_only:
-                self.keyframe_stages.note_points(result.keyframe.cloud)
-            elif result.keyframe is not None:
-                self._submit(result.keyframe)
+        self._take_in(results)
         return results
 
     def finish_tracking(self) -> list[FrameResult]:
@@ -246,10 +242,15 @@ class Pipeline:
         if self.mount is None:
             self.path_only, self.slam.rig.mount = True, CAMERA_AS_BASE
         results = self.slam.finish()
-        keyframes = [result.keyframe for result in results if result.keyframe is not None]
-        if keyframes and self.path_only:
-            self.keyframe_stages.note_points(keyframes[-1].cloud)
+        self._take_in(results)
         return results
+
+    def _take_in(self, results: Sequence[FrameResult]) -> None:
+        for result in results:
+            if result.keyframe is not None and self.path_only:
+                self.keyframe_stages.note_points(result.keyframe.cloud)
+            elif result.keyframe is not None:
+                self._submit(result.keyframe)
 
     def finish(self) -> OccupancyGrid | None:
         """Wait for the last keyframe and return the map, or None when there was no keyframe."""

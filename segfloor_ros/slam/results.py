@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # the nodes behind SLAM do without SciPy
     from segfloor_ros.slam.tracking.images import Features
     from segfloor_ros.slam.tracking.pose import PoseEstimate
 
+NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
+
 UNKNOWN_COVARIANCE = 1e6
 NO_POINT = -1
 """Id of a feature that has no map point."""
@@ -244,6 +246,22 @@ def lost_frame(frame: StereoFrame) -> FrameResult:
     )
 
 
+def left_out(result: FrameResult) -> FrameResult:
+    """Return what is left of a frame of a submap that was not recognised in the map by the end, or
+    of a map that a larger submap was not recognised in.
+    """
+    return replace(
+        result,
+        tracked=False,
+        covariance=np.eye(6) * UNKNOWN_COVARIANCE,
+        state=f'lost: {NOT_RECOGNISED}',
+        keyframe=None,
+        moving=None,
+        blind=False,
+        in_submap=result.in_submap or result.tracked,
+    )
+
+
 def turned(points: MovingPoints, T: Array) -> MovingPoints:
     """Return points and velocities in another frame, T (4, 4)."""
     return MovingPoints(
@@ -338,6 +356,15 @@ class HeldResults:
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
         """Change the results that are held of a submap."""
         self._held = [change(result) if result.in_submap else result for result in self._held]
+
+    def keep_submap(self, in_its_map: Callable[[FrameResult], FrameResult]) -> None:
+        """Make the submap the map: what was held before it is in none. in_its_map: brings a result
+        of the submap up to date.
+        """
+        self._held = [
+            replace(in_its_map(held), in_submap=False) if held.in_submap else left_out(held)
+            for held in self._held
+        ]
 
     def release(self, mount: Mount | None) -> list[FrameResult]:
         """Return the results in ROS frames, oldest first; none while the mount is unknown."""

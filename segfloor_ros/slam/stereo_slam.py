@@ -31,6 +31,7 @@ from segfloor_ros.slam.results import (
     StereoSlamSettings,
     Track,
     in_merged_map,
+    left_out,
     take_snapshot,
 )
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, Rig
@@ -56,7 +57,6 @@ SUBMAP_WORDS = {
     Submap.LOST: ', mapped before the map was recognised',
     Submap.OUTSIDE: ', outside the loaded map',
 }
-NOT_RECOGNISED = 'mapped, but no place of the map was recognised'
 UNSURE_M = 0.005
 """A place that the images leave more uncertain than this is said to be."""
 
@@ -212,11 +212,18 @@ class StereoSlam:
         return self._held.take(result, self.mount)
 
     def finish(self) -> list[FrameResult]:
-        """Return the results that are still held back after the last frame: as lost, for no place
-        of the map was recognised since.
+        """Return the results that are still held back after the last frame. Of a map and a submap
+        that was not recognised in it the larger one stays, and frames of the other are in none
+        (`left_out`): those that were returned before, where the map begins after them. A map that
+        was loaded stays.
         """
         if self.back_end.submap is Submap.LOST:
-            self._drop_submap()
+            self._take_adjustment(wait=True)
+            if not self.sessions and self.back_end.keep_submap():
+                T_world_odom = self.front_end.motion.T_world_odom
+                self._held.keep_submap(in_merged_map(self.map, T_world_odom))
+            else:
+                self._drop_submap()
         return self._held.release(self.mount)
 
     def to_arrays(self) -> Arrays:
@@ -302,7 +309,7 @@ class StereoSlam:
         self.back_end.drop_submap()
         self.front_end.reset()
         self._moving = self._moving and MovingRegions(self._camera)
-        self._held.change(_lost)
+        self._held.change(left_out)
 
     def _add_keyframe(
         self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
@@ -419,19 +426,6 @@ def _carried(result: FrameResult, motion: CameraMotion, covariance: Array) -> Fr
         T_odom_base=invert(expected.T_camera_world @ motion.T_world_odom),
         covariance=covariance - motion.covariance + expected.covariance,
         state=REPEATED,
-    )
-
-
-def _lost(result: FrameResult) -> FrameResult:
-    """Return what is left of a frame where the map was, in the end, not recognised."""
-    return replace(
-        result,
-        tracked=False,
-        covariance=np.eye(6) * UNKNOWN_COVARIANCE,
-        state=f'lost: {NOT_RECOGNISED}',
-        keyframe=None,
-        moving=None,
-        blind=False,
     )
 
 

@@ -152,6 +152,13 @@ class BackEnd:
         known.restore(arrays)
         self._reset_places(arrays)
 
+    def keep_submap(self) -> bool:
+        """Give the known map up, where the submap has more keyframes. Returns whether it did."""
+        if self._known is None or len(self._map.keyframes) <= self._known.num_keyframes:
+            return False
+        self._known, self.submap = None, Submap.KNOWN
+        return True
+
     def _reset_places(self, words: Arrays | None = None) -> None:
         self._global.reset()
         self.places.reset()

@@ -248,6 +248,11 @@ class KnownMap:
         self._relocaliser = Relocaliser(self._map, self._places)
         self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
 
+    @property
+    def num_keyframes(self) -> int:
+        """How large the known map is."""
+        return len(self._map.keyframes)
+
     def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
         anywhere = np.ones(len(self._map.keyframes), bool)

@@ -121,6 +121,26 @@ def test_a_submap_that_is_never_recognised_is_not_in_the_map():
     )
 
 
+def test_of_two_that_were_not_joined_the_larger_is_the_map():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    way = [planar_pose(0.03 * k, 0.0, 0.03 * k) for k in range(60)]
+    poses = KNOWN + way
+    drive(slam, KNOWN)
+    batches = drive(slam, way, len(KNOWN), StereoRoom(seed=77))
+    assert slam.back_end.submap is Submap.LOST and batches[-1] == []
+    rest = slam.finish()
+    mapped = [r for r in rest if r.tracked]
+    began = slam.map.keyframes[0].stamp_ns
+    assert len(mapped) > len(KNOWN) and began == mapped[0].stamp_ns
+    assert [r.index for r in mapped] == list(range(mapped[0].index, len(poses)))
+    assert not any(r.in_submap for r in rest) and any(r.keyframe for r in rest)
+    by_truth = [invert(poses[mapped[0].index]) @ poses[r.index] for r in mapped]
+    seen = [r.T_map_odom @ r.T_odom_base for r in mapped]
+    off = [invert(true) @ invert(seen[0]) @ pose for true, pose in zip(by_truth, seen, strict=True)]
+    assert np.linalg.norm(np.array(off)[:, :3, 3], axis=1).max() < 0.04
+    assert slam.to_arrays()['keyframe_stamp_ns'][0] == began
+
+
 def test_a_map_that_had_hardly_begun_is_given_up():
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     first, poses = len(KNOWN[:5]), KNOWN[:5] + BEHIND + TURN
