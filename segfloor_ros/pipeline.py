@@ -187,11 +187,6 @@ def prune(saved: MapFile) -> MapFile:
     return MapFile(saved.header, parts)
 
 
-def end_drive(saved: MapFile) -> MapFile:
-    """Return the map as the drive leaves it to the next one: pruned where it is of several."""
-    return prune(saved) if len(saved.header['sessions']) > 1 else saved
-
-
 class Pipeline:
     """SLAM on the calling thread, the other stages on one worker, in the order of the keyframes.
 
@@ -260,12 +255,12 @@ class Pipeline:
         return self.keyframe_stages.grid()
 
     def save(self) -> MapFile:
-        """Return the whole map, once all keyframes are finished, as the drive leaves it. Raises
-        MapError before there is one.
+        """Return the whole map, once all keyframes are finished. Raises MapError before there is
+        one.
         """
         saved = save_slam(self.slam, self.camera)
         saved.parts |= self.keyframe_stages.to_arrays()
-        return end_drive(saved)
+        return saved
 
     def load(self, saved: MapFile, name: str, localize: bool) -> None:
         """Go on with a saved map, before the first frame. localize: it stays as it is. Raises

@@ -4,7 +4,7 @@
 
 Two rooms with a door between. From day to day about half of the furniture is moved, and with
 `--light` it is day, evening or lamplight. Each drive goes on with the map of the one before. It is
-rendered once; `--every-map` keeps the map of each day.
+rendered once; `--every-map` keeps the map of each day, `--prune` prunes it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from segfloor_ros.evaluation.maps import load_truth, resample
 from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
 from segfloor_ros.geometry import Array
 from segfloor_ros.grid.map_file import FREE, OCCUPIED, OccupancyGrid
-from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.pipeline import Pipeline, prune
 from segfloor_ros.simulation.scene_file import scene_from_mapping
 from segfloor_ros.simulation.simulation import render_once
 from segfloor_ros.slam.mapping.back_end import Submap
@@ -190,6 +190,7 @@ def main(
     light: Annotated[bool, typer.Option(help='It is day, evening or lamplight.')] = False,
     seed: Annotated[int, typer.Option(help='Of the furniture.')] = 1,
     every_map: Annotated[bool, typer.Option(help='Keep the map of each day.')] = False,
+    pruned: Annotated[bool, typer.Option('--prune', help='Prune the map after each day.')] = False,
 ) -> None:
     """Render, drive and print a table."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -204,7 +205,7 @@ def main(
         saved, row = drive_session(drive, saved, folder / 'day_01')
         if every_map:
             path = folder / f'day_{number:02}.map'
-        write_map_file(path, saved)
+        write_map_file(path, prune(saved) if pruned else saved)
         saved = read_map_file(path)
         print(f'{row} | {path.stat().st_size / 1e6:.2f}', flush=True)
 

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,6 @@ from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import CameraWatch
-from segfloor_ros.pipeline import end_drive
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
@@ -380,7 +380,7 @@ class SlamMaps:
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
-            await _in_background(lambda: write_map_file(path, end_drive(saved)))
+            await _in_background(partial(write_map_file, path, saved))
         finally:
             self._node.destroy_timer(give_up)
             self._arrived, self._parts = None, {}
