@@ -436,3 +436,24 @@ def test_a_report_names_its_colours_and_the_length_of_the_path(result, tmp_path)
         assert re.search(f'<span class="colour" style="background: rgb[^"]*"></span>{name}', page)
     # room_drive: 6 cm a frame.
     assert f'<b>{0.06 * (FRAMES - 1):.1f} m</b><span>of path' in page
+
+
+def test_the_larger_of_two_parts_that_were_not_joined_is_the_map(tmp_path):
+    rooms = StereoRoom(), StereoRoom(seed=77)
+    lengths = 20, 60
+    places = [(room, k) for room, n in zip(rooms, lengths, strict=True) for k in range(n)]
+    frames = [
+        room.frame(i, planar_pose(0.03 * k, 0.0, 0.03 * k)) for i, (room, k) in enumerate(places)
+    ]
+    drive, out = write_kitti(tmp_path / 'drive', frames), tmp_path / 'out'
+    done = segfloor('run', drive, '--out', out, *with_mount())
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / 'summary.json').read_text())
+    first, last = 0, lengths[0] - 1
+    assert summary['submaps'] == [{'first_frame': first, 'last_frame': last, 'merged': False}]
+    ((lost_from, lost_to),) = summary['lost_intervals']
+    assert lost_from == 0 and last < lost_to < lengths[0] + 20
+    written = np.loadtxt(out / 'trajectory.txt')
+    assert len(written) == summary['tracked_frames'] == sum(lengths) - lost_to - 1
+    assert written[0, 0] == pytest.approx(frames[lost_to + 1].stamp_ns * 1e-9)
+    assert summary['map_updates'] >= summary['keyframes'] > 2
