@@ -345,11 +345,17 @@ class LockstepRun:
 
     def _note(self, result: FrameResult) -> None:
         if self._save_masks is SaveMasks.all:
-            frame = self._pipeline.slam.rig_check.corrected(self._unmasked.pop(result.index))
+            frame = self._pipeline.slam.rig_check.corrected(self._unmasked[result.index])
             self._attempt(frame.index, partial(self._mask_frame, frame, result))
+            if not self._pipeline.slam.may_remap:
+                self._unmasked = {
+                    i: later for i, later in self._unmasked.items() if i > result.index
+                }
         if result.keyframe is not None:
             self._path = new_keyframes(result.keyframe.path)
             result = dataclasses.replace(result, keyframe=None)
+        if self._results and result.index <= self._results[-1].index:
+            self._results = [one for one in self._results if one.index < result.index]
         self._results.append(result)
 
     def _mask_frame(self, frame: StereoFrame, result: FrameResult) -> None:

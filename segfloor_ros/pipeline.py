@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,10 +80,7 @@ class KeyframeStages:
             height_m, own = configuration.floor_segmentation.robot_height_m, labeller.network
             classes, moves = own.settings.classes, own.settings.moves
             self._label_map = LabelMap(camera, classes, height_m, moves)
-        has_mount = configuration.stereo_slam.has_mount
-        self.floor = FloorSegmentation(
-            camera, configuration.floor_segmentation, checks_mount=has_mount
-        )
+        self.floor = FloorSegmentation(camera, configuration.floor_segmentation)
         self._labelling = CloudLabelling(configuration.cloud_labelling)
         self._mapper = OccupancyGridMapper(configuration.occupancy_grid)
 
@@ -211,7 +209,10 @@ class Pipeline:
         mount = CAMERA_AS_BASE if path_only and not configuration.stereo_slam.has_mount else None
         self.slam = make_slam(camera, configuration.stereo_slam, mount, self.times)
         self.labeller = None if network is None else ImageLabeller(network, self.times)
-        self.keyframe_stages = KeyframeStages(camera, configuration, self.times, self.labeller)
+        self._make_stages = partial(
+            KeyframeStages, camera, configuration, self.times, self.labeller
+        )
+        self.keyframe_stages, self._mapped_with = self._make_stages(), self.mount
         self.failed_keyframes, self.fault = 0, ''
         self._on_keyframe = on_keyframe
         self._worker = ThreadPoolExecutor(1, 'keyframes')
@@ -225,6 +226,8 @@ class Pipeline:
     def process(self, frame: StereoFrame) -> list[FrameResult]:
         """Take in the next frame; returns the tracking results that are ready, oldest first."""
         results = self.slam.process(frame)
+        if self.mount != self._mapped_with:
+            self._begin_map()
         if self.labeller is not None and self.labeller.is_late:
             self._add_late_mask(frame)
         self._take_in(results)
@@ -249,8 +252,7 @@ class Pipeline:
 
     def finish(self) -> OccupancyGrid | None:
         """Wait for the last keyframe and return the map, or None when there was no keyframe."""
-        while self._pending:
-            self._pending.popleft().result()
+        self._wait()
         self._worker.shutdown()
         return self.keyframe_stages.grid()
 
@@ -267,6 +269,7 @@ class Pipeline:
         InputError, by the file's name, for one that is damaged or of another camera.
         """
         loaded = load_slam(self.slam, self.camera, saved, name, localize)
+        self._mapped_with = self.mount
         self.keyframe_stages.load(saved.parts, loaded, name)
 
     def close(self) -> None:
@@ -281,15 +284,26 @@ class Pipeline:
             mask = self.labeller.moving(frame.stamp_ns, frame.left)
             self.slam.late_masks.add(frame.stamp_ns, mask)
 
+    def _begin_map(self) -> None:
+        """Begin the map anew: all results come once more where the mount has changed."""
+        if self._mapped_with is not None:
+            self._wait()
+            self.keyframe_stages = self._make_stages()
+        self._mapped_with = self.mount
+
+    def _wait(self) -> None:
+        while self._pending:
+            self._pending.popleft().result()
+
     def _submit(self, keyframe: Keyframe) -> None:
         while len(self._pending) >= MAX_KEYFRAMES_UNDER_WAY:
             self._pending.popleft().result()
         self._pending.append(self._worker.submit(self._process_keyframe, keyframe))
 
     def _process_keyframe(self, keyframe: Keyframe) -> None:
-        assert self.mount is not None
+        assert self._mapped_with is not None
         try:
-            floor = self.keyframe_stages.process(keyframe, self.mount)
+            floor = self.keyframe_stages.process(keyframe, self._mapped_with)
             if self._on_keyframe is not None:
                 self._on_keyframe(keyframe, floor)
         except Exception as error:
@@ -329,4 +343,6 @@ def make_slam(
             forward_m=settings.camera_forward_m,
             left_m=settings.camera_left_m,
         )
+    elif mount is not CAMERA_AS_BASE:
+        meter = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m, given=mount)
     return StereoSlam(camera, settings, mount, meter, times, background)

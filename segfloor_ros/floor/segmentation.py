@@ -75,7 +75,6 @@ from segfloor_ros.floor.observation import (
     FloorSegmentationSettings,
     VDisparity,
 )
-from segfloor_ros.floor.plane.mount import MountCheck
 from segfloor_ros.floor.plane.plane import Fixture, expectations, plane_of_frame
 from segfloor_ros.floor.scan import FloorScanner, OverheadMatcher
 from segfloor_ros.geometry import Array
@@ -105,8 +104,7 @@ MASK_COLOURS = {
 
 class FloorSegmentation:
     """Finds the floor in rectified stereo pairs of one camera. times: gets what each step takes.
-    checks_mount: whether the mount in use is compared with what the floor shows. network: how far
-    what a network says of the floor can be believed.
+    network: how far what a network says of the floor can be believed.
     """
 
     def __init__(
@@ -114,11 +112,8 @@ class FloorSegmentation:
         camera: StereoCamera,
         settings: FloorSegmentationSettings,
         times: StageTimes | None = None,
-        checks_mount: bool = False,
     ) -> None:
         self._times = times or NoTimes()
-        self._checks_mount = checks_mount
-        self._mount_check: MountCheck | None = None
         self._camera = camera
         self._settings = settings
         self.network = NetworkFloor()
@@ -220,15 +215,12 @@ class FloorSegmentation:
             scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, movable_xy)
         if movable is not None:
             disparity = np.maximum(disparity, movable)
-        if self._mount_check is not None and T_map_base is not None:
-            self._mount_check.add(left, right if measured is None else measured, T_map_base)
         return self._observation(view, profile, disparity, mask, scan, counted)
 
     @property
     def remarks(self) -> dict[str, str]:
         """What is wrong with the mount and with what a network says, in words, by what it is."""
-        mount = self._mount_check.problem if self._mount_check else None
-        said = ('mount', mount), ('fixture', self.fixture.problem), ('network', self.network.remark)
+        said = ('fixture', self.fixture.problem), ('network', self.network.remark)
         return {about: words for about, words in said if words}
 
     def _heights(
@@ -271,7 +263,6 @@ class FloorSegmentation:
             return
         self._make_tools(mount)
         self._mount, self.fixture = mount, Fixture()
-        self._mount_check = MountCheck(self._camera, mount) if self._checks_mount else None
 
     def _make_tools(self, mount: Mount) -> None:
         searched = self._settings.num_disparities or disparity_range(self._camera, mount)

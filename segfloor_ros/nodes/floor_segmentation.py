@@ -173,7 +173,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
     def _stage_for(self, camera: StereoCamera) -> FloorSegmentation:
         if self._stage is None or camera != self._camera:
             self._camera = camera
-            self._stage = FloorSegmentation(camera, self.settings, checks_mount=True)
+            self._stage = FloorSegmentation(camera, self.settings)
         return self._stage
 
 

@@ -84,13 +84,17 @@ class SlamTopics:
     def reset(self, map_start_ns: int, is_loaded: bool = False) -> None:
         """Publish about another map from now on; velocities are not known across a reset."""
         # The time of a recording that is played again may be the same twice.
-        self.map_start_ns = map_start_ns + (map_start_ns == self.map_start_ns)
+        self.begin_map(map_start_ns + (map_start_ns == self.map_start_ns))
         self._is_loaded = is_loaded
-        self._last: FrameResult | None = None
         self.newest_ns = -1
         """Stamp of the newest pose."""
-        self._path_messages = poses.PathMessages(self._own.map_frame)
         self.frames = CameraFrames('', '')
+
+    def begin_map(self, map_start_ns: int) -> None:
+        """Have the nodes behind map anew from now on."""
+        self.map_start_ns = map_start_ns
+        self._last: FrameResult | None = None
+        self._path_messages = poses.PathMessages(self._own.map_frame)
 
     def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
         """Publish about this camera from now on. calibration: of the rectified images."""
@@ -199,7 +203,13 @@ class SlamResults:
         self.mount: Mount | None = None
 
     def add(self, results: Sequence[FrameResult], slam: StereoSlam, milliseconds: float) -> None:
-        """Have results published, at once where there is one. milliseconds: that all took."""
+        """Have results published, at once where there is one. Where the mount has changed all of
+        them come once more, for a map that is begun anew. milliseconds: that all took.
+        """
+        if results and self.mount not in (None, slam.mount):
+            self._unsent.clear()
+            self.mount = None
+            self.topics.begin_map(self.topics.map_start_ns + 1)
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
         if len(self._unsent) == 1:
             self._send_next()

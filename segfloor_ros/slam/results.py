@@ -346,6 +346,8 @@ class HeldResults:
 
     def __init__(self) -> None:
         self._held: list[FrameResult] = []
+        self._released: list[FrameResult] = []
+        self._keeps = False
 
     def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
         """Take in the next result and return what is ready: nothing while it is of a submap."""
@@ -371,7 +373,18 @@ class HeldResults:
         if mount is None:
             return []
         ready, self._held = self._held, []
+        self._released += ready if self._keeps else []
         return [in_map(held, mount.T_base_left) for held in ready]
+
+    def keep(self, keeps: bool) -> None:
+        """Keep what is released from now on, as long as the mount may turn out to be another."""
+        self._keeps = keeps
+        if not keeps:
+            self._released.clear()
+
+    def take_back(self) -> None:
+        """Hold all results back again: they are released once more, the first ones first."""
+        self._held, self._released = [*self._released, *self._held], []
 
     def newest(self, mount: Mount) -> FrameResult | None:
         """Return the pose of the newest result that is held, as seen from a mount."""
@@ -383,9 +396,10 @@ class HeldResults:
         """Keep the images of so many keyframes only: a camera that never sees the floor must not
         fill the memory. The poses of all frames are kept.
         """
-        holders = [i for i, held in enumerate(self._held) if held.keyframe is not None]
-        for i in holders[1::2] if len(holders) > MAX_HELD_KEYFRAMES else []:
-            self._held[i] = replace(self._held[i], keyframe=None)
+        for kept in (self._held, self._released):
+            holders = [i for i, held in enumerate(kept) if held.keyframe is not None]
+            for i in holders[1::2] if len(holders) > MAX_HELD_KEYFRAMES else []:
+                kept[i] = replace(kept[i], keyframe=None)
 
 
 def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:

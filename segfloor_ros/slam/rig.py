@@ -20,11 +20,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.camera.rig.estimates import MAX_OFFSET_PX
+from segfloor_ros.camera.rig.estimates import MAX_OFFSET_PX, OFFSET_SIGMA_PX
 from segfloor_ros.geometry import Array
-
-EXPECTED_SIGMA_PX = 0.1
-"""A tenth of a milliradian at a focal length of a thousand pixels, px; 0: disparities are true."""
 
 LOCAL_KEYFRAMES = 10
 """Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is
@@ -108,7 +105,7 @@ class Rig:
     camera: StereoCamera
     mount: Mount | None = None
     offset: DisparityOffset = field(
-        default_factory=lambda: DisparityOffset(EXPECTED_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
+        default_factory=lambda: DisparityOffset(OFFSET_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
     )
 
 

@@ -93,7 +93,8 @@ class StereoSlam:
 
     One call of `process` per frame, in order. Results are held back until the camera's mount is
     known, since frame `map` lies on the floor; then all of them come at once, none is lost. Until
-    then `provisional` is the newest pose.
+    then `provisional` is the newest pose. Where `mount` changes later, all of them come once more,
+    from the first one on.
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
     adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
     what is wrong with the images. sessions: the drives that made the map it goes on with.
@@ -132,6 +133,11 @@ class StereoSlam:
     def mount(self) -> Mount | None:
         """The mount of the camera, None until it is measured."""
         return self.rig.mount
+
+    @property
+    def may_remap(self) -> bool:
+        """Whether `mount` may still change."""
+        return self._mount_meter is not None and self._mount_meter.may_change
 
     @property
     def provisional(self) -> FrameResult | None:
@@ -241,6 +247,8 @@ class StereoSlam:
         """
         self.back_end.from_arrays(arrays)
         self.rig.mount, self.front_end.is_fixed = mount, localize
+        if self._mount_meter is not None:
+            self._mount_meter.use(mount)
         if last is None:
             self.back_end.submap = Submap.LOADED
             self.front_end.reset()
@@ -294,7 +302,10 @@ class StereoSlam:
             self.back_end.reset()
         else:
             self.back_end.start_submap()
-        if self._mount_meter is not None:
+        if self.mount is not None:
+            self._mount_meter = None
+            self._held.keep(False)
+        elif self._mount_meter is not None:
             self._mount_meter.reset()
         if not is_known:
             self.front_end.motion.reset()
@@ -354,15 +365,25 @@ class StereoSlam:
 
     def _look_for_mount(self, frame: StereoFrame, is_new_view: bool) -> None:
         """Look for the floor at a keyframe; at other frames now and then: a camera that stands may
-        see it better than in its first image, or know by now where up is.
+        see it better than in its first image, or know by now where up is. Where the floor shows
+        another mount than the one in use, all results come once more.
         """
-        is_due = is_new_view or frame.stamp_ns - self._looked_ns >= STEP_NS
-        if self.mount is None and self._mount_meter is not None and is_due:
-            self._looked_ns = frame.stamp_ns
-            T_world_camera = invert(self.front_end.motion.T_camera_world)
-            up = self.sensors.gravity.up_world
-            self._mount_meter.add(frame.left, frame.right, T_world_camera, up, is_new_view)
-            self.rig.mount = self._mount_meter.mount
+        meter = self._mount_meter
+        if meter is None or meter.is_final:
+            return
+        is_late = frame.stamp_ns - self._looked_ns >= STEP_NS
+        if not is_new_view and (self.mount is not None or not is_late):
+            return
+        self._looked_ns = frame.stamp_ns
+        T_world_camera = invert(self.front_end.motion.T_camera_world)
+        up = self.sensors.gravity.up_world
+        meter.add(frame.left, frame.right, T_world_camera, up, is_new_view)
+        if self.mount is not None and meter.mount != self.mount:
+            self._held.take_back()
+        if meter.remark is not None:
+            self.sensors.remark({'mount': meter.remark})
+        self.rig.mount = meter.mount
+        self._held.keep(meter.may_change)
 
     def _take_adjustment(self, wait: bool) -> None:
         """Bring a finished adjustment into the map."""
@@ -450,7 +471,22 @@ class MountMeter(Protocol):
 
     @property
     def mount(self) -> Mount | None:
-        """The mount at the first frame, once it is known."""
+        """The mount at the first frame, once it is known; later looks may show another."""
+
+    @property
+    def is_final(self) -> bool:
+        """Whether the mount is known, and looked at often enough."""
+
+    @property
+    def may_change(self) -> bool:
+        """Whether later looks may show another mount."""
+
+    def use(self, mount: Mount) -> None:
+        """Take a mount for given: it is compared with what is seen, and stays as it is."""
+
+    @property
+    def remark(self) -> str | None:
+        """How the mount that was in use differs from the one that the floor shows, in words."""
 
     @property
     def provisional(self) -> Mount:

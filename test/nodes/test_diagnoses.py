@@ -18,10 +18,9 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.floor.plane.mount import MountCheck
+from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
 from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
-from segfloor_ros.messages.poses import odometry_message, transform_message
 from segfloor_ros.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
@@ -194,24 +193,17 @@ def test_a_camera_that_was_unplugged_is_named(make_graph, frames) -> None:
 
 
 def test_a_mount_that_the_floor_contradicts_is_named_with_both_numbers(make_graph, frames) -> None:
-    """The camera looks down by 0.15 rad = 8.6 deg; tf or the parameters say 14.3 deg."""
-    graph = make_graph()
-    graph.add(FloorSegmentationNode())
-    wrong = replace(MOUNT, pitch_rad=0.25)
-    mount = transform_message(0, 'base_link', 'left', wrong.T_base_left)
-    publishers = publish(graph, {'camera_mount': mount})
+    """The camera looks down by 0.15 rad = 8.6 deg; the parameters say 14.3 deg."""
+    wrong = (*GIVEN[:3], 'camera_pitch_rad:=0.25', *GIVEN[4:])
+    graph = make_graph(*wrong, '-p', 'image_reliability:=best_effort')
+    driver = Driver(graph, profile=best_effort(IMAGES))
+    graph.add(StereoSlamNode())
+    driver.connect()
     for frame in frames:
-        stamp_ns = frame.stamp_ns
-        pose = odometry_message(stamp_ns, 'map', 'base_link', np.eye(4), np.zeros((6, 6)))
-        messages = {'keyframe/odometry': pose}
         for side in ('left', 'right'):
-            image = image_message(stamp_ns, side, getattr(frame, side))
-            info = camera_info_message(stamp_ns, side, getattr(CALIBRATION, side))
-            messages[f'keyframe/{side}/image_rect'] = image
-            messages[f'keyframe/{side}/camera_info'] = info
-        publish(graph, messages, publishers)
+            driver.send(side, frame.stamp_ns, getattr(frame, side))
     words = ('camera mount: pitch 14.3 deg, the floor shows 8.', 'camera_pitch_rad', 'tf')
-    assert says(graph, 'floor_segmentation', *words).level is Level.WARN
+    assert says(graph, 'stereo_slam', *words).level is Level.WARN
 
 
 def test_keyframes_that_wait_for_the_mount_say_so(make_graph, frames) -> None:
@@ -294,13 +286,15 @@ def test_rate_delay_and_problems_are_those_of_the_time() -> None:
 
 
 def test_a_mount_that_the_floor_confirms_is_not_mentioned(frames) -> None:
-    check = MountCheck(CAMERA, MOUNT)
+    check = MountEstimator(CAMERA, given=MOUNT)
     check.add(frames[0].left, frames[0].right, np.eye(4))
-    assert check.problem is None
-    high = MountCheck(CAMERA, replace(MOUNT, height_m=1.2 * MOUNT.height_m))
+    assert (check.mount, check.remark) == (MOUNT, None)
+    given = replace(MOUNT, height_m=1.2 * MOUNT.height_m)
+    high = MountEstimator(CAMERA, given=given)
     high.add(frames[0].left, frames[0].right, np.eye(4))
-    assert high.problem is not None
-    assert f'the floor shows {MOUNT.height_m:.2f}' in high.problem
+    assert high.mount == given
+    assert high.remark is not None
+    assert f'the floor shows {MOUNT.height_m:.2f}' in high.remark
 
 
 def test_nodes_with_different_robots_say_so(make_graph) -> None:

@@ -78,6 +78,10 @@ PAIR_SIGMA = 0.02
 """What is wrong in all points of a pair is in no covariance: by so much, as a share, pairs of good
 recordings differ."""
 
+OFFSET_SIGMA_PX = 0.1
+"""Error that all disparities share, expected of a rig: a tenth of a milliradian between its eyes at
+a focal length of a thousand pixels."""
+
 MAX_OFFSET_PX = 0.5
 """An error of all disparities that is larger is not an imperfect rectification but a wrong
 calibration, px."""

@@ -39,6 +39,11 @@ _SAME_GAIN, _SAME_MEAN_GREY = 0.08, 8.0
 COARSE_BLOCK_PX = 3
 COARSE_ABOVE_PX = 28.0
 """Where the floor has a larger disparity, images are matched at half the resolution."""
+_FINE_BLOCK = (9, 9)
+"""Columns and rows of the block in which a disparity is refined."""
+_NOISE_SLOPE = 0.03
+"""Square of the slope between pixels, of the mean of a smoothed pair, that noise of one grey level
+has."""
 _OVERLAP_PX = 4
 """So near to the end of its range the fine match leaves what is nearer to the coarse one."""
 RUN_UP_ROWS = 16
@@ -153,6 +158,53 @@ def halved_disparity(
         interpolation=cv2.INTER_NEAREST,
     )
     return disparity
+
+
+def refined(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    disparity: NDArray[np.float32],
+    noise_grey: float,
+    at: tuple[NDArray[np.intp], NDArray[np.intp]],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return what the blocks around rows and columns `at`, (N,) each, show of a pair (H, W) by
+    least squares on its grey levels, near disparities (H, W) that were matched: rows, columns and
+    disparities (N,) of their texture, and the standard deviation of these, in pixels: infinite
+    where both do not agree.
+
+    Lucas and Kanade, An Iterative Image Registration Technique (1981), along the row, with grey
+    levels that are off by a constant; its error by the bound of Cramer and Rao. noise_grey: of the
+    images.
+    """
+    height, width = left.shape
+    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+    smooth, smooth_right = (
+        cv2.GaussianBlur(image, (3, 3), 0).astype(np.float32) for image in (left, right)
+    )
+    down = np.repeat(rows[:, None], width, axis=1)
+    across = columns - disparity
+    warped = cv2.remap(smooth_right, across, down, cv2.INTER_LINEAR)
+    derivative, once = np.array([-0.25, 0.0, 0.25]), np.ones(1)
+    slope = cv2.sepFilter2D(smooth + warped, cv2.CV_32F, derivative, once)
+    known = ((disparity > 0) & (across >= 1)).astype(np.float32)
+    slope *= known
+    step = (smooth - warped) * known
+
+    def in_block(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        return cv2.boxFilter(values, -1, _FINE_BLOCK, normalize=False)[at]
+
+    squared = slope * slope
+    count, by_slope = np.maximum(in_block(known), 1), in_block(slope)
+    power = np.maximum(in_block(squared), np.float32(1e-3))
+    # Noise has slopes, too: they are no information.
+    noise = count * np.float32(_NOISE_SLOPE * noise_grey**2)
+    information = np.maximum(power - by_slope**2 / count - noise, np.float32(1e-3))
+    shift = (in_block(slope * step) - by_slope * in_block(step) / count) / information
+    matched = in_block(squared * disparity) / power
+    shown = in_block(squared * rows[:, None]) / power, in_block(squared * columns) / power
+    sigma = noise_grey * np.sqrt(2 / information)
+    sigma[np.abs(shift) > SAME_PX] = np.inf
+    return *shown, matched - shift, sigma
 
 
 class TwoScaleMatcher:

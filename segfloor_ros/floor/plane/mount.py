@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -19,9 +20,11 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera, Up
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
-    DisparityMatcher,
+    NOISE_PX,
+    SIGMAS,
     TwoScaleMatcher,
     disparity_range,
+    refined,
     stereo_view,
 )
 from segfloor_ros.floor.disparity.profile import STEP_PX, column_step, pixels_where, surface_above
@@ -48,33 +51,39 @@ from segfloor_ros.floor.plane.plane import (
     refine,
     scores,
     shares,
-    texture_weight,
 )
 from segfloor_ros.geometry import Array, invert
 
 _USUAL = np.array([0.0, 0.0, 0.3])
 """Pitch, roll and height while nothing is known."""
-_MAX_FRAMES = 12
-_PROPOSALS, _KEPT = 200, 60
+_PROPOSALS, _KEPT = 120, 40
 """Guesses by the newest frame, and those that are kept for the next."""
 _COMPARED = 6000
 """So many samples of all frames together are compared with a plane: neighbours err together."""
 _LEAST_SAMPLES = 20
-_SIGMA = np.array([math.radians(0.4), math.radians(1.0), 0.015])
-"""How well pitch, roll and height, as a share of it, must be known."""
+_LEAST_NOISE_GREY = 0.5
+"""Grey levels are rounded, and the eyes differ: no image is less noisy."""
+_SIGMA = np.array([math.radians(0.8), math.radians(2.0), 0.03])
+"""How well pitch, roll and height, as a share of it, must be known: the map is redone should they
+turn out to be others.
+"""
 _SURE = 3.0
 """Sigmas within which nearly all lies: guesses, or what is seen but once, are no surer."""
 _FLOOR_SLOPE = math.radians(1.5)
 """Floors on which robots start are level, more or less."""
-_HEIGHT_TOLERANCE = 0.05
-_TILT_TOLERANCE_DEG = 1.0
+_TOLERANCE = np.array([math.radians(1.0), math.radians(1.0), 0.05])
+"""A mount whose pitch, roll or height, as a share of it, are off by less does no harm."""
 MAX_KEYFRAMES = 20
-"""Where so many do not show the floor well enough, nothing is said."""
-
-MORE_TEXTURE = 1.25
-"""A mount is kept, so it asks for more texture than the plane of one frame. As measured: with 1 the
-mount of KITTI 06 rolls by 1.6° in place of 0.8°, with 1.5 a rug alone shows none.
+"""So many looks a plane is made of at most, a mount is changed by, and it is looked at again. Where
+so many do not show the floor well enough, half as well will do.
 """
+
+_IS_WRONG = (
+    'correct the tf to the camera, or the parameters camera_height_m, camera_pitch_rad and '
+    'camera_roll_rad of stereo_slam; or where these are right, the baseline and the focal length '
+    'of the calibration'
+)
+_IS_REDONE = 'the map is made anew with what it shows'
 
 _BASE_WEIGHT = 8.0
 """All of the surface above places a base: it counts as so many samples."""
@@ -90,10 +99,13 @@ _UPRIGHT_SPREAD_PX = 0.6
 
 
 class MountEstimator:
-    """Measures the mount over the first keyframes, in SLAM's own frame.
+    """Measures the mount over the first keyframes, and looks at it again on the way, whether it was
+    measured or is given.
 
-    known values are kept and only the others measured; NaN where not known. Deterministic: the
-    same frames give the same mount.
+    known values are kept and only the others measured; NaN where not known. given: the mount, where
+    all is known, which is never changed. mount: in use, None while it is not known; one that was
+    measured changes where later looks show another. remark: in words, with the numbers, how both
+    differ. Deterministic: the same frames give the same mount.
     """
 
     def __init__(
@@ -104,24 +116,42 @@ class MountEstimator:
         roll_rad: float = math.nan,
         forward_m: float = 0.0,
         left_m: float = 0.0,
+        given: Mount | None = None,
     ) -> None:
         self._known = np.array([pitch_rad, roll_rad, height_m])
         self._offset = (forward_m, left_m)
         self._viewer = MountViewer(camera)
+        self.mount = self._given = given
+        self._sigma = np.zeros(3)
+        self.remark: str | None = None
         self.reset()
+
+    def use(self, mount: Mount) -> None:
+        """Take a mount for given."""
+        self.mount = self._given = mount
 
     def reset(self) -> None:
         """Forget all frames: the next ones are of another world."""
         self._surfaces, self._bases = PlaneSearch(self._known), PlaneSearch(self._known)
         self._poses: list[Array] = []
-        self.mount: Mount | None = None
+        self._looks_again = 0
+
+    @property
+    def is_final(self) -> bool:
+        """Whether the mount is known, and was looked at often enough."""
+        return self._looks_again >= MAX_KEYFRAMES
+
+    @property
+    def may_change(self) -> bool:
+        """Whether later looks may show another mount."""
+        return self._given is None and not self.is_final
 
     @property
     def provisional(self) -> Mount:
         """The mount as it seems so far, at first a level camera at a usual height."""
         for search in (self._bases, self._surfaces):
-            if search.fits and self._is_possible(search.fits[-1]):
-                return self._mount_of(search.fits[-1].angles_height)
+            if search.fit is not None and self._is_possible(search.fit):
+                return self._mount_of(search.fit.angles_height)
         return self._mount_of(np.where(np.isnan(self._known), _USUAL, self._known))
 
     def _mount_of(self, angles_height: Array) -> Mount:
@@ -142,28 +172,47 @@ class MountEstimator:
         up_world: where an accelerometer has up in that frame. is_new_view: else it shows what the
         last one does, and takes its place: their errors are the same.
         """
-        if self.mount is not None:
+        if self.is_final:
             return
+        self._looks_again += self.mount is not None
         if not is_new_view:
             del self._poses[-1:]
         self._poses.append(T_world_left)
         right, measured = stereo_view(left, right)
         disparity = self._viewer.disparity(left, right) if measured is None else measured
-        enough = enough_texture(noise_grey(left))
-        needed = enough if measured is None else None
-        surfaces = self._viewer.surfaces(left, disparity, needed, T_world_left)
-        prior = level_prior(up_world)
-        fit = self._surfaces.add(surfaces, prior, [], is_new_view)
+        noise = noise_grey(left)
+        seen = None if measured is not None else max(noise, _LEAST_NOISE_GREY)
+        surfaces = self._viewer.surfaces(left, right, disparity, seen)
+        prior, travel = level_prior(up_world, T_world_left), self._travel()
+        fit = self._surfaces.add(surfaces, prior, travel, [], is_new_view)
         if not self._settles(self._surfaces, fit):
-            bases = self._viewer.bases(left, disparity, enough, T_world_left)
-            fit = self._bases.add(bases, prior, self._surfaces.frames, is_new_view)
+            bases = self._viewer.bases(left, disparity, enough_texture(noise))
+            fit = self._bases.add(bases, prior, travel, self._surfaces.frames, is_new_view)
             self._settles(self._bases, fit)
 
+    def _travel(self) -> Array:
+        """Return how far the camera has come (T, 3) m, in its own axes at the end of each way."""
+        poses = np.array(self._poses[-MAX_KEYFRAMES:])
+        way = poses[1:, :3, 3] - poses[:1, :3, 3]
+        own = np.einsum('nji,nj->ni', poses[1:, :3, :3], way)
+        return own[np.linalg.norm(own, axis=1) > 0.05]
+
     def _settles(self, search: PlaneSearch, fit: PlaneFit | None) -> bool:
-        """Take over the plane of a search where it is known, and one that a robot can drive on."""
-        if fit is not None and search.is_known() and self._is_possible(fit):
-            self.mount = self._mount_of(fit.angles_height)
-        return self.mount is not None
+        """Take over the plane of a search where it is known, one that a robot can drive on, and
+        none that agrees with the mount in use.
+        """
+        if fit is None or not (search.is_known() and self._is_possible(fit)):
+            return False
+        seen, is_given = self._mount_of(fit.angles_height), self._given is not None
+        sigma, words = fit.sigma, None
+        # A robot sways: what is to be changed takes more looks than one.
+        if self.mount is not None and (is_given or len(search.frames) >= MAX_KEYFRAMES):
+            words = disagreement(self.mount, seen, np.hypot(sigma, self._sigma))
+        if words is not None:
+            self.remark = f'camera mount: {words}; {_IS_WRONG if is_given else _IS_REDONE}'
+        if self.mount is None or (words is not None and not is_given):
+            self.mount, self._sigma = seen, sigma
+        return True
 
     def _is_possible(self, fit: PlaneFit) -> bool:
         """Return whether a robot drove on the plane: on its way the camera keeps its place above
@@ -173,26 +222,30 @@ class MountEstimator:
             return False
         height_m = float(fit.angles_height[2])
         normal = plane_of(fit.angles_height) * height_m
-        poses = np.array(self._poses)
+        poses = np.array(self._poses[-MAX_KEYFRAMES:])
+        poses = invert(poses[0]) @ poses
         heights_m = height_m + poses[:, :3, 3] @ normal
         seen = angles_height_of((normal @ poses[:, :3, :3]) / heights_m[:, None])
         spread = seen.std(axis=0) / (1.0, 1.0, height_m)
         return bool(heights_m.min() > 0 and (spread < SWAY).all())
 
 
-def level_prior(up: Up | None) -> tuple[Array, Array]:
-    """Return what pitch, roll and height (3,) are expected, and their standard deviations: a floor
-    is level as an accelerometer has it.
+def level_prior(up: Up | None, T_world_left: Array) -> tuple[Array, Array]:
+    """Return what pitch, roll and height (3,) are expected of a camera at a pose (4, 4), and their
+    standard deviations: a floor is level as an accelerometer has it in the world.
     """
     if up is None:
         return np.zeros(3), LEVEL_SIGMA
     sigma = math.hypot(up.sigma_rad, _FLOOR_SLOPE)
-    return angles_height_of(up.direction), np.array([sigma, sigma, math.inf])
+    return angles_height_of(T_world_left[:3, :3].T @ up.direction), np.array(
+        [sigma, sigma, math.inf]
+    )
 
 
 class PlaneSearch:
-    """Finds the plane that the samples of the last frames lie on, anew with each frame; the best
-    guesses of earlier frames compete with those of the newest one.
+    """Finds the plane below a camera on which the samples of its last frames lie, each in the
+    camera's own axes: there the floor always is, and all else is now here, now there. It is looked
+    for anew with each frame; the best guesses of earlier frames compete with those of the newest.
     """
 
     def __init__(self, known: Array) -> None:
@@ -201,32 +254,30 @@ class PlaneSearch:
         self._guesses = np.zeros((0, 3))
         self._looks = 0
         self.frames: list[Samples] = []
-        self.fits: list[PlaneFit] = []
-        self._before = self.frames, self.fits
+        self.fit: PlaneFit | None = None
+        self._before = self.frames
 
     def add(
         self,
         samples: Samples,
         prior: tuple[Array, Array],
+        travel: Array,
         contrary: list[Samples],
         is_new_view: bool = True,
     ) -> PlaneFit | None:
         """Take in the samples of a frame and return the plane, None where none is plausible.
 
         prior: pitch, roll and height (3,) that are expected, and their standard deviations.
-        contrary: further samples, which can but speak against a plane, by lying below it.
-        is_new_view: else the samples take the place of those of the last view.
+        travel: (T, 3), ways in metres along which the floor runs. contrary: further samples, which
+        can but speak against a plane, by lying below it. is_new_view: else the samples take the
+        place of those of the last view.
         """
         if is_new_view:
-            self._before = self.frames, self.fits
+            self._before = self.frames
         if len(samples.weight) < _LEAST_SAMPLES or samples.weight.sum() < 1:
             return None
-        self.frames, self.fits = self._before
-        frames = self.frames = [*self.frames, samples][-_MAX_FRAMES:]
+        frames = self.frames = [*self._before, samples][-MAX_KEYFRAMES:]
         mean, sigma = prior
-        positions = np.array([frame.position_m for frame in frames])
-        travel = positions[1:] - positions[:1]
-        travel = travel[np.linalg.norm(travel, axis=1) > 0.05]
         fresh = propose(samples, _PROPOSALS, self._rng, self._known)
         guesses = np.concatenate([self._guesses, fresh])
         if len(guesses) == 0:
@@ -245,26 +296,35 @@ class PlaneSearch:
             fit = replace(fit, violations=below)
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
         self._guesses = self._guesses[plausible(self._guesses)]
-        self.fits = [*self.fits, fit]
+        self.fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(some, fit, prior)))
         self._looks += 1
-        return fit
+        return self.fit
+
+    def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
+        """Return the standard deviations (3,) of a plane by how much those of parts of the drive
+        differ: what is wrong in all samples of a scene is in no covariance of theirs (batch means).
+        """
+        if len(frames) < LOOKS:
+            return np.zeros(3)
+        ends = np.linspace(0, len(frames), LOOKS + 1).astype(int)
+        mean, sigma = prior[0], prior[1] * math.sqrt(LOOKS / len(frames))
+        still = np.zeros((0, 3))
+        planes = [
+            refine(frames[first:end], fit.angles_height, self._known, still, mean, sigma)
+            for first, end in pairwise(ends)
+        ]
+        return np.std([plane.angles_height for plane in planes], axis=0, ddof=1) / math.sqrt(LOOKS)
 
     def is_known(self) -> bool:
-        """Return whether the last plane is known: by its own covariance and by how much it varies
-        from frame to frame, as what is wrong in all frames of a scene is in no covariance. One view
-        is enough where that of a single one is much smaller. In the end a plane that is off by some
-        per cent is better than none.
+        """Return whether the last plane is known, by what varies within a frame and over the drive.
+        Before that can vary it must be known much better. In the end any view will do, and a plane
+        that is off by some per cent is better than none.
         """
-        fit, count = self.fits[-1], len(self.fits)
+        assert self.fit is not None
         is_late = self._looks >= MAX_KEYFRAMES
-        sigma = fit.sigma / (1.0, 1.0, fit.angles_height[2])
-        if count > 1 or (_SURE * sigma > _SIGMA).any():
-            recent = np.array([one.angles_height for one in self.fits[-LOOKS:]])
-            sigma = np.hypot(sigma, recent.std(axis=0) / (1.0, 1.0, fit.angles_height[2]))
-            if count < LOOKS and not is_late:
-                return False
-        limit = _SIGMA * (2 if is_late else 1)
-        return fit.is_seen and bool((sigma < limit).all())
+        sure = 1.0 if is_late or len(self.frames) >= LOOKS else SIGMAS * _SURE
+        sigma = sure * self.fit.sigma / (1.0, 1.0, self.fit.angles_height[2])
+        return self.fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
 
 
 def _thinned(frames: list[Samples]) -> list[Samples]:
@@ -272,125 +332,83 @@ def _thinned(frames: list[Samples]) -> list[Samples]:
     return [frame.every(max(1, step)) for frame in frames]
 
 
-def disagreement(used: Mount, seen: Mount) -> str | None:
-    """Return in words how the mount in use differs from the one that the floor shows, or None
-    where they agree.
+def disagreement(used: Mount, seen: Mount, sigma: Array) -> str | None:
+    """Return in words how the mount in use differs from the one that the floor shows, by more than
+    does harm and than its standard deviations (3,) of pitch, roll and height explain; None where
+    they agree.
     """
-    parts = []
-    if abs(used.height_m - seen.height_m) > _HEIGHT_TOLERANCE * seen.height_m:
-        parts.append(f'height {used.height_m:.3f} m, the floor shows {seen.height_m:.3f} m')
-    for name in ('pitch', 'roll'):
-        given = math.degrees(getattr(used, f'{name}_rad'))
-        measured = math.degrees(getattr(seen, f'{name}_rad'))
-        if abs(given - measured) > _TILT_TOLERANCE_DEG:
-            parts.append(f'{name} {given:.1f} deg, the floor shows {measured:.1f} deg')
-    if not parts:
-        return None
-    return (
-        'camera mount: ' + '; '.join(parts) + '; correct the tf to the camera, or the parameters '
-        'camera_height_m, camera_pitch_rad and camera_roll_rad of stereo_slam; or where these are '
-        'right, the baseline and the focal length of the calibration'
+    scale = np.array([1.0, 1.0, seen.height_m])
+    own, other = (
+        np.array([mount.pitch_rad, mount.roll_rad, mount.height_m]) for mount in (used, seen)
     )
-
-
-class MountCheck:
-    """Measures the mount beside its use, once. A wrong one tilts the map or shifts its heights.
-    problem: in words, with the numbers, how both differ, once that is known.
-    """
-
-    def __init__(self, camera: StereoCamera, mount: Mount) -> None:
-        self._mount = mount
-        self._estimator = MountEstimator(camera, forward_m=mount.forward_m, left_m=mount.left_m)
-        self._T_first_map: Array | None = None
-        self._keyframes = 0
-        self.problem: str | None = None
-
-    def add(self, left: NDArray[np.uint8], right: NDArray[Any], T_map_base: Array) -> None:
-        """Use a keyframe: rectified images (H, W), or of a depth camera its disparity in place of
-        the right one, and the base's pose (4, 4).
-        """
-        if self._estimator.mount is not None or self._keyframes >= MAX_KEYFRAMES:
-            return
-        T_map_left = T_map_base @ self._mount.T_base_left
-        if self._T_first_map is None:
-            self._T_first_map = invert(T_map_left)
-        self._estimator.add(left, right, self._T_first_map @ T_map_left)
-        self._keyframes += 1
-        seen = self._estimator.mount
-        self.problem = None if seen is None else disagreement(self._mount, seen)
+    pitch, roll, height = np.abs(own - other) > np.maximum(_TOLERANCE * scale, SIGMAS * sigma)
+    parts = []
+    if height:
+        parts.append(f'height {used.height_m:.3f} m, the floor shows {seen.height_m:.3f} m')
+    for name, is_other in (('pitch', pitch), ('roll', roll)):
+        if is_other:
+            degrees = (math.degrees(getattr(mount, f'{name}_rad')) for mount in (used, seen))
+            parts.append('{} {:.1f} deg, the floor shows {:.1f} deg'.format(name, *degrees))
+    return '; '.join(parts) or None
 
 
 class MountViewer:
-    """Looks at the rectified pairs of one camera; only the first is matched in full."""
+    """Looks at the rectified pairs of one camera."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
         searched = disparity_range(camera, None)
-        self._first: DisparityMatcher | None = DisparityMatcher(searched)
         self._matcher = TwoScaleMatcher(searched)
         self._fine_rows = camera.height if column_step(camera) == 1 else 0
 
     def disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the disparities (H, W) of a pair, 0 where there is no match."""
-        first, self._first = self._first, None
-        if first is not None:
-            return first.compute(left, right)
         return self._matcher.compute(left, right, self._fine_rows)
 
     def surfaces(
         self,
         left: NDArray[np.uint8],
+        right: NDArray[np.uint8],
         disparity: NDArray[np.float32],
-        enough: float | None,
-        T_world_left: Array,
+        noise: float | None,
     ) -> Samples:
-        """Return samples of all that has texture. enough: what is no noise; None where depth is
-        measured, which needs none.
+        """Return samples of all that has texture. noise: of the images, in grey levels; None where
+        depth is measured, which needs no texture.
         """
         # Matched at half the resolution two rows share a disparity: odd steps meet both alike.
         step = max(2, round(math.sqrt(left.size / 2 / SAMPLES))) | 1
         part = np.s_[step // 2 :: step, step // 2 :: step]
         at = pixels_where(disparity[part] >= 1)
         rows, columns = (step // 2 + step * index for index in at)
-        weight: Array = np.ones(len(rows))
-        shown_at: NDArray[np.number] = rows
-        if enough is not None:
-            slope, block = texture_grey(left, 1), (BLOCK_PX, BLOCK_PX)
-            texture = cv2.blur(slope, block)[rows, columns]
-            weight = texture_weight(texture, MORE_TEXTURE * enough)
-            # A disparity is that of the texture in its block, and belongs where that is.
-            slope *= np.arange(len(left), dtype=np.float32)[:, None]
-            shown_at = cv2.blur(slope, block)[rows, columns] / np.maximum(texture, 1e-6)
         above, below = (
             disparity[np.clip(rows + by, 0, len(left) - 1), columns] for by in (-BLOCK_PX, BLOCK_PX)
         )
         rise = np.where((above > 0) & (below > 0), (below - above) / (2 * BLOCK_PX), 0.0)
-        return self._placed(shown_at, columns, disparity[rows, columns], weight, T_world_left, rise)
+        if noise is None:
+            return self._placed(rows, columns, disparity[rows, columns], np.ones(len(rows)), rise)
+        *shown_at, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
+        weight = 1.0 / (1.0 + (sigma.astype(np.float64) / NOISE_PX) ** 2)
+        return self._placed(*shown_at, found_px, weight, rise)
 
     def bases(
-        self,
-        left: NDArray[np.uint8],
-        disparity: NDArray[np.float32],
-        enough: float,
-        T_world_left: Array,
+        self, left: NDArray[np.uint8], disparity: NDArray[np.float32], enough: float
     ) -> Samples:
         """Return samples of where upright things stand on blank floor."""
         rows, columns, found_px = find_bases(left, disparity, enough)
         weight = np.full(len(rows), _BASE_WEIGHT)
-        return self._placed(rows, columns, found_px, weight, T_world_left)
+        return self._placed(rows, columns, found_px, weight)
 
     def _placed(
         self,
         rows: NDArray[np.number],
-        columns: NDArray[np.integer],
+        columns: NDArray[np.number],
         disparity_px: NDArray[np.floating],
         weight: Array,
-        T_world_left: Array,
         rise: Array | None = None,
     ) -> Samples:
         uv_px = np.stack([columns, rows], axis=1).astype(np.float64)
         found_px = disparity_px.astype(np.float64)
-        return Samples.of(self._camera, uv_px, found_px, weight, T_world_left, rise)
+        return Samples.of(self._camera, uv_px, found_px, weight, rise)
 
 
 def find_bases(

@@ -1,9 +1,9 @@
 """The plane of the floor in the disparities of one or more frames.
 
-A plane is written as m = n / h, with n its unit normal pointing up and h the height of the first
-camera above it, both in the world frame, which is the first left optical frame. The point X is on
-the plane where m . X + 1 = 0, so the ray q from a camera at t meets it at the inverse depth
--(m . q) / (1 + m . t): in a rectified pair a plane's disparity is linear in the pixel.
+A plane is written as m = n / h, with n its unit normal pointing up and h the height of the camera
+above it, in the axes of the left camera. The point X is on the plane where m . X + 1 = 0, so the
+ray q meets it at the inverse depth -m . q: in a rectified pair a plane's disparity is linear in the
+pixel. A camera that is fixed to its base sees the floor on the same plane in all frames.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.camera.rig.estimates import OFFSET_SIGMA_PX
 from segfloor_ros.floor.disparity.matching import NOISE_PX, SAME_PX
 from segfloor_ros.floor.disparity.profile import (
     HEIGHT_SIGMA,
@@ -56,19 +57,17 @@ _FLAT_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class Samples:
-    """Disparities of one frame: rays (N, 3) turned into the world, the camera's position (3,) in
-    the world in metres, disparities (N,) in pixels, weights (N,). disparity_m: fx * baseline.
-    rise: (N,), by how much disparities grow per row around the samples, None where that is not
-    known; down: (3,), by how much rays change per row.
+    """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). disparity_m:
+    fx * baseline. rise: (N,), by how much disparities grow per row around the samples, None where
+    that is not known; down: by how much rays change per row.
     """
 
     rays: Array
-    position_m: Array
     disparity_px: Array
     weight: Array
     disparity_m: float
     rise: Array | None = None
-    down: Array | None = None
+    down: float = 0.0
 
     @classmethod
     def of(
@@ -77,14 +76,12 @@ class Samples:
         uv_px: Array,
         disparity_px: Array,
         weight: Array,
-        T_world_left: Array,
         rise: Array | None = None,
     ) -> Samples:
-        """Return the samples at pixels (N, 2), seen from a pose (4, 4)."""
-        rays = camera.back_project(uv_px, np.ones(len(uv_px))) @ T_world_left[:3, :3].T
-        position_m = T_world_left[:3, 3].astype(np.float64)
-        down = T_world_left[:3, 1] / camera.fy
-        return cls(rays, position_m, disparity_px, weight, camera.disparity_times_depth, rise, down)
+        """Return the samples at pixels (N, 2)."""
+        rays = camera.back_project(uv_px, np.ones(len(uv_px)))
+        constant = camera.disparity_times_depth
+        return cls(rays, disparity_px, weight, constant, rise, 1.0 / camera.fy)
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
@@ -100,9 +97,9 @@ class Samples:
         """Return the weights (N,) for a plane (3,): little where disparities do not rise down the
         image as those of the plane do.
         """
-        if self.rise is None or self.down is None:
+        if self.rise is None:
             return self.weight
-        slope = -self.disparity_m * float(plane @ self.down) / (1 + float(plane @ self.position_m))
+        slope = -self.disparity_m * self.down * float(plane[1])
         return self.weight * np.where(is_rise(self.rise, slope), 1.0, _FLAT_WEIGHT)
 
 
@@ -122,7 +119,7 @@ wrong matches, is so small a share of that: of true floors 0.11 at most, of boar
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the first camera;
+    """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the camera;
     sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
     that lies on it; violations: share that lies below it.
     """
@@ -195,8 +192,7 @@ def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array
     chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
     q = samples.rays[chosen]
     inverse_depth = samples.disparity_px[chosen] / samples.disparity_m
-    # m . (q + inverse_depth * t) = -inverse_depth
-    rows = q + inverse_depth[..., None] * samples.position_m
+    rows = q.copy()
     half = count // 2
     rows[half:, 2] = (1.0, 0.0, 0.0)
     inverse_depth[half:, 2] = 0.0
@@ -212,10 +208,9 @@ def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.boo
     how much less than that lies clearly below the plane, and whether it is visible there at all,
     each (N, M).
     """
-    along = 1 + planes @ samples.position_m
     expected = samples.rays @ planes.T
     # In place: thousands of samples times hundreds of planes take most of a process's memory.
-    expected *= -samples.disparity_m / np.where(np.abs(along) < 1e-6, 1e-6, along)
+    expected *= -samples.disparity_m
     visible = expected > SAME_PX
     error = samples.disparity_px[:, None] - expected
     expected *= -_BEND
@@ -238,8 +233,7 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     np.maximum(on, 0, out=on)
     on[~visible] = 0
     on -= _VIOLATION_WEIGHT * below
-    above_camera = 1 + planes @ samples.position_m < 0.2
-    return np.where(above_camera, -np.inf, samples.weight @ on)
+    return samples.weight @ on
 
 
 def shares(frames: list[Samples], angles_height: Array) -> tuple[float, float]:
@@ -298,9 +292,10 @@ def refine(
     state = start.copy()
     free = np.isnan(known)
     information: Array = np.eye(3)
+    shared = np.zeros(3)
     prior = np.diag(sigma**-2.0)
     for scale in scales_px:
-        information, gradient = _normal_equations(frames, state, scale)
+        information, gradient, shared = _normal_equations(frames, state, scale)
         _add_travel(information, gradient, state, travel)
         information += prior
         gradient += prior @ (mean - state)
@@ -311,7 +306,8 @@ def refine(
         state = state + np.clip(step, -0.1, 0.1)
     error = np.zeros(3)
     covariance = np.linalg.pinv(information[np.ix_(free, free)])
-    error[free] = np.sqrt(np.maximum(np.diag(covariance), 0))
+    by_offset = OFFSET_SIGMA_PX * (covariance @ shared[free])
+    error[free] = np.sqrt(np.maximum(np.diag(covariance), 0) + by_offset**2)
     return PlaneFit(state, error, *shares(frames, state))
 
 
@@ -326,23 +322,25 @@ def _jacobian(angles_height: Array) -> Array:
     return by_angles / height
 
 
-def _normal_equations(frames: list[Samples], state: Array, scale: float) -> tuple[Array, Array]:
-    information, gradient = np.zeros((3, 3)), np.zeros(3)
+def _normal_equations(
+    frames: list[Samples], state: Array, scale: float
+) -> tuple[Array, Array, Array]:
+    """Return the information (3, 3), the gradient (3,), and that (3,) of an error of a pixel which
+    all disparities share.
+    """
+    information, gradient, shared = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     plane, by_state = plane_of(state), _jacobian(state)
     for samples in frames:
-        along = 1 + float(plane @ samples.position_m)
-        toward = samples.rays @ plane
-        expected = -samples.disparity_m * toward / along
+        expected = -samples.disparity_m * (samples.rays @ plane)
         error = samples.disparity_px - expected
         weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
         weight = np.where(expected > SAME_PX, weight, 0)
         weight /= _CORRELATED_SAMPLES * NOISE_PX**2
-        jacobian = samples.rays @ by_state
-        jacobian -= (toward / along)[:, None] * (samples.position_m @ by_state)
-        jacobian *= -samples.disparity_m / along
+        jacobian = -samples.disparity_m * (samples.rays @ by_state)
         information += jacobian.T @ (jacobian * weight[:, None])
         gradient += jacobian.T @ (weight * error)
-    return information, gradient
+        shared += jacobian.T @ weight
+    return information, gradient, shared
 
 
 def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
@@ -404,7 +402,7 @@ def plane_of_frame(
     weight *= np.where(inclined, 1.0, _FLAT_WEIGHT)
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
-    samples = Samples.of(camera, uv_px, found_px, weight, np.eye(4))
+    samples = Samples.of(camera, uv_px, found_px, weight)
     share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
     start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])

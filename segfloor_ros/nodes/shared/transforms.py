@@ -116,7 +116,7 @@ class Transforms:
         self._link = TfLink(node)
         self._tf = self._link.frames
         self._opened_s = self._deadline_s = 0.0
-        self._has_own_mount = False
+        self._mounted: tuple[str, Array] | None = None
         self._unsent_mount: tuple[int, str, Mount] | None = None
         self._uncorrected: deque[FrameResult] = deque(maxlen=IMAGES.depth)
         self._T_map_odom: Array | None = None
@@ -147,7 +147,11 @@ class Transforms:
 
     def mount_is_settled(self, camera_frame: str) -> bool:
         """Whether tf tells the mount of the left optical frame, or had time enough to."""
-        if not self._link.is_there or self._has_own_mount or self.mount(camera_frame) is not None:
+        if (
+            not self._link.is_there
+            or self._mounted is not None
+            or self.mount(camera_frame) is not None
+        ):
             return True
         base, wait_s = self._own.base_frame, self._own.tf_wait_s
         if not self._is_published():
@@ -172,7 +176,7 @@ class Transforms:
 
     def mount(self, camera_frame: str) -> Mount | None:
         """Return where tf has the left optical frame on the base, or None."""
-        if self._has_own_mount:
+        if self._mounted is not None:
             return None
         T_base_camera = self._tf.lookup(self._own.base_frame, camera_frame)
         return None if T_base_camera is None else Mount.from_transform(T_base_camera)
@@ -212,11 +216,14 @@ class Transforms:
         """Where the camera's frame hangs on another one already, e.g. on the camera's body, that
         one is put on the base: a frame has one parent.
         """
-        base, root = self._own.base_frame, self._tf.root_of(camera_frame)
-        T_root_camera = self._tf.lookup(root, camera_frame)
-        if T_root_camera is None or self._tf.lookup(base, camera_frame) is not None:
-            return
-        self._has_own_mount = True
+        base = self._own.base_frame
+        if self._mounted is None:
+            root = self._tf.root_of(camera_frame)
+            T_root_camera = self._tf.lookup(root, camera_frame)
+            if T_root_camera is None or self._tf.lookup(base, camera_frame) is not None:
+                return
+            self._mounted = root, T_root_camera
+        root, T_root_camera = self._mounted
         T_base_root = mount.T_base_left @ invert(T_root_camera)
         self._link.send_fixed(transform_message(stamp_ns, base, root, T_base_root))
 

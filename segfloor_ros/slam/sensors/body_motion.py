@@ -99,7 +99,7 @@ class BodyMotion:
         if not is_sound(measurement):
             self._dropped[name] += 1
             words = f'{name}: messages without finite numbers, dropped: {self._dropped[name]}'
-            self._remark({f'dropped {name}': words})
+            self.remark({f'dropped {name}': words})
             return
         self.messages[name] += 1
         if isinstance(measurement, WheelPose):
@@ -178,7 +178,7 @@ class BodyMotion:
             return
         self._window, self._window_rate_rad_s = (stamp_ns, T_odom_camera), rate_rad_s
         self.gyroscope.learn(T_before_now[:3, :3], before_ns, stamp_ns)
-        self._remark(self.gyroscope.remarks())
+        self.remark(self.gyroscope.remarks())
         turning_up = 0.0 if math.isnan(rate_before) else rate_rad_s - rate_before
         self._learn_wheels(T_before_now, before_ns, stamp_ns, turning_up)
 
@@ -242,11 +242,11 @@ class BodyMotion:
             self._slipped_ns = now_ns
             logger.info('wheel odometry and images disagree at %.3f s', now_ns / 1e9)
             if in_a_row:
-                self._remark({'slip': SLIP_REMARK})
+                self.remark({'slip': SLIP_REMARK})
         if len(self._calibrator) >= ENOUGH:  # the slip of a few is not worth a word
-            self._remark(self._calibrator.current.remarks())
+            self.remark(self._calibrator.current.remarks())
 
-    def _remark(self, remarks: Mapping[str, str]) -> None:
+    def remark(self, remarks: Mapping[str, str]) -> None:
         """Say each thing that is wrong once."""
         for what, remark in remarks.items():
             if what not in self.remarks:

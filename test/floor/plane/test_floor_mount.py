@@ -8,9 +8,10 @@ import pytest
 from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, wall
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.configuration import resolve
 from segfloor_ros.floor.plane.mount import MAX_KEYFRAMES, MountEstimator, disagreement
 from segfloor_ros.floor.plane.plane import mean_climb
-from segfloor_ros.pipeline import make_slam
+from segfloor_ros.pipeline import Pipeline, make_slam
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.sensors.gyroscope import STEP_NS
 
@@ -157,7 +158,6 @@ def test_after_a_while_the_best_plane_will_do():
     scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=2.0)
     mounts = mounts_on_the_way(scene, 24, step_m=0.01)
     mount = mounts[-1]
-    assert mounts[14] is None
     assert mount is not None
     assert mount.height_m == pytest.approx(0.3, rel=0.05)
 
@@ -233,11 +233,45 @@ def test_a_floor_that_the_robot_drives_into_is_none(path_deg, settles):
 
 def test_disagreement_names_both_numbers():
     used, seen = Mount(0.35, np.radians(7.0)), Mount(0.30, np.radians(10.0))
-    words = disagreement(used, seen)
+    words = disagreement(used, seen, np.zeros(3))
     assert words is not None
     for number in ('0.350 m', '0.300 m', '7.0 deg', '10.0 deg'):
         assert number in words
-    assert disagreement(used, used) is None
+    assert disagreement(used, used, np.zeros(3)) is None
+    # Neither is known well enough to say so.
+    assert disagreement(used, seen, np.array([0.03, 0.03, 0.04])) is None
+
+
+def test_a_mount_that_later_looks_contradict_is_corrected_and_the_map_follows():
+    """It begins before a stage, drives past it, and sees the floor then."""
+    mount = Mount(0.35, np.radians(8.0))
+    stage = Patch((0.2, -2.0, 0.1), (1.2, 0, 0), (0, 4.0, 0), True, contrast=30.0, seed=5)
+    scene = Scene([floor_patch(), wall(7.0), stage], camera=SMALL_CAMERA, noise_grey=1.0)
+    every = resolve(assignments=['stereo_slam.keyframe_max_frames=1'])
+    pipeline = Pipeline(SMALL_CAMERA, every)
+    results, heights_m = [], []
+    for i in range(26):
+        here = replace(mount, forward_m=0.1 * i)
+        left, right, _, _ = replace(scene, mount=here, seed=i).render()
+        results.append(pipeline.process(StereoFrame(i, i * 10**8, left, right)))
+        heights_m.append(pipeline.mount.height_m if pipeline.mount else None)
+    pipeline.finish_tracking()
+    grid = pipeline.finish()
+    first = next(height_m for height_m in heights_m if height_m)
+    assert first == pytest.approx(0.25, rel=0.05)
+    assert heights_m[-1] == pytest.approx(0.35, rel=0.03)
+    assert len(set(heights_m) - {None}) == 2
+    changed = heights_m.index(heights_m[-1])
+    # All of the drive comes once more, as it is seen with the mount that is right.
+    assert [result.index for result in results[changed]] == list(range(changed + 1))
+    assert [len(one) for one in results[changed + 1 :]] == [1] * (25 - changed)
+    keyframes = {r.index for one in results[changed:] for r in one if r.keyframe is not None}
+    assert pipeline.keyframe_stages.map_updates == len(keyframes)
+    assert min(keyframes) == 0
+    assert grid is not None
+    (words,) = pipeline.slam.sensors.remarks.values()
+    assert 'height 0.2' in words
+    assert 'made anew' in words
 
 
 def kitti_folder(folder, pose_name='poses.txt'):
