@@ -347,7 +347,7 @@ class LockstepRun:
         if self._save_masks is SaveMasks.all:
             frame = self._pipeline.slam.rig_check.corrected(self._unmasked[result.index])
             self._attempt(frame.index, partial(self._mask_frame, frame, result))
-            if not self._pipeline.slam.may_remap:
+            if not self._pipeline.slam.rig.mount_may_change:
                 self._unmasked = {
                     i: later for i, later in self._unmasked.items() if i > result.index
                 }

@@ -100,10 +100,13 @@ class DisparityOffset:
 
 @dataclass
 class Rig:
-    """What all of SLAM knows of the stereo rig. mount: None until it is measured or given."""
+    """What all of SLAM knows of the stereo rig. mount: None until it is measured or given.
+    mount_may_change: whether later looks may show another.
+    """
 
     camera: StereoCamera
     mount: Mount | None = None
+    mount_may_change: bool = False
     offset: DisparityOffset = field(
         default_factory=lambda: DisparityOffset(OFFSET_SIGMA_PX, 1.0 / LOCAL_KEYFRAMES)
     )

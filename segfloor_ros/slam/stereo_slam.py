@@ -135,11 +135,6 @@ class StereoSlam:
         return self.rig.mount
 
     @property
-    def may_remap(self) -> bool:
-        """Whether `mount` may still change."""
-        return self._mount_meter is not None and self._mount_meter.may_change
-
-    @property
     def provisional(self) -> FrameResult | None:
         """The newest pose while results are held back: while the mount is being measured, by the
         mount as it seems so far; or of a drive that was broken off and maps on its own since, as
@@ -303,7 +298,7 @@ class StereoSlam:
         else:
             self.back_end.start_submap()
         if self.mount is not None:
-            self._mount_meter = None
+            self._mount_meter, self.rig.mount_may_change = None, False
             self._held.keep(False)
         elif self._mount_meter is not None:
             self._mount_meter.reset()
@@ -383,6 +378,7 @@ class StereoSlam:
         if meter.remark is not None:
             self.sensors.remark({'mount': meter.remark})
         self.rig.mount = meter.mount
+        self.rig.mount_may_change = meter.may_change
         self._held.keep(meter.may_change)
 
     def _take_adjustment(self, wait: bool) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import SUBPIXEL, seen_from_right
 from segfloor_ros.camera.model import Mount, StereoCamera, is_disparity
+from segfloor_ros.geometry import Array
 
 NOISE_PX = 0.5
 """Error of a disparity, one sigma."""
@@ -165,8 +166,8 @@ def refined(
     right: NDArray[np.uint8],
     disparity: NDArray[np.float32],
     noise_grey: float,
-    at: tuple[NDArray[np.intp], NDArray[np.intp]],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    at: tuple[NDArray[np.integer], NDArray[np.integer]],
+) -> tuple[Array, Array, Array, Array]:
     """Return what the blocks around rows and columns `at`, (N,) each, show of a pair (H, W) by
     least squares on its grey levels, near disparities (H, W) that were matched: rows, columns and
     disparities (N,) of their texture, and the standard deviation of these, in pixels: infinite
@@ -190,21 +191,22 @@ def refined(
     slope *= known
     step = (smooth - warped) * known
 
-    def in_block(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return cv2.boxFilter(values, -1, _FINE_BLOCK, normalize=False)[at]
+    def in_block(values: NDArray[np.floating]) -> Array:
+        return cv2.boxFilter(values, -1, _FINE_BLOCK, normalize=False)[at].astype(np.float64)
 
     squared = slope * slope
     count, by_slope = np.maximum(in_block(known), 1), in_block(slope)
-    power = np.maximum(in_block(squared), np.float32(1e-3))
+    power = np.maximum(in_block(squared), 1e-3)
     # Noise has slopes, too: they are no information.
-    noise = count * np.float32(_NOISE_SLOPE * noise_grey**2)
-    information = np.maximum(power - by_slope**2 / count - noise, np.float32(1e-3))
+    noise = count * _NOISE_SLOPE * noise_grey**2
+    information = np.maximum(power - by_slope**2 / count - noise, 1e-3)
     shift = (in_block(slope * step) - by_slope * in_block(step) / count) / information
     matched = in_block(squared * disparity) / power
-    shown = in_block(squared * rows[:, None]) / power, in_block(squared * columns) / power
+    shown_row = in_block(squared * rows[:, None]) / power
+    shown_column = in_block(squared * columns) / power
     sigma = noise_grey * np.sqrt(2 / information)
     sigma[np.abs(shift) > SAME_PX] = np.inf
-    return *shown, matched - shift, sigma
+    return shown_row, shown_column, matched - shift, sigma
 
 
 class TwoScaleMatcher:

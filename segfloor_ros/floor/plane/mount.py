@@ -122,7 +122,7 @@ class MountEstimator:
         self._offset = (forward_m, left_m)
         self._viewer = MountViewer(camera)
         self.mount = self._given = given
-        self._sigma = np.zeros(3)
+        self._sigma: Array = np.zeros(3)
         self.remark: str | None = None
         self.reset()
 
@@ -386,9 +386,9 @@ class MountViewer:
         rise = np.where((above > 0) & (below > 0), (below - above) / (2 * BLOCK_PX), 0.0)
         if noise is None:
             return self._placed(rows, columns, disparity[rows, columns], np.ones(len(rows)), rise)
-        *shown_at, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
-        weight = 1.0 / (1.0 + (sigma.astype(np.float64) / NOISE_PX) ** 2)
-        return self._placed(*shown_at, found_px, weight, rise)
+        row, column, found_px, sigma = refined(left, right, disparity, noise, (rows, columns))
+        weight = 1.0 / (1.0 + (sigma / NOISE_PX) ** 2)
+        return self._placed(row, column, found_px, weight, rise)
 
     def bases(
         self, left: NDArray[np.uint8], disparity: NDArray[np.float32], enough: float

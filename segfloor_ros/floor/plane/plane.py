@@ -292,7 +292,7 @@ def refine(
     state = start.copy()
     free = np.isnan(known)
     information: Array = np.eye(3)
-    shared = np.zeros(3)
+    shared: Array = np.zeros(3)
     prior = np.diag(sigma**-2.0)
     for scale in scales_px:
         information, gradient, shared = _normal_equations(frames, state, scale)

@@ -250,7 +250,7 @@ def test_a_mount_that_later_looks_contradict_is_corrected_and_the_map_follows():
     every = resolve(assignments=['stereo_slam.keyframe_max_frames=1'])
     pipeline = Pipeline(SMALL_CAMERA, every)
     results, heights_m = [], []
-    for i in range(26):
+    for i in range(48):
         here = replace(mount, forward_m=0.1 * i)
         left, right, _, _ = replace(scene, mount=here, seed=i).render()
         results.append(pipeline.process(StereoFrame(i, i * 10**8, left, right)))
@@ -264,7 +264,7 @@ def test_a_mount_that_later_looks_contradict_is_corrected_and_the_map_follows():
     changed = heights_m.index(heights_m[-1])
     # All of the drive comes once more, as it is seen with the mount that is right.
     assert [result.index for result in results[changed]] == list(range(changed + 1))
-    assert [len(one) for one in results[changed + 1 :]] == [1] * (25 - changed)
+    assert [len(one) for one in results[changed + 1 :]] == [1] * (47 - changed)
     keyframes = {r.index for one in results[changed:] for r in one if r.keyframe is not None}
     assert pipeline.keyframe_stages.map_updates == len(keyframes)
     assert min(keyframes) == 0
