@@ -240,11 +240,13 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
         def __init__(self):
             self.seen = 0
-            self.mount = None
+            self.mount = self.remark = None
+            self.is_final = self.may_change = False
 
         def add(self, left, right, T_world_left, up_world, is_new_view):
             self.seen += is_new_view
             self.mount = MOUNT if self.seen == 3 else None
+            self.is_final = self.mount is not None
 
     slam = StereoSlam(CAMERA, SETTINGS, None, LateMeter())
     batches = [slam.process(frame) for frame in frames]
