@@ -86,7 +86,7 @@ SLAM: dict[str, Mechanism] = {
     ),
     'alignment of patches': Mechanism({'slam.tracking.map_tracking.align_pixels': _none}),
     'following between keyframes': Mechanism({'slam.tracking.map_tracking.Follower.follow': _none}),
-    'disparity offset': Mechanism({'slam.rig.EXPECTED_SIGMA_PX': 0.0}),
+    'disparity offset': Mechanism({'slam.rig.OFFSET_SIGMA_PX': 0.0}),
     'bad adjustments left out': Mechanism({'slam.mapping.keyframe_mapping.MAJORITY': 0.0}),
     'known views': Mechanism({'slam.places.views.NEARLY_ALL': 2.0}),
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),

@@ -10,10 +10,11 @@ from bundle_problems import disturbed, make_problem
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.camera.model import StereoFrame
+from segfloor_ros.camera.rig.estimates import OFFSET_SIGMA_PX
 from segfloor_ros.geometry import make_transform, se3_exp, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import adjust
 from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.rig import EXPECTED_SIGMA_PX, DisparityOffset, OffsetEstimate
+from segfloor_ros.slam.rig import DisparityOffset, OffsetEstimate
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 FRAMES, TURNED_FRAMES = 40, 21
@@ -143,4 +144,4 @@ def test_a_turn_on_the_spot_shows_little_and_changes_little():
         assert all(result.tracked for result in results)
         offsets.append(abs(slam.rig.offset.value_px))
     # One drive alone may err by as much as the noise of its matches.
-    assert np.median(offsets) < 0.5 * EXPECTED_SIGMA_PX
+    assert np.median(offsets) < 0.5 * OFFSET_SIGMA_PX
