@@ -36,7 +36,7 @@ FRAME_NS = 100_000_000
 
 @pytest.fixture(scope='module')
 def frames():
-    return room_drive(6)[0]
+    return room_drive(3)[0]
 
 
 def health(graph, node: str):

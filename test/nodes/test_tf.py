@@ -174,7 +174,7 @@ def test_without_tf_the_wait_ends_and_the_mount_is_measured(start, drive) -> Non
     frames, _ = drive
     chain = start(**WITHOUT_MOUNT, tf_wait_s=1.0)
     tf, mounts = Listener(chain.graph), chain.graph.collect('camera_mount')
-    chain.drive(frames[:6])
+    chain.drive(frames[:3])
     chain.graph.until(lambda: mounts and tf.fixed, 'the mount measured')
     measured = Mount.from_transform(transform_array(mounts[0]))
     assert measured.height_m == pytest.approx(MOUNT.height_m, rel=0.03)

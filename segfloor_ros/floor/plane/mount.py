@@ -317,12 +317,12 @@ class PlaneSearch:
 
     def is_known(self) -> bool:
         """Return whether the last plane is known, by what varies within a frame and over the drive.
-        Before that can vary it must be known much better. In the end any view will do, and a plane
-        that is off by some per cent is better than none.
+        Before that can vary, both count as SIGMAS of what they are. In the end any view will do, and
+        a plane that is off by some per cent is better than none.
         """
         assert self.fit is not None
         is_late = self._looks >= MAX_KEYFRAMES
-        sure = 1.0 if is_late or len(self.frames) >= LOOKS else SIGMAS * _SURE
+        sure = 1.0 if is_late or len(self.frames) >= LOOKS else SIGMAS * SIGMAS
         sigma = sure * self.fit.sigma / (1.0, 1.0, self.fit.angles_height[2])
         return self.fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
 

@@ -152,11 +152,12 @@ def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
 
 
 def test_after_a_while_the_best_plane_will_do():
-    """A rug is all that has texture: its height is known to two per cent, never better."""
-    rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=20.0, seed=5)
+    """A rug is all that has texture, and little more than the noise: it takes long, not for ever."""
+    rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=16.0, seed=5)
     floor, blank = floor_patch(grey=175.0, contrast=0.0), wall(4.0, contrast=0.0)
-    scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=2.0)
+    scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=3.0)
     mounts = mounts_on_the_way(scene, 24, step_m=0.01)
+    assert mounts[14] is None
     mount = mounts[-1]
     assert mount is not None
     assert mount.height_m == pytest.approx(0.3, rel=0.05)
@@ -325,10 +326,11 @@ def test_a_camera_that_stands_has_a_mount_too():
     assert results[0].keyframe is not None
 
 
-def test_looks_at_one_view_are_worth_one():
-    scene = Scene([floor_patch(contrast=6.0), wall()], camera=SMALL_CAMERA, noise_grey=3.0)
+@pytest.mark.parametrize('is_new_view', [False, True])
+def test_looks_at_one_view_are_worth_one(is_new_view):
+    scene = Scene([floor_patch(contrast=4.0), wall()], camera=SMALL_CAMERA, noise_grey=3.0)
     estimator = MountEstimator(SMALL_CAMERA)
     left, right, _, _ = scene.render()
     for i in range(MAX_KEYFRAMES - 1):
-        estimator.add(left, right, np.eye(4), is_new_view=i == 0)
-    assert estimator.mount is None
+        estimator.add(left, right, np.eye(4), is_new_view=i == 0 or is_new_view)
+    assert (estimator.mount is not None) == is_new_view
