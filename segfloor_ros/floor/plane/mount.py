@@ -317,8 +317,8 @@ class PlaneSearch:
 
     def is_known(self) -> bool:
         """Return whether the last plane is known, by what varies within a frame and over the drive.
-        Before that can vary, both count as SIGMAS of what they are. In the end any view will do, and
-        a plane that is off by some per cent is better than none.
+        Before that can vary it must be known four times better. In the end any view will do, and a
+        plane that is off by some per cent is better than none.
         """
         assert self.fit is not None
         is_late = self._looks >= MAX_KEYFRAMES

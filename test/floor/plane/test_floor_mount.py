@@ -152,7 +152,7 @@ def test_a_camera_that_is_lost_before_its_mount_is_known_begins_again():
 
 
 def test_after_a_while_the_best_plane_will_do():
-    """A rug is all that has texture, and little more than the noise: it takes long, not for ever."""
+    """A rug is all that has texture, little more than the noise: it takes long, not for ever."""
     rug = Patch((0.9, -0.15, 0.0), (0.46, 0, 0), (0, 0.3, 0), True, contrast=16.0, seed=5)
     floor, blank = floor_patch(grey=175.0, contrast=0.0), wall(4.0, contrast=0.0)
     scene = Scene([floor, blank, rug], mount=Mount(0.3, np.radians(7.0)), noise_grey=3.0)
