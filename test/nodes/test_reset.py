@@ -2,43 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from floor_scenes import Patch, Scene, floor_patch, wall
 from node_messages import cloud_messages, grid_arrays, publish
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.camera.model import Mount, StereoFrame
+from segfloor_ros.configuration import resolve
 from segfloor_ros.messages.arrays import (
     camera_info_message,
     image_message,
     labelled_arrays,
     map_start_message,
+    map_start_ns,
     rectified_calibration,
 )
+from segfloor_ros.messages.poses import transform_array
 from segfloor_ros.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.pipeline import Pipeline
 
 S = 1_000_000_000
 FRAMES, MIDDLE = 12, 6
 CALIBRATION = rectified_calibration(CAMERA)
+MOUNTED = (
+    '-p', f'camera_height_m:={MOUNT.height_m}', '-p', 'camera_roll_rad:=0.0',
+    '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+)  # fmt: skip
 BEHIND_SLAM = (FloorSegmentationNode, CloudLabellingNode, OccupancyGridNode)
 
 
 class Chain:
     """The four nodes behind the camera, fed frame by frame."""
 
-    def __init__(self, make_graph) -> None:
+    def __init__(self, make_graph, *options: str) -> None:
         self.graph = make_graph(
-            '-p', 'background:=false', '-p', 'publish_period_s:=0.0',
-            '-p', f'camera_height_m:={MOUNT.height_m}', '-p', 'camera_roll_rad:=0.0',
-            '-p', f'camera_pitch_rad:={MOUNT.pitch_rad}',
+            '-p', 'background:=false', '-p', 'publish_period_s:=0.0', *(options or MOUNTED)
         )  # fmt: skip
         self._maps = self.graph.collect('map')
         self._labelled = self.graph.collect('labelled_points')
@@ -123,6 +132,35 @@ def test_slam_begun_anew_in_mid_drive_takes_all_nodes_along(make_graph, how) -> 
     after = chain.drive(frames[MIDDLE:])
     chain.graph.close()
     assert_same(after, Chain(make_graph).drive(frames[MIDDLE:]))
+
+
+def test_a_mount_that_turns_out_to_be_wrong_has_all_nodes_map_anew(make_graph) -> None:
+    """The robot begins before a stage: the map is the one that `run` makes of the same images."""
+    stage = Patch((0.2, -2.0, 0.1), (1.2, 0, 0), (0, 4.0, 0), True, contrast=30.0, seed=5)
+    scene = Scene([floor_patch(), wall(7.0), stage], camera=CAMERA, noise_grey=1.0)
+    frames = []
+    for i in range(48):
+        here = Mount(0.35, np.radians(8.0), forward_m=0.1 * i)
+        left, right, _, _ = replace(scene, mount=here, seed=i).render()
+        frames.append(StereoFrame(i, (i + 1) * S // 10, left, right))
+    chain = Chain(make_graph, '-p', 'keyframe_max_frames:=1', '-p', 'tf_wait_s:=0.0')
+    names = ('camera_mount', MAP_START, 'map')
+    mounts, starts, maps = (chain.graph.collect(name) for name in names)
+    chain.send(frames)
+    pipeline = Pipeline(CAMERA, resolve(assignments=['stereo_slam.keyframe_max_frames=1']))
+    results = [result for frame in frames for result in pipeline.process(frame)]
+    assert len(results) > len(frames)
+    last_ns = max(result.stamp_ns for result in results if result.keyframe is not None)
+    chain.graph.until(lambda: maps and to_ns(maps[-1].header.stamp) == last_ns, 'the new map')
+    heights_m = [Mount.from_transform(transform_array(mount)).height_m for mount in mounts]
+    assert heights_m == pytest.approx([0.25, 0.35], rel=0.05)
+    assert len({map_start_ns(start) for start in starts}) == 2
+    expected = pipeline.finish()
+    assert expected is not None
+    cells = grid_arrays(maps[-1], '').cells
+    assert cells.shape == expected.cells.shape
+    # At the edges of what is seen rounding decides.
+    assert (cells != expected.cells).sum() < 0.002 * (expected.cells >= 0).sum()
 
 
 def test_a_late_pair_is_dropped_and_does_not_begin_anew(make_graph) -> None:
