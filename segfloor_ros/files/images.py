@@ -62,6 +62,11 @@ def read_colour(path: Path) -> Grey:
     return decode_colour(read_bytes(path), str(path))
 
 
+def read_depth(path: Path) -> NDArray[Any]:
+    """Return the depth image (H, W) of a file, also of floats; errors as of `read_grey`."""
+    return _decoded(read_bytes(path), str(path), GREY, (np.uint8, np.uint16, np.float32))
+
+
 def read_mask(path: Path) -> NDArray[np.uint8]:
     """Return the mask (H, W) of an image file of 8 bits. Raises InputError."""
     return _eight_bit(read_grey(path), path)
@@ -117,7 +122,9 @@ def _eight_bit(image: NDArray[Any], path: Path) -> NDArray[np.uint8]:
     return image
 
 
-def _decoded(data: bytes, name: str, flags: int) -> NDArray[Any]:
+def _decoded(
+    data: bytes, name: str, flags: int, kinds: tuple[type, ...] = (np.uint8, np.uint16)
+) -> NDArray[Any]:
     _check_complete(data, name)
     try:
         with silent_libraries():
@@ -126,8 +133,9 @@ def _decoded(data: bytes, name: str, flags: int) -> NDArray[Any]:
         image = None
     if image is None:
         raise CorruptImageError(f'{name}: the image cannot be decoded')
-    if image.dtype not in (np.uint8, np.uint16):
-        raise CorruptImageError(f'{name}: pixels are {image.dtype}, expected 8 or 16 bits')
+    if image.dtype not in kinds:
+        expected = ' or '.join(np.dtype(kind).name for kind in kinds)
+        raise CorruptImageError(f'{name}: pixels are {image.dtype}, expected {expected}')
     check_size(image.shape[1], image.shape[0], name)
     return image
 

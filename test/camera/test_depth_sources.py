@@ -111,6 +111,25 @@ def test_depth_of_eight_bits_is_no_depth(tmp_path: Path) -> None:
         opened(folder, depth=True)
 
 
+def test_depth_in_metres_is_read_from_tiff_files(tmp_path: Path) -> None:
+    folder = rgbd_folder(tmp_path)
+    for i, path in enumerate(sorted((folder / 'depth').iterdir())):
+        path.unlink()
+        depth_m = depth_mm(1000 + 500 * i).astype(np.float32) / 1000
+        write_image(path.with_suffix('.tiff'), depth_m)
+    frames = list(opened(folder, depth=True).frames())
+    np.testing.assert_allclose(
+        [frame.right[20, 20] for frame in frames], SCALE / np.array([1.0, 1.5, 2.0])
+    )
+
+
+def test_depth_of_another_size_is_named(tmp_path: Path) -> None:
+    folder = rgbd_folder(tmp_path)
+    write_image(folder / 'depth' / '000001.png', depth_mm()[::2, ::2])
+    with pytest.raises(SegfloorError, match=r'the depth image of frame 1 is 32x24, but .*64x48'):
+        list(opened(folder, depth=True).frames())
+
+
 def test_a_tum_folder_is_paired_by_its_stamps(tmp_path: Path) -> None:
     folder = tmp_path / 'rgbd_dataset_freiburg3_office'
     rows: dict[str, list[str]] = {'rgb': ['# colour images'], 'depth': ['# depth maps']}

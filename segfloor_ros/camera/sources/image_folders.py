@@ -42,7 +42,7 @@ from segfloor_ros.camera.sources.files import (
 )
 from segfloor_ros.camera.sources.source import Stamped, StereoSource
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.images import read_grey
+from segfloor_ros.files.images import read_depth
 from segfloor_ros.files.whole import END_NS, nanoseconds, whole_nanoseconds
 from segfloor_ros.geometry import Array, invert, make_transform
 
@@ -323,13 +323,13 @@ def _depth_source(
     """Return images with depth images in place of the right ones. left: of the raw images."""
     calibration = depth_calibration(left)
 
-    def read_depth(path: Path) -> NDArray[Any]:
-        return disparity_of_depth(read_grey(path), calibration.camera, metres_per_unit)
+    def read_disparity(path: Path) -> NDArray[Any]:
+        return disparity_of_depth(read_depth(path), calibration.camera, metres_per_unit)
 
     found = RecordedSensor(DEPTH, str(pairs[0].right.parent), len(pairs), True)
     others = [sensor for sensor in sensors if sensor.name != DEPTH]
     return files.file_pair_source(
-        name, pairs, calibration, settings.bit_depth, [found, *others], read_depth
+        name, pairs, calibration, settings.bit_depth, [found, *others], read_disparity
     )
 
 
@@ -345,7 +345,8 @@ def with_depth(
     depth = files.images_in(folder / DEPTH) if (folder / DEPTH).is_dir() else []
     if not depth:
         raise InputError(
-            f'{folder / DEPTH}: there are no depth images (16-bit PNG, mm); leave out --depth'
+            f'{folder / DEPTH}: there are no depth images (16-bit PNG in mm, TIFF of floats in '
+            'm); leave out --depth'
         )
     by_name = {path.stem: path for path in depth}
     partners = [by_name.get(pair.left.stem) for pair in pairs]

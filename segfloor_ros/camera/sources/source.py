@@ -204,11 +204,15 @@ class StereoSource:
         except CorruptImageError as error:
             self.skip(entry.index, str(error))
             return None
-        for image in (left, right):
-            what = f'{self.name}: frame {entry.index}'
+        is_depth = is_disparity(right)
+        for image, kind in (
+            (left, 'frame'),
+            (right, 'the depth image of frame' if is_depth else 'frame'),
+        ):
+            what = f'{self.name}: {kind} {entry.index}'
             self.calibration.check_size(image.shape[1], image.shape[0], what)
         colour, left = left if left.ndim == 3 else None, to_grey(left)
-        if is_disparity(right):
+        if is_depth:
             left, right = self._eight_bit(left, left)[0], right.astype(np.float32, copy=False)
         else:
             left, right = self._eight_bit(left, right)
