@@ -290,15 +290,17 @@ class PlaneSearch:
         order = np.argsort(-total, kind='stable')[:_KEPT]
         # Frames that show the same err together: the prior counts once per frame, too.
         sigma = sigma / math.sqrt(len(frames))
-        fit = refine(some, guesses[order[0]], self._known, travel, mean, sigma)
+        fit = refine(Samples.joined(some), guesses[order[0]], self._known, travel, mean, sigma)
         if contrary:
-            below = max(fit.violations, shares(contrary, fit.angles_height)[1])
+            below = max(fit.violations, shares(Samples.joined(contrary), fit.angles_height)[1])
             fit = replace(fit, violations=below)
         self._guesses = np.concatenate([fit.angles_height[None], guesses[order]])
         self._guesses = self._guesses[plausible(self._guesses)]
-        self.fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(some, fit, prior)))
         self._looks += 1
-        return self.fit
+        if self._is_known(fit):
+            fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(some, fit, prior)))
+        self.fit = fit
+        return fit
 
     def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
         """Return the standard deviations (3,) of a plane by how much those of parts of the drive
@@ -310,7 +312,14 @@ class PlaneSearch:
         mean, sigma = prior[0], prior[1] * math.sqrt(LOOKS / len(frames))
         still = np.zeros((0, 3))
         planes = [
-            refine(frames[first:end], fit.angles_height, self._known, still, mean, sigma)
+            refine(
+                Samples.joined(frames[first:end]),
+                fit.angles_height,
+                self._known,
+                still,
+                mean,
+                sigma,
+            )
             for first, end in pairwise(ends)
         ]
         return np.std([plane.angles_height for plane in planes], axis=0, ddof=1) / math.sqrt(LOOKS)
@@ -320,11 +329,13 @@ class PlaneSearch:
         Before that can vary it must be known four times better. In the end any view will do, and a
         plane that is off by some per cent is better than none.
         """
-        assert self.fit is not None
+        return self.fit is not None and self._is_known(self.fit)
+
+    def _is_known(self, fit: PlaneFit) -> bool:
         is_late = self._looks >= MAX_KEYFRAMES
         sure = 1.0 if is_late or len(self.frames) >= LOOKS else SIGMAS * SIGMAS
-        sigma = sure * self.fit.sigma / (1.0, 1.0, self.fit.angles_height[2])
-        return self.fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
+        sigma = sure * fit.sigma / (1.0, 1.0, fit.angles_height[2])
+        return fit.is_seen and bool((sigma < _SIGMA * (2 if is_late else 1)).all())
 
 
 def _thinned(frames: list[Samples]) -> list[Samples]:

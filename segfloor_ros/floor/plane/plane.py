@@ -9,6 +9,7 @@ pixel. A camera that is fixed to its base sees the floor on the same plane in al
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +92,18 @@ class Samples:
             disparity_px=self.disparity_px[::step],
             weight=self.weight[::step] * step,
             rise=None if self.rise is None else self.rise[::step],
+        )
+
+    @classmethod
+    def joined(cls, frames: Sequence[Samples]) -> Samples:
+        """Return the samples of at least one frame of one camera as those of one."""
+        rises = [frame.rise for frame in frames if frame.rise is not None]
+        return replace(
+            frames[0],
+            rays=np.concatenate([frame.rays for frame in frames]),
+            disparity_px=np.concatenate([frame.disparity_px for frame in frames]),
+            weight=np.concatenate([frame.weight for frame in frames]),
+            rise=np.concatenate(rises) if rises else None,
         )
 
     def weight_on(self, plane: Array) -> Array:
@@ -236,18 +249,19 @@ def scores(samples: Samples, angles_height: Array) -> Array:
     return samples.weight @ on
 
 
-def shares(frames: list[Samples], angles_height: Array) -> tuple[float, float]:
+def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
     """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
     and which below it.
     """
-    on = below = total = 0.0
-    for samples in frames:
-        error, limit, visible = _seen(samples, plane_of(angles_height)[None])
-        weight = np.where(visible[:, 0], samples.weight, 0)
-        total += float(weight.sum())
-        on += float(weight[np.abs(error[:, 0]) < SAME_PX].sum())
-        below += float(weight[error[:, 0] < limit[:, 0]].sum())
-    return (on / total, below / total) if total > 0 else (0.0, 1.0)
+    error, limit, visible = (
+        column[:, 0] for column in _seen(samples, plane_of(angles_height)[None])
+    )
+    weight = np.where(visible, samples.weight, 0)
+    total = float(weight.sum())
+    if total == 0:
+        return 0.0, 1.0
+    on, below = weight[np.abs(error) < SAME_PX].sum(), weight[error < limit].sum()
+    return float(on) / total, float(below) / total
 
 
 def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
@@ -275,7 +289,7 @@ def _climb_sigma_m(travel: Array) -> Array:
 
 
 def refine(
-    frames: list[Samples],
+    samples: Samples,
     start: Array,
     known: Array,
     travel: Array,
@@ -283,7 +297,7 @@ def refine(
     sigma: Array,
     scales_px: tuple[float, ...] = _SCALES_PX,
 ) -> PlaneFit:
-    """Refine pitch, roll and height (3,) by robust Gauss-Newton on the disparities of all frames.
+    """Refine pitch, roll and height (3,) by robust Gauss-Newton on disparities.
 
     known: (3,), values that are given, NaN where not. travel: (T, 3) displacements of the camera in
     metres, along which the floor runs. mean, sigma: (3,) what is expected, and how surely.
@@ -295,7 +309,7 @@ def refine(
     shared: Array = np.zeros(3)
     prior = np.diag(sigma**-2.0)
     for scale in scales_px:
-        information, gradient, shared = _normal_equations(frames, state, scale)
+        information, gradient, shared = _normal_equations(samples, state, scale)
         _add_travel(information, gradient, state, travel)
         information += prior
         gradient += prior @ (mean - state)
@@ -308,7 +322,7 @@ def refine(
     covariance = np.linalg.pinv(information[np.ix_(free, free)])
     by_offset = OFFSET_SIGMA_PX * (covariance @ shared[free])
     error[free] = np.sqrt(np.maximum(np.diag(covariance), 0) + by_offset**2)
-    return PlaneFit(state, error, *shares(frames, state))
+    return PlaneFit(state, error, *shares(samples, state))
 
 
 def _jacobian(angles_height: Array) -> Array:
@@ -322,31 +336,28 @@ def _jacobian(angles_height: Array) -> Array:
     return by_angles / height
 
 
-def _normal_equations(
-    frames: list[Samples], state: Array, scale: float
-) -> tuple[Array, Array, Array]:
+def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Array, Array, Array]:
     """Return the information (3, 3), the gradient (3,), and that (3,) of an error of a pixel which
     all disparities share.
     """
-    information, gradient, shared = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    plane, by_state = plane_of(state), _jacobian(state)
-    for samples in frames:
-        expected = -samples.disparity_m * (samples.rays @ plane)
-        error = samples.disparity_px - expected
-        weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
-        weight = np.where(expected > SAME_PX, weight, 0)
-        weight /= _CORRELATED_SAMPLES * NOISE_PX**2
-        jacobian = -samples.disparity_m * (samples.rays @ by_state)
-        information += jacobian.T @ (jacobian * weight[:, None])
-        gradient += jacobian.T @ (weight * error)
-        shared += jacobian.T @ weight
-    return information, gradient, shared
+    by_state = _jacobian(state)
+    plane = -state[2] * by_state[:, 2]
+    expected = -samples.disparity_m * (samples.rays @ plane)
+    error = samples.disparity_px - expected
+    weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
+    weight = np.where(expected > SAME_PX, weight, 0)
+    weight /= _CORRELATED_SAMPLES * NOISE_PX**2
+    jacobian = -samples.disparity_m * (samples.rays @ by_state)
+    information = jacobian.T @ (jacobian * weight[:, None])
+    return information, jacobian.T @ (weight * error), jacobian.T @ weight
 
 
 def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
     """Add that the camera travels parallel to the floor: all displacements count as one."""
+    if len(travel) == 0:
+        return
     unit = np.array([*state[:2], 1.0])
-    scaled = travel / (_climb_sigma_m(travel) * math.sqrt(max(1, len(travel))))[:, None]
+    scaled = travel / (_climb_sigma_m(travel) * math.sqrt(len(travel)))[:, None]
     rows = scaled @ _jacobian(unit)[:, :2]
     information[:2, :2] += rows.T @ rows
     gradient[:2] -= rows.T @ (scaled @ plane_of(unit))
@@ -407,7 +418,7 @@ def plane_of_frame(
     start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    return refine([samples], start, unknown, still, start, sigma, _NEAR_SCALES_PX)
+    return refine(samples, start, unknown, still, start, sigma, _NEAR_SCALES_PX)
 
 
 def likeliest(share: Array, expected: Array) -> int:

@@ -15,6 +15,7 @@ from segfloor_ros.floor.plane.mount import MountViewer, PlaneSearch, level_prior
 from segfloor_ros.floor.plane.plane import PlaneFit, Samples, plane_of, refine
 
 UNKNOWN, STILL = np.full(3, np.nan), np.zeros((0, 3))
+NOTHING = Samples(np.zeros((0, 3)), np.zeros(0), np.zeros(0), 1.0)
 DISPARITY_M = 40.0
 CAMERA = StereoCamera(320, 240, 160.0, 160.0, 159.5, 119.5, 0.25)
 VGA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.25)
@@ -83,7 +84,7 @@ def test_a_floor_runs_along_the_path_on_it() -> None:
     """The camera is pitched by 0.3: a level path leads up to the floor's plane that is steeper."""
     path = np.array([[0.0, -np.sin(0.3), np.cos(0.3)], [0.2, -np.sin(0.3), np.cos(0.3)]])
     start, unsure = TRUE + np.array([0.2, 0.1, 0.0]), np.array([0.5, 0.5, 0.1])
-    fit = refine([], start, UNKNOWN, path, start, unsure)
+    fit = refine(NOTHING, start, UNKNOWN, path, start, unsure)
     climb = np.abs(plane_of(fit.angles_height) * TRUE[2] @ path.T)
     assert climb.max() < 0.1 * np.abs(plane_of(start) * TRUE[2] @ path.T).max()
     assert fit.angles_height[0] == pytest.approx(TRUE[0], abs=0.03)
@@ -101,7 +102,7 @@ def test_how_a_plane_is_known() -> None:
 
     def fit(disparity: np.ndarray, rise: np.ndarray) -> PlaneFit:
         frame = Samples(rays, disparity, np.ones(3000), DISPARITY_M, rise, down)
-        return refine([frame] * 20, TRUE, UNKNOWN, STILL, TRUE, unsure)
+        return refine(Samples.joined([frame] * 20), TRUE, UNKNOWN, STILL, TRUE, unsure)
 
     exact, off = fit(true_px, rise), fit(true_px + OFFSET_SIGMA_PX, rise)
     np.testing.assert_allclose(exact.angles_height, TRUE, atol=1e-6)
