@@ -164,8 +164,11 @@ def test_faults_are_named_in_a_line(tmp_path: Path, caplog: pytest.LogCaptureFix
     with pytest.raises(InputError, match=r'left03.png, right03.png: not of the size of the other'):
         calibrate_folder(folder, PLAIN)
     (folder / 'left03.png').unlink()
-    with pytest.raises(InputError, match=r'4 left and 5 right images'):
+    with pytest.raises(CalibrationError, match=r'seen in 4 of 4 pairs, 5 are needed'):
         calibrate_folder(folder, PLAIN)
+    assert [r.getMessage() for r in caplog.records] == [
+        f'{folder}: 0 left and 1 right images have no partner of the same number; they are left out'
+    ]
     with pytest.raises(InputError, match=r'expected image folders left and right, or images'):
         calibrate_folder(tmp_path, PLAIN)
     assert not (folder / 'left.yaml').exists()

@@ -242,15 +242,39 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), '') if part.isdecimal() else (0, part) for part in parts]
 
 
-def check_equal_numbers(name: str, left: Sequence[Path], right: Sequence[Path]) -> None:
-    """Raise InputError unless there are as many left as right images, and at least one."""
+def partners(name: str, left: Sequence[Path], right: Sequence[Path]) -> tuple[list[int], list[int]]:
+    """Return which left and which right images, by their places, are pairs: those with the same
+    last number in their names; in their order where such numbers tell nothing and both sides have
+    as many. Images without partner are counted in a warning and left out. Raises InputError where
+    none has one.
+    """
     if not left and not right:
         raise InputError(f'{name}: there are no images in its folders')
-    if len(left) != len(right):
+    places = [_by_number(side) for side in (left, right)]
+    if not all(places) and len(left) == len(right):
+        return list(range(len(left))), list(range(len(right)))
+    common = sorted(places[0].keys() & places[1].keys())
+    if not common:
         raise InputError(
-            f'{name}: {len(left)} left and {len(right)} right images; every left image needs its '
-            'right one: complete the copy, or remove the images without partner'
+            f'{name}: {len(left)} left and {len(right)} right images, none with the number of one '
+            'of the other side; complete the copy, or give partners the same number'
         )
+    alone = [len(side) - len(common) for side in (left, right)]
+    if any(alone):
+        logger.warning(
+            '%s: %d left and %d right images have no partner of the same number; they are left out',
+            name, *alone,
+        )  # fmt: skip
+    return [places[0][number] for number in common], [places[1][number] for number in common]
+
+
+def _by_number(paths: Sequence[Path]) -> dict[int, int]:
+    """Return the places of files by the last number of their names; empty where that is not one of
+    its own for each.
+    """
+    numbers = [re.findall(r'\d+', path.stem)[-1:] for path in paths]
+    places = {int(last): place for place, found in enumerate(numbers) for last in found}
+    return places if len(places) == len(paths) else {}
 
 
 def folder_sensors(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -89,13 +88,15 @@ def open_image_folders(folder: Path, settings: StereoCameraSettings) -> StereoSo
     sides = _side_images(folder)
     if settings.depth or (sides and not sides[1] and (folder / DEPTH).is_dir()):
         return _open_depth(folder, sides[0] if sides else [], settings)
-    left, right = find_image_pairs(folder)
+    left, right = _both_sides(folder)
     stamps = _stamps(folder, left, settings.rate_hz)
+    places = files.partners(str(folder), left, right)
     pairs = [
-        files.FilePair(i, *fields) for i, fields in enumerate(zip(stamps, left, right, strict=True))
+        files.FilePair(number, stamps[i], left[i], right[j])
+        for number, (i, j) in enumerate(zip(*places, strict=True))
     ]
-    places = (folder, left[0].parent, left[0].parent.parent)
-    calibration = find_calibration(str(folder), places, settings)
+    near = (folder, left[0].parent, left[0].parent.parent)
+    calibration = find_calibration(str(folder), near, settings)
     sensors = folder_sensors(folder, settings.ignored_sensors)
     return files.file_pair_source(str(folder), pairs, calibration, settings.bit_depth, sensors)
 
@@ -116,24 +117,24 @@ def find_image_pairs(folder: Path) -> tuple[list[Path], list[Path]]:
     """Return the left and the right images of a folder, in natural order, partner by partner.
 
     Either in two subfolders (`left` and `right`, or similar names), or side by side
-    (`left01.jpg`, `right01.jpg`). Raises InputError when they do not match.
+    (`left01.jpg`, `right01.jpg`). Raises InputError where there are no pairs.
     """
+    left, right = _both_sides(folder)
+    chosen = files.partners(str(folder), left, right)
+    return [left[i] for i in chosen[0]], [right[i] for i in chosen[1]]
+
+
+def _both_sides(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return all left and all right images of a folder. Raises InputError where a side is empty."""
     sides = _side_images(folder)
     if sides is None:
         raise InputError(
             f'{folder}: expected image folders left and right, or images left01… and right01…'
         )
-    left, right = sides
-    if not (left and right) and (left or right):
-        raise InputError(f'{folder}: {len(left)} left and {len(right)} right images; {MONO}')
-    files.check_equal_numbers(str(folder), left, right)
-    for one, other in zip(left, right, strict=True):
-        if _numbers(one) and _numbers(other) and _numbers(one)[-1:] != _numbers(other)[-1:]:
-            raise InputError(
-                f'{folder}: {one.name} has no partner, {other.name} comes next on the right; '
-                'remove the images without partner'
-            )
-    return left, right
+    if not all(sides) and any(sides):
+        left, right = map(len, sides)
+        raise InputError(f'{folder}: {left} left and {right} right images; {MONO}')
+    return sides
 
 
 def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
@@ -159,10 +160,6 @@ def _side_images(folder: Path) -> tuple[list[Path], list[Path]] | None:
 def _nested_images(folder: Path) -> list[Path]:
     data = folder / 'data'
     return files.images_in(folder) or (files.images_in(data) if data.is_dir() else [])
-
-
-def _numbers(path: Path) -> list[int]:
-    return [int(digits) for digits in re.findall(r'\d+', path.stem)]
 
 
 def _stamps(folder: Path, left: Sequence[Path], rate_hz: float) -> list[int]:
@@ -265,9 +262,12 @@ def open_kitti(folder: Path, settings: StereoCameraSettings) -> StereoSource:
     has_right = partner is not None and not settings.depth
     left = files.images_in(folder / f'image_{camera}')
     right = files.images_in(folder / f'image_{partner}') if has_right else left
-    files.check_equal_numbers(str(folder), left, right)
+    places = files.partners(str(folder), left, right)
     indices, stamps = _indices_and_stamps(folder / 'times.txt', left, settings.rate_hz)
-    pairs = [files.FilePair(*fields) for fields in zip(indices, stamps, left, right, strict=True)]
+    pairs = [
+        files.FilePair(indices[i], stamps[i], left[i], right[j])
+        for i, j in zip(*places, strict=True)
+    ]
     calib, size = folder / 'calib.txt', files.first_image_size(left, str(folder))
     if partner is None or not has_right:
         eye = given_left_calibration(settings) or read_kitti_eye(calib, *size, camera)
