@@ -31,6 +31,7 @@ from segfloor_ros.camera.calibration.files import write_ros_calibration
 from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.camera.sources import StereoSource, open_source
+from segfloor_ros.camera.sources.files import partners
 from segfloor_ros.errors import CalibrationError, InputError
 
 
@@ -337,6 +338,13 @@ def test_images_without_partner_are_left_out(tmp_path: Path, caplog) -> None:
     assert [r.getMessage() for r in caplog.records] == [
         f'{folder}: 1 left and 1 right images have no partner of the same number; they are left out'
     ]
+
+
+def test_images_keep_their_order_whatever_their_last_numbers() -> None:
+    left, right = (
+        [Path(f'{name}_{side}{i}.png') for name, i in (('a', 7), ('b', 2))] for side in 'lr'
+    )
+    assert partners('drive', left, right) == ([0, 1], [0, 1])
 
 
 def test_a_kitti_copy_that_broke_off_is_read_as_far_as_it_goes(tmp_path: Path, caplog) -> None:

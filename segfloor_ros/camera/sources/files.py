@@ -253,7 +253,7 @@ def partners(name: str, left: Sequence[Path], right: Sequence[Path]) -> tuple[li
     places = [_by_number(side) for side in (left, right)]
     if not all(places) and len(left) == len(right):
         return list(range(len(left))), list(range(len(right)))
-    common = sorted(places[0].keys() & places[1].keys())
+    common = [number for number in places[0] if number in places[1]]
     if not common:
         raise InputError(
             f'{name}: {len(left)} left and {len(right)} right images, none with the number of one '
