@@ -115,11 +115,12 @@ def variants(
             folder = work / f'{name}_{variant.replace(" ", "_")}'
             console.print(f'{name}, {variant}')
             indices = write_variant(data / name, variant, folder)
-            words = ['run', str(folder), '--out', str(folder / 'out'), '--save-masks', 'all']
+            out = folder.with_name(f'{folder.name}_out')
+            words = ['run', str(folder), '--out', str(out), '--save-masks', 'all']
             with contextlib.suppress(ProgramError):  # without a map there is a summary, too
-                run_segfloor(words, folder / 'run.txt', TIMEOUT_S)
-            summary = read_json(folder / 'out' / 'summary.json', 'a summary')
-            score = score_variant(folder / 'out', OUTLINES / f'{name}_floor_outlines.yaml', indices)
+                run_segfloor(words, folder.with_name(f'{folder.name}.txt'), TIMEOUT_S)
+            summary = read_json(out / 'summary.json', 'a summary')
+            score = score_variant(out, OUTLINES / f'{name}_floor_outlines.yaml', indices)
             height_m = summary.get('camera_height_m')
             table.add_row(
                 name,

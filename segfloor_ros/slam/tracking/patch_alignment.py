@@ -87,6 +87,8 @@ def align_patches(
     normal equations come from the template, once. A fit is sound when it stays near its start, has
     settled, and explains the patch better than a plain grey level would.
     """
+    if len(template) == 0:
+        return Alignment(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_))
     fit = _Fit(template, image, 1 if along_row else 2)
     A = zoom[:, None, None] * np.eye(2)
     offset = np.zeros((len(template), 2))

@@ -105,3 +105,11 @@ def test_nothing_in_nothing_out():
     image = Texture().image()
     disparity, sigma = refine_disparity(image, image, np.zeros((0, 2)), np.zeros(0), 4)
     assert disparity.shape == sigma.shape == (0,)
+
+
+def test_no_patches_are_found_nowhere():
+    image = np.zeros((40, 60), np.float32)
+    none = np.zeros((0, 2))
+    found = align_patches(sample_patches(image, none), image, none, np.zeros(0), along_row=True)
+    assert found.uv_px.shape == (0, 2) and found.sigma_px.shape == (0, 2)
+    assert found.sound.shape == (0,)
