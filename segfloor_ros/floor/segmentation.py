@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import blank_border, union
+from segfloor_ros.camera.images import blank_border, noise_grey, union
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
@@ -60,7 +60,6 @@ from segfloor_ros.floor.mask.pixel_evidence import (
     judge,
     lies_on_floor,
     mean_height,
-    noise_grey,
     row_slope,
     texture_grey,
     unlike_floor,

@@ -239,6 +239,8 @@ class TwoScaleMatcher:
         if self._coarse is None:
             return self._fine.compute(left, right)
         disparity = halved_disparity(self._coarse, left, right)
+        if fine_rows == 0:
+            return disparity
         part = slice(0, fine_rows + _RUN_OUT_ROWS)
         far = self._fine.compute(left[part], right[part])[:fine_rows]
         near = disparity[:fine_rows]

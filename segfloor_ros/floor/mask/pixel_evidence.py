@@ -397,18 +397,6 @@ def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32
     return cv2.blur(np.abs(response), (window_px, window_px))
 
 
-def noise_grey(image: NDArray[np.uint8]) -> float:
-    """Return the standard deviation of the image noise in grey levels.
-
-    Immerkaer, Fast Noise Variance Estimation (1996), with a median in place of the mean, so that
-    texture does not count.
-    """
-    part = image[::2]
-    kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
-    response = cv2.filter2D(part, cv2.CV_32F, kernel)
-    return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / float(np.linalg.norm(kernel))
-
-
 def enough_texture(noise_grey: float) -> float:
     """Return the texture, in grey levels per pixel, that is surely no noise."""
     return max(_MIN_TEXTURE_GREY, _NOISE_TEXTURE * noise_grey)

@@ -17,26 +17,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera, Up
+from segfloor_ros.camera.images import noise_grey
+from segfloor_ros.camera.model import Mount, StereoCamera, Up, is_disparity
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
     NOISE_PX,
     SIGMAS,
     TwoScaleMatcher,
     disparity_range,
+    equal_exposure,
     refined,
-    stereo_view,
 )
 from segfloor_ros.floor.disparity.profile import STEP_PX, column_step, pixels_where, surface_above
 from segfloor_ros.floor.mask.pixel_evidence import (
     EDGE_SLOPE,
     TEXTURE_WINDOW_PX,
     enough_texture,
-    noise_grey,
     row_slope,
     texture_grey,
 )
 from segfloor_ros.floor.plane.plane import (
+    HEIGHT_RANGE_M,
     LEVEL_SIGMA,
     LOOKS,
     SAMPLES,
@@ -84,6 +85,22 @@ _IS_WRONG = (
     'of the calibration'
 )
 _IS_REDONE = 'the map is made anew with what it shows'
+
+_ODD = (
+    (
+        (-1.0, -1.0, 1.0),
+        1.0,
+        'what is level lies {height:.1f} m above the camera: a ceiling, or the camera hangs upside '
+        'down; then turn its images by 180 deg and exchange both eyes',
+    ),
+    (
+        (1.0, 1.0, 1.0),
+        0.125,
+        'a level floor is seen {height:.1f} m below the camera, where none is mounted; correct the '
+        'baseline, the focal length or the unit of the depth',
+    ),
+)
+"""Planes that no mount has: axes that the camera would have, the scale of its world, and words."""
 
 _BASE_WEIGHT = 8.0
 """All of the surface above places a base: it counts as so many samples."""
@@ -178,10 +195,11 @@ class MountEstimator:
         if not is_new_view:
             del self._poses[-1:]
         self._poses.append(T_world_left)
-        right, measured = stereo_view(left, right)
-        disparity = self._viewer.disparity(left, right) if measured is None else measured
+        is_measured = is_disparity(right)
+        right = np.nan_to_num(right, nan=0.0) if is_measured else equal_exposure(left, right)
+        disparity = right if is_measured else self._viewer.disparity(left, right)
         noise = noise_grey(left)
-        seen = None if measured is not None else max(noise, _LEAST_NOISE_GREY)
+        seen = None if is_measured else max(noise, _LEAST_NOISE_GREY)
         surfaces = self._viewer.surfaces(left, right, disparity, seen)
         prior, travel = level_prior(up_world, T_world_left), self._travel()
         fit = self._surfaces.add(surfaces, prior, travel, [], is_new_view)
@@ -189,6 +207,24 @@ class MountEstimator:
             bases = self._viewer.bases(left, disparity, enough_texture(noise))
             fit = self._bases.add(bases, prior, travel, self._surfaces.frames, is_new_view)
             self._settles(self._bases, fit)
+        if self.mount is None and len(self._poses) == MAX_KEYFRAMES:
+            self.remark = self._odd_plane()
+
+    def _odd_plane(self) -> str | None:
+        """Return in words the plane that is seen but that no mount has; None without one."""
+        for axes, scale, words in _ODD:
+            frames = [
+                replace(frame, rays=frame.rays * axes, disparity_m=frame.disparity_m * scale)
+                for frame in _thinned(self._surfaces.frames)
+            ]
+            search = PlaneSearch(self._known)
+            travel = self._travel() * axes * scale
+            fit = search.add(Samples.joined(frames), level_prior(None, np.eye(4)), travel, [])
+            if fit is not None and search.is_known():
+                height_m = float(fit.angles_height[2]) / scale
+                if scale == 1 or height_m > HEIGHT_RANGE_M[1]:
+                    return f'camera mount: {words.format(height=height_m)}'
+        return None
 
     def _travel(self) -> Array:
         """Return how far the camera has come (T, 3) m, in its own axes at the end of each way."""

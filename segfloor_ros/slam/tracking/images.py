@@ -18,6 +18,7 @@ Matching of binary descriptors: guided by a predicted pixel, or without guidance
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.images import Region, blank_border, union
+from segfloor_ros.camera.images import Region, blank_border, noise_grey, union
 from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import StereoSlamSettings
@@ -48,6 +49,11 @@ OVERSAMPLING = 4
 
 CELL_SIZE_PX = 16
 """Side of the image cells over which features are spread: about as many cells as features."""
+
+NOISY_GREY, CALM_GREY = 4.0, 1.5
+"""Of an image with more noise than the first, corners are looked for in one that is smoothed until
+it has the second: else they are those of the noise.
+"""
 
 PYRAMID_LEVELS, PYRAMID_SCALE = 8, 1.2
 """The pyramid of ORB as published: sizes up to 3.6 times as large are recognised."""
@@ -187,6 +193,7 @@ class FeatureExtractor:
     @timed
     def extract(self, image: NDArray[np.uint8], excluded: Region | None = None) -> Features:
         """Return the features of a grey image (H, W) outside of what is excluded."""
+        image = calmed(image)
         corners = self._orb.detect(image, None)
         if excluded is not None and corners:
             inside = is_inside(excluded, cv2.KeyPoint_convert(corners))
@@ -214,6 +221,16 @@ class FeatureExtractor:
         size = np.array(image.shape[::-1], np.float64)
         level_size = np.rint(size / nominal)
         return (((uv / nominal) + 0.5) * (size / level_size) - 0.5).astype(np.float32)
+
+
+def calmed(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image (H, W) without most of its noise, where that is strong: smoothed by s pixels
+    white noise is 2 * sqrt(pi) * s times weaker.
+    """
+    noise = noise_grey(image)
+    if noise < NOISY_GREY:
+        return image
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), noise / (2 * math.sqrt(math.pi) * CALM_GREY)))
 
 
 def spread(

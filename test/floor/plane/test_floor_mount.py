@@ -67,6 +67,36 @@ def test_nothing_is_seen_of_a_blank_scene():
     assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
 
 
+def test_a_camera_that_hangs_upside_down_is_told() -> None:
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)])
+    left, right, _, _ = scene.render()
+    remark = remark_after_looks(scene.camera, right[::-1, ::-1].copy(), left[::-1, ::-1].copy())
+    assert 'upside down' in remark and '0.3 m above' in remark
+
+
+def test_a_world_that_is_too_large_is_told() -> None:
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)], mount=Mount(0.7, 0.2))
+    left, right, _, _ = scene.render()
+    camera = replace(scene.camera, baseline_m=10 * scene.camera.baseline_m)
+    remark = remark_after_looks(camera, left, right)
+    assert '7.0 m below' in remark and 'baseline' in remark
+
+
+def test_of_a_wall_alone_nothing_is_told() -> None:
+    scene = Scene([wall(1.0)], mount=Mount(0.3))
+    left, right, _, _ = scene.render()
+    assert remark_after_looks(scene.camera, left, right) is None
+
+
+def remark_after_looks(camera, left, right) -> str | None:
+    """Return what is said of a mount that is not found in as many looks as there are at most."""
+    estimator = MountEstimator(camera)
+    for _ in range(MAX_KEYFRAMES):
+        estimator.add(left, right, np.eye(4))
+    assert estimator.mount is None
+    return estimator.remark
+
+
 def mounts_on_the_way(scene: Scene, frames: int, step_m: float = 0.15) -> list[Mount | None]:
     """Return what a robot that drives ahead over the floor has measured after each frame."""
     estimator = MountEstimator(scene.camera)
