@@ -196,8 +196,11 @@ class MountEstimator:
             del self._poses[-1:]
         self._poses.append(T_world_left)
         is_measured = is_disparity(right)
-        right = np.nan_to_num(right, nan=0.0) if is_measured else equal_exposure(left, right)
-        disparity = right if is_measured else self._viewer.disparity(left, right)
+        if is_measured:
+            disparity: NDArray[np.float32] = np.nan_to_num(right, nan=0.0)
+        else:
+            right = equal_exposure(left, right)
+            disparity = self._viewer.disparity(left, right)
         noise = noise_grey(left)
         seen = None if is_measured else max(noise, _LEAST_NOISE_GREY)
         surfaces = self._viewer.surfaces(left, right, disparity, seen)
