@@ -7,7 +7,6 @@ mask and v-disparity.
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import cv2
@@ -18,10 +17,8 @@ from segfloor_ros.camera.images import blank_border, noise_grey, union
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
-    COARSE_ABOVE_PX,
     MEAN_NOISE,
     NOISE_PX,
-    RUN_UP_ROWS,
     SIGMAS,
     TwoScaleMatcher,
     disparity_range,
@@ -29,12 +26,13 @@ from segfloor_ros.floor.disparity.matching import (
 )
 from segfloor_ros.floor.disparity.profile import (
     BINS_PER_PX,
-    FloorLine,
     FloorProfile,
     FloorView,
     column_step,
     filtered_v_disparity,
+    first_floor_row,
     fit_profile,
+    last_fine_row,
     pixels_where,
 )
 from segfloor_ros.floor.mask.filling import (
@@ -144,7 +142,7 @@ class FloorSegmentation:
         measure = self._times.measure
         self._prepare(mount)
         expected = expectations(mount, T_map_base)
-        first_row = min(self._first_row(_with_angles(mount, one)) for one in expected)
+        first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
             moving = union(moving, blank_border(left))
@@ -269,23 +267,13 @@ class FloorSegmentation:
         self._overhead = OverheadMatcher(self._camera, searched, self._settings)
         self._scanner = FloorScanner(self._camera, mount, self._settings)
 
-    def _first_row(self, expected: Mount) -> int:
-        camera = self._camera
-        line = FloorLine.of(camera, expected)
-        shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
-        top = math.floor(line.horizon - shear) - RUN_UP_ROWS
-        return int(np.clip(top, 0, camera.height - 32))
-
     def _disparity(
         self, first_row: int, left: NDArray[np.uint8], right: NDArray[np.uint8]
     ) -> NDArray[np.float32]:
         settings, camera = self._settings, self._camera
         top = 0 if settings.disparity_above_horizon else first_row
         assert self._mount is not None
-        line = FloorLine.of(camera, self._mount)
-        shear = abs(line.shear) * max(camera.cx, camera.width - camera.cx)
-        last_fine = line.horizon + COARSE_ABOVE_PX / line.slope + shear
-        fine_rows = int(np.clip(last_fine - top, RUN_UP_ROWS, camera.height - top))
+        fine_rows = last_fine_row(camera, self._mount) - top
         disparity = np.zeros(left.shape, np.float32)
         disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
         return disparity

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.camera.images import SUBPIXEL
 from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.floor.disparity.matching import NOISE_PX, SAME_PX
+from segfloor_ros.floor.disparity.matching import COARSE_ABOVE_PX, NOISE_PX, RUN_UP_ROWS, SAME_PX
 from segfloor_ros.floor.observation import VDisparity
 from segfloor_ros.geometry import Array
 
@@ -81,6 +81,24 @@ class FloorLine:
             shear=float(up[0] / camera.fx * camera.fy / up[1]),
             metres_per_row=float(-up[1] / camera.fy * scale),
         )
+
+    def rolled_rows(self, camera: StereoCamera) -> float:
+        """Return how many rows lie between de-rolled rows and those of the image, at most."""
+        return abs(self.shear) * max(camera.cx, camera.width - camera.cx)
+
+
+def first_floor_row(camera: StereoCamera, mount: Mount) -> int:
+    """Return the first row of the image that can show the floor, with a run-up for the matcher."""
+    line = FloorLine.of(camera, mount)
+    top = math.floor(line.horizon - line.rolled_rows(camera)) - RUN_UP_ROWS
+    return int(np.clip(top, 0, camera.height - 2 * RUN_UP_ROWS))
+
+
+def last_fine_row(camera: StereoCamera, mount: Mount) -> int:
+    """Return the last row in which the floor may be so far that it is matched in full."""
+    line = FloorLine.of(camera, mount)
+    last = line.horizon + COARSE_ABOVE_PX / line.slope + line.rolled_rows(camera)
+    return int(np.clip(last, first_floor_row(camera, mount) + RUN_UP_ROWS, camera.height))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,14 @@ from segfloor_ros.floor.disparity.matching import (
     equal_exposure,
     refined,
 )
-from segfloor_ros.floor.disparity.profile import STEP_PX, column_step, pixels_where, surface_above
+from segfloor_ros.floor.disparity.profile import (
+    STEP_PX,
+    column_step,
+    first_floor_row,
+    last_fine_row,
+    pixels_where,
+    surface_above,
+)
 from segfloor_ros.floor.mask.pixel_evidence import (
     EDGE_SLOPE,
     TEXTURE_WINDOW_PX,
@@ -40,6 +47,7 @@ from segfloor_ros.floor.plane.plane import (
     HEIGHT_RANGE_M,
     LEVEL_SIGMA,
     LOOKS,
+    NEAR_SCALES_PX,
     SAMPLES,
     SWAY,
     PlaneFit,
@@ -62,6 +70,8 @@ _PROPOSALS, _KEPT = 120, 40
 _COMPARED = 6000
 """So many samples of all frames together are compared with a plane: neighbours err together."""
 _LEAST_SAMPLES = 20
+_NEAR_SHARE = 2.0
+"""What is nearer than a floor at half the height of the mount is not looked for."""
 _LEAST_NOISE_GREY = 0.5
 """Grey levels are rounded, and the eyes differ: no image is less noisy."""
 _SIGMA = np.array([math.radians(0.8), math.radians(2.0), 0.03])
@@ -72,7 +82,7 @@ _SURE = 3.0
 """Sigmas within which nearly all lies: guesses, or what is seen but once, are no surer."""
 _FLOOR_SLOPE = math.radians(1.5)
 """Floors on which robots start are level, more or less."""
-_TOLERANCE = np.array([math.radians(1.0), math.radians(1.0), 0.05])
+_TOLERANCE = np.array([math.radians(1.0), math.radians(1.0), 0.03])
 """A mount whose pitch, roll or height, as a share of it, are off by less does no harm."""
 MAX_KEYFRAMES = 20
 """So many looks a plane is made of at most, a mount is changed by, and it is looked at again. Where
@@ -196,18 +206,21 @@ class MountEstimator:
             del self._poses[-1:]
         self._poses.append(T_world_left)
         is_measured = is_disparity(right)
+        self._viewer = viewer = self._viewer.for_mount(self.mount)
+        noise = noise_grey(left)
+        if not is_measured:
+            right = equal_exposure(left, right)
+        left, right = left[viewer.first_row :], right[viewer.first_row :]
         if is_measured:
             disparity: NDArray[np.float32] = np.nan_to_num(right, nan=0.0)
         else:
-            right = equal_exposure(left, right)
-            disparity = self._viewer.disparity(left, right)
-        noise = noise_grey(left)
+            disparity = viewer.disparity(left, right)
         seen = None if is_measured else max(noise, _LEAST_NOISE_GREY)
-        surfaces = self._viewer.surfaces(left, right, disparity, seen)
+        surfaces = viewer.surfaces(left, right, disparity, seen)
         prior, travel = level_prior(up_world, T_world_left), self._travel()
         fit = self._surfaces.add(surfaces, prior, travel, [], is_new_view)
         if not self._settles(self._surfaces, fit):
-            bases = self._viewer.bases(left, disparity, enough_texture(noise))
+            bases = viewer.bases(left, disparity, enough_texture(noise))
             fit = self._bases.add(bases, prior, travel, self._surfaces.frames, is_new_view)
             self._settles(self._bases, fit)
         if self.mount is None and len(self._poses) == MAX_KEYFRAMES:
@@ -330,6 +343,9 @@ class PlaneSearch:
         # Frames that show the same err together: the prior counts once per frame, too.
         sigma = sigma / math.sqrt(len(frames))
         fit = refine(Samples.joined(some), guesses[order[0]], self._known, travel, mean, sigma)
+        near = [frame.near(fit.angles_height) for frame in frames]
+        finer = self._finer(near, fit.angles_height, travel, (mean, sigma))
+        fit = replace(fit, angles_height=finer.angles_height, sigma=finer.sigma)
         if contrary:
             below = max(fit.violations, shares(Samples.joined(contrary), fit.angles_height)[1])
             fit = replace(fit, violations=below)
@@ -337,9 +353,15 @@ class PlaneSearch:
         self._guesses = self._guesses[plausible(self._guesses)]
         self._looks += 1
         if self._is_known(fit):
-            fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(some, fit, prior)))
+            fit = replace(fit, sigma=np.hypot(fit.sigma, self._scatter(near, fit, prior)))
         self.fit = fit
         return fit
+
+    def _finer(
+        self, near: list[Samples], start: Array, travel: Array, prior: tuple[Array, Array]
+    ) -> PlaneFit:
+        """Return a plane (3,) that is nearly known, refined by all samples of frames near it."""
+        return refine(Samples.joined(near), start, self._known, travel, *prior, NEAR_SCALES_PX)
 
     def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
         """Return the standard deviations (3,) of a plane by how much those of parts of the drive
@@ -351,14 +373,7 @@ class PlaneSearch:
         mean, sigma = prior[0], prior[1] * math.sqrt(LOOKS / len(frames))
         still = np.zeros((0, 3))
         planes = [
-            refine(
-                Samples.joined(frames[first:end]),
-                fit.angles_height,
-                self._known,
-                still,
-                mean,
-                sigma,
-            )
+            self._finer(frames[first:end], fit.angles_height, still, (mean, sigma))
             for first, end in pairwise(ends)
         ]
         return np.std([plane.angles_height for plane in planes], axis=0, ddof=1) / math.sqrt(LOOKS)
@@ -403,16 +418,23 @@ def disagreement(used: Mount, seen: Mount, sigma: Array) -> str | None:
 
 
 class MountViewer:
-    """Looks at the rectified pairs of one camera."""
+    """Looks at the rectified pairs of one camera: with a mount only at the rows that can show its
+    floor, from first_row on.
+    """
 
-    def __init__(self, camera: StereoCamera) -> None:
-        self._camera = camera
-        searched = disparity_range(camera, None)
-        self._matcher = TwoScaleMatcher(searched)
-        self._fine_rows = camera.height if column_step(camera) == 1 else 0
+    def __init__(self, camera: StereoCamera, mount: Mount | None = None) -> None:
+        self._camera, self._mount = camera, mount
+        self.first_row = 0 if mount is None else first_floor_row(camera, mount)
+        self._matcher = TwoScaleMatcher(disparity_range(camera, mount, _NEAR_SHARE))
+        last_fine = camera.height if mount is None else last_fine_row(camera, mount)
+        self._fine_rows = last_fine - self.first_row if column_step(camera) == 1 else 0
+
+    def for_mount(self, mount: Mount | None) -> MountViewer:
+        """Return one that looks at the floor below a mount."""
+        return self if mount == self._mount else MountViewer(self._camera, mount)
 
     def disparity(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the disparities (H, W) of a pair, 0 where there is no match."""
+        """Return the disparities (R, W) of these rows of a pair, 0 where there is no match."""
         return self._matcher.compute(left, right, self._fine_rows)
 
     def surfaces(
@@ -426,7 +448,8 @@ class MountViewer:
         depth is measured, which needs no texture.
         """
         # Matched at half the resolution two rows share a disparity: odd steps meet both alike.
-        step = max(2, round(math.sqrt(left.size / 2 / SAMPLES))) | 1
+        size = self._camera.width * self._camera.height
+        step = max(2, round(math.sqrt(size / 2 / SAMPLES))) | 1
         part = np.s_[step // 2 :: step, step // 2 :: step]
         at = pixels_where(disparity[part] >= 1)
         rows, columns = (step // 2 + step * index for index in at)
@@ -456,7 +479,7 @@ class MountViewer:
         weight: Array,
         rise: Array | None = None,
     ) -> Samples:
-        uv_px = np.stack([columns, rows], axis=1).astype(np.float64)
+        uv_px = np.stack([columns, rows + self.first_row], axis=1).astype(np.float64)
         found_px = disparity_px.astype(np.float64)
         return Samples.of(self._camera, uv_px, found_px, weight, rise)
 

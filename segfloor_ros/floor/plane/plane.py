@@ -42,7 +42,7 @@ _VIOLATION_WEIGHT = 1.5
 _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
-_NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
+NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
 """Of the biweight with which a plane is refined, one per step; of one that is nearly known."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
@@ -104,6 +104,18 @@ class Samples:
             disparity_px=np.concatenate([frame.disparity_px for frame in frames]),
             weight=np.concatenate([frame.weight for frame in frames]),
             rise=np.concatenate(rises) if rises else None,
+        )
+
+    def near(self, angles_height: Array) -> Samples:
+        """Return only those that matter where a plane, (3,), is refined that is nearly known."""
+        error, _, visible = _seen(self, plane_of(angles_height)[None])
+        rows = np.flatnonzero(visible[:, 0] & (np.abs(error[:, 0]) < 2 * NEAR_SCALES_PX[0]))
+        return replace(
+            self,
+            rays=self.rays[rows],
+            disparity_px=self.disparity_px[rows],
+            weight=self.weight[rows],
+            rise=None if self.rise is None else self.rise[rows],
         )
 
     def weight_on(self, plane: Array) -> Array:
@@ -418,7 +430,7 @@ def plane_of_frame(
     start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
-    return refine(samples, start, unknown, still, start, sigma, _NEAR_SCALES_PX)
+    return refine(samples, start, unknown, still, start, sigma, NEAR_SCALES_PX)
 
 
 def likeliest(share: Array, expected: Array) -> int:

@@ -90,6 +90,26 @@ def test_a_floor_runs_along_the_path_on_it() -> None:
     assert fit.angles_height[0] == pytest.approx(TRUE[0], abs=0.03)
 
 
+def test_all_samples_near_a_plane_refine_it() -> None:
+    rng = np.random.default_rng(5)
+    search = PlaneSearch(UNKNOWN)
+    for _ in range(12):
+        u, v = rng.uniform(-0.8, 0.8, 3000), rng.uniform(0.0, 0.8, 3000)
+        rays = np.stack([u, v, np.ones(3000)], axis=1)
+        disparity = -DISPARITY_M * rays @ plane_of(TRUE) + rng.normal(0, 0.4, 3000)
+        fit = search.add(
+            Samples(rays, disparity, np.ones(3000), DISPARITY_M),
+            level_prior(None, np.eye(4)),
+            STILL,
+            [],
+        )
+    assert fit is not None
+    mean, sigma = level_prior(None, np.eye(4))
+    every = Samples.joined(search.frames)
+    by_all = refine(every, TRUE, UNKNOWN, STILL, mean, sigma / math.sqrt(len(search.frames)))
+    assert np.abs(fit.angles_height - by_all.angles_height).max() < 1e-4
+
+
 def test_how_a_plane_is_known() -> None:
     """An error that all disparities share is in it, and little is known by what does not rise."""
     rng = np.random.default_rng(4)
