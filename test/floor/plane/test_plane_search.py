@@ -107,7 +107,7 @@ def test_all_samples_near_a_plane_refine_it() -> None:
     mean, sigma = level_prior(None, np.eye(4))
     every = Samples.joined(search.frames)
     by_all = refine(every, TRUE, UNKNOWN, STILL, mean, sigma / math.sqrt(len(search.frames)))
-    assert np.abs(fit.angles_height - by_all.angles_height).max() < 1e-4
+    assert np.abs(fit.angles_height - by_all.angles_height).max() < 1e-5
 
 
 def test_how_a_plane_is_known() -> None:
