@@ -9,8 +9,8 @@ from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_p
 
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.configuration import resolve
-from segfloor_ros.floor.plane.mount import MAX_KEYFRAMES, MountEstimator, disagreement
-from segfloor_ros.floor.plane.plane import mean_climb
+from segfloor_ros.floor.plane.mount import MAX_KEYFRAMES, MountEstimator, MountViewer, disagreement
+from segfloor_ros.floor.plane.plane import mean_climb, shares
 from segfloor_ros.pipeline import Pipeline, make_slam
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.sensors.gyroscope import STEP_NS
@@ -65,6 +65,26 @@ def test_a_wall_is_not_the_floor():
 
 def test_nothing_is_seen_of_a_blank_scene():
     assert estimate(Scene([floor_patch(contrast=0.0), wall(contrast=0.0)], noise_grey=1.0)) is None
+
+
+def test_a_look_at_the_rows_of_the_floor_shows_the_same_floor() -> None:
+    scene = Scene([floor_patch(), wall(), *box(1.6, 0.5, 0.4, 0.3)])
+    left, right, _, _ = scene.render()
+    true = np.array([scene.mount.pitch_rad, scene.mount.roll_rad, scene.mount.height_m])
+    viewer = MountViewer(scene.camera, scene.mount)
+    first = viewer.first_row
+    assert first > 100
+    disparity = viewer.disparity(left[first:], right[first:])
+    samples = viewer.surfaces(left[first:], right[first:], disparity, 1.0)
+    assert len(samples.weight) > 500
+    on, below = shares(samples, true)
+    assert on > 0.6 and below < 0.02
+
+
+def test_a_height_that_is_off_by_three_per_cent_does_harm() -> None:
+    used, sigma = Mount(1.7), np.zeros(3)
+    assert disagreement(used, Mount(1.64), sigma) is not None
+    assert disagreement(used, Mount(1.66), sigma) is None
 
 
 def test_a_camera_that_hangs_upside_down_is_told() -> None:
