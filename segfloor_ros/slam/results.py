@@ -9,7 +9,7 @@ then results are held back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -63,6 +63,9 @@ PROOF = 3
 """Keyframes that must show something for it to be believed: that a point stands still, or is gone,
 that a view adds nothing, that a place is seen again; and corners of a thing that moves. By chance
 hardly two agree."""
+
+MOST_LOOKED_BACK = 100
+"""Of the frames of a camera that is looked for, so many may turn out to have seen where it was."""
 
 MAX_HELD_KEYFRAMES = 50
 """Keyframes that wait with their images; of more, every second one goes without."""
@@ -246,6 +249,21 @@ def lost_frame(frame: StereoFrame) -> FrameResult:
     )
 
 
+def recognised(result: FrameResult, track: Track, T_world_odom: Array) -> FrameResult:
+    """Return the outcome, in optical axes, of a frame that was lost but saw the place where the
+    camera was found soon after. T_world_odom: (4, 4), the correction since.
+    """
+    return replace(
+        result,
+        tracked=True,
+        T_odom_base=invert(track.T_camera_world @ T_world_odom),
+        T_map_odom=T_world_odom,
+        covariance=track.covariance,
+        num_matches=len(track.point_ids),
+        state='tracking: the place was recognised by later frames',
+    )
+
+
 def left_out(result: FrameResult) -> FrameResult:
     """Return what is left of a frame of a submap that was not recognised in the map by the end, or
     of a map that a larger submap was not recognised in.
@@ -347,17 +365,37 @@ class HeldResults:
     def __init__(self) -> None:
         self._held: list[FrameResult] = []
         self._released: list[FrameResult] = []
+        self._lost: list[FrameResult] = []
         self._keeps = False
 
     def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
         """Take in the next result and return what is ready: nothing while it is of a submap."""
         self._held.append(result)
+        self._lost = [] if result.tracked else [*self._lost[-MOST_LOOKED_BACK:], result]
         self._thin_out()
         return [] if result.in_submap else self.release(mount)
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
         """Change the results that are held of a submap."""
         self._held = [change(result) if result.in_submap else result for result in self._held]
+
+    def recognise(self, proof: Mapping[int, Track], T_world_odom: Array) -> None:
+        """Release the frames once more that were lost when the camera was looked for, from the
+        first on that saw the place where it was found. proof: those that did, by stamp.
+        T_world_odom: (4, 4), the correction since.
+        """
+        if not proof:
+            return
+        again = [
+            recognised(result, proof[result.stamp_ns], T_world_odom)
+            if result.stamp_ns in proof
+            else result
+            for result in self._lost
+            if result.stamp_ns >= min(proof)
+        ]
+        if again:
+            self._held = [*_before(self._held, again[0]), *again]
+            self._released = _before(self._released, again[0])
 
     def keep_submap(self, in_its_map: Callable[[FrameResult], FrameResult]) -> None:
         """Make the submap the map: what was held before it is in none. in_its_map: brings a result
@@ -400,6 +438,10 @@ class HeldResults:
             holders = [i for i, held in enumerate(kept) if held.keyframe is not None]
             for i in holders[1::2] if len(holders) > MAX_HELD_KEYFRAMES else []:
                 kept[i] = replace(kept[i], keyframe=None)
+
+
+def _before(results: list[FrameResult], first: FrameResult) -> list[FrameResult]:
+    return [result for result in results if result.index < first.index]
 
 
 def in_map(result: FrameResult, T_map_world: Array) -> FrameResult:

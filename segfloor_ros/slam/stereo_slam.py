@@ -184,6 +184,9 @@ class StereoSlam:
                 self.front_end.track(frame, images) if self.map.keyframes and not fault else None
             )
             if track is not None:
+                self._held.recognise(
+                    self.front_end.relocaliser.take_proof(), self.front_end.motion.T_world_odom
+                )
                 self._lost_ns = None
                 if not self.back_end.submap.is_beside:
                     self.back_end.submap, self._began_unsure = Submap.KNOWN, None

@@ -26,7 +26,7 @@ def there(count, aside=0.0):
 
 def drive(slam, poses):
     """Return the results, and the errors in metres of the frames that were tracked."""
-    results = [slam.process(ROOM.frame(k, pose))[0] for k, pose in enumerate(poses)]
+    results = [slam.process(ROOM.frame(k, pose))[-1] for k, pose in enumerate(poses)]
     pairs = [(r, p) for r, p in zip(results, poses, strict=True) if r.tracked]
     return results, [
         np.linalg.norm((invert(pose) @ r.T_map_odom @ r.T_odom_base)[:3, 3]) for r, pose in pairs
@@ -103,6 +103,20 @@ def test_localizing_finds_the_camera_and_adds_nothing(mapped):
     again = slam.to_arrays()
     for name in ('point_xyz_world', 'point_found_count', 'keyframe_T_camera_world'):
         np.testing.assert_array_equal(again[name], saved[name])
+
+
+def test_frames_that_saw_the_place_before_that_was_certain_come_once_more(mapped):
+    slam, poses = loaded(mapped, localize=True), there(8)
+    come = [slam.process(ROOM.frame(k, pose)) for k, pose in enumerate(poses)]
+    found = next(k for k, results in enumerate(come) if results[-1].tracked)
+    assert not any(results[0].tracked for results in come[:found])
+    assert [r.index for r in come[found]] == list(range(found + 1))
+    assert all(len(results) == 1 for results in come[found + 1 :])
+    for result in come[found]:
+        assert result.tracked
+        pose = result.T_map_odom @ result.T_odom_base
+        assert np.linalg.norm((invert(poses[result.index]) @ pose)[:3, 3]) < 0.02
+        assert result.covariance[0, 0] < 1e-3
 
 
 def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):

@@ -342,6 +342,7 @@ class Relocaliser:
         self._near: tuple[Array, tuple[float, float]] | None = None
         self._searches_left = 0
         self._sightings.reset()
+        self._proof: dict[int, Track] = {}
 
     def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
         """Look around a pose (4, 4) alone, for some time or until the camera is found."""
@@ -378,18 +379,26 @@ class Relocaliser:
             self._sightings.add(None)
             return None
         pose = found.T_camera_world
-        is_proven = self._sightings.add((stamp_ns, pose))
+        is_proven = self._sightings.add((stamp_ns, found))
         is_expected = lost_at is not None and is_within(pose @ invert(lost_at), SAME)
         if not (is_proven or is_expected or given is not None):
             return None
+        views = self._sightings.views
         self.reset()
+        self._proof = dict(views)
         return found
 
-    def _can_have_moved(self, before: tuple[int, Array], now: tuple[int, Array]) -> bool:
-        """Whether a camera can have come from one pose, with its stamp, to another."""
+    def take_proof(self) -> dict[int, Track]:
+        """Return, once, the frames that saw the place where the camera was found, by stamp."""
+        proof, self._proof = self._proof, {}
+        return proof
+
+    def _can_have_moved(self, before: tuple[int, Track], now: tuple[int, Track]) -> bool:
+        """Whether a camera can have come from one view, with its stamp, to another."""
         seconds = 1e-9 * (now[0] - before[0])
         way = greatest_speed_mps(self._map.keyframes) * seconds
-        return is_within(now[1] @ invert(before[1]), (SAME[0] + way, SAME[1] + way))
+        step = now[1].T_camera_world @ invert(before[1].T_camera_world)
+        return is_within(step, (SAME[0] + way, SAME[1] + way))
 
 
 def _differ(a: Track, b: Track) -> bool:

@@ -70,7 +70,7 @@ class FrontEnd:
         self.frames_since_keyframe = 0
         self._camera = sparse_map.rig.camera
         self._map = sparse_map
-        self._relocaliser = Relocaliser(sparse_map, self.places)
+        self.relocaliser = Relocaliser(sparse_map, self.places)
         self.repeats = RepeatCheck()
         self._rotation = ImageRotation(self._camera)
 
@@ -79,13 +79,13 @@ class FrontEnd:
         """Whether the camera is looked for in the whole map."""
         state = self.motion.state
         is_searched = state.is_lost or state is TrackingState.HELD
-        return is_searched and not self._relocaliser.is_narrow
+        return is_searched and not self.relocaliser.is_narrow
 
     def reset(self) -> None:
         """Begin anew in a map in which the camera must be found."""
         self.local.point_ids = np.zeros(0, np.int32)
         self.follower.reset()
-        self._relocaliser.reset()
+        self.relocaliser.reset()
         self.motion.lose()
 
     def resume(self, last: LastPose) -> None:
@@ -101,7 +101,7 @@ class FrontEnd:
         if here and not self.motion.state.is_lost:
             return
         self.reset()
-        self._relocaliser.search_near(T_world_camera, reach)
+        self.relocaliser.search_near(T_world_camera, reach)
 
     def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
         """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
@@ -242,7 +242,7 @@ class FrontEnd:
         is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
         lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
         lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
-        found = self._relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
+        found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
         if found is None:
             return None
         pose = found.T_camera_world
