@@ -290,8 +290,9 @@ class FloorSegmentation:
         said: NDArray[np.uint8] | None,
     ) -> NDArray[np.uint8]:
         """Return the mask with floor where this pair of images alone cannot tell: where it looks
-        like floor. The more floor is known the better is known how it looks, so this is done twice.
-        Nor does it contradict a network that was right so far.
+        like floor. The more floor is known the better is known how it looks, so this is done twice,
+        and what then does not look like it is floor only if it was measured. Nor does it contradict
+        a network that was right so far.
         """
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
@@ -303,7 +304,8 @@ class FloorSegmentation:
             )
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
-            odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
+            odd = unlike_floor(left, mask == FLOOR) & (evidence.off | evidence.odd)
+            mask[odd & (mask == FLOOR)] = NO_EVIDENCE
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:

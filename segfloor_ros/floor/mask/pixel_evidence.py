@@ -194,7 +194,17 @@ def judge(
     step_m = np.float32(settings.step_height_m)
     sill = compared.against & (np.abs(heights.height) <= step_m)
     mask[may_be & sill & below_floor(mask)] = FLOOR
+    mask[(mask == FLOOR) & ~_most_around(mask == FLOOR, textured & (disparity > 0))] = NO_EVIDENCE
     return mask
+
+
+def _most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
+    of what is matched wrongly lies on the floor by chance.
+    """
+    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
+    return np.asarray(of_said >= np.float32(0.5) * of_all)
 
 
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
