@@ -141,6 +141,9 @@ FLOOR: dict[str, Mechanism] = {
     'looks of the floor': Mechanism(
         {'floor.segmentation.unlike_floor': lambda image, floor: _nowhere(image)}
     ),
+    'most of what is measured around': Mechanism(
+        {'floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
+    ),
     'what stands beside the left border': Mechanism(
         {'floor.segmentation.beside_something': lambda view, mask: _nowhere(mask)}
     ),

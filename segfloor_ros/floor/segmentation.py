@@ -304,8 +304,9 @@ class FloorSegmentation:
             )
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
-            odd = unlike_floor(left, mask == FLOOR) & (evidence.off | evidence.odd)
-            mask[odd & (mask == FLOOR)] = NO_EVIDENCE
+            unlike = unlike_floor(left, mask == FLOOR)
+            odd = unlike & (evidence.off | evidence.odd)
+            mask[unlike & evidence.off & (mask == FLOOR)] = NO_EVIDENCE
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:

@@ -33,7 +33,6 @@ _MIN_COLUMNS = 0.3
 """Part of the columns of a region that must show floor for it to be filled."""
 _GAP_M = 0.5
 """Gaps of this size between floor pixels are filled where nothing speaks against it."""
-_THREAD_PX = 3
 _ISLAND_SHARE = 0.05
 """Patches of floor smaller than this share of the largest are dropped."""
 _MIN_SLOPE = 1.5
@@ -230,10 +229,7 @@ def trim_to_edges(
     too high. There it is cut off at the strongest edge between the two, and where there is none,
     where the texture is its own.
     """
-    # Threads of floor, where the matcher loses hold, are none.
-    whole = (mask == FLOOR).astype(np.uint8)
-    floor = cv2.morphologyEx(whole, cv2.MORPH_OPEN, np.ones((_THREAD_PX, _THREAD_PX), np.uint8))
-    mask = np.where((whole > 0) & (floor == 0), np.uint8(NO_EVIDENCE), mask)
+    floor = (mask == FLOOR).astype(np.uint8)
     nothing = (mask == NO_EVIDENCE).astype(np.uint8)
     upward = np.ones((reach_px + 1, 1), np.uint8)
     below_blank = cv2.dilate(nothing, upward, anchor=(0, reach_px)) & floor

@@ -194,11 +194,13 @@ def judge(
     step_m = np.float32(settings.step_height_m)
     sill = compared.against & (np.abs(heights.height) <= step_m)
     mask[may_be & sill & below_floor(mask)] = FLOOR
-    mask[(mask == FLOOR) & ~_most_around(mask == FLOOR, textured & (disparity > 0))] = NO_EVIDENCE
+    mask[
+        (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
+    ] = NO_EVIDENCE
     return mask
 
 
-def _most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
     of what is matched wrongly lies on the floor by chance.
     """

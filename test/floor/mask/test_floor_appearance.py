@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import FLOORS, Scene, box, floor_patch, wall
 
-from segfloor_ros.floor.mask.pixel_evidence import unlike_floor
+from segfloor_ros.floor.mask.pixel_evidence import most_around, unlike_floor
 from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.segmentation import FloorSegmentation
 
@@ -48,6 +48,38 @@ def test_a_plain_dark_thing_right_ahead_is_not_filled_as_floor(floor_kind):
     called = stage.process(left, right, scene.mount).mask == FLOOR
     thing = ~floor & (depth < 1.6)
     assert thing.sum() > 1000
+    assert (called & thing).sum() < 0.02 * thing.sum()
+    wanted = floor & (depth > 0.5) & (depth < 3.0)
+    assert (called & wanted).sum() > 0.9 * wanted.sum()
+
+
+def test_matches_that_lie_on_the_floor_by_chance_are_no_floor():
+    """A third of what is measured at the left, two thirds at the right; one in ten is measured."""
+    rng = np.random.default_rng(5)
+    measured = rng.random((120, 400)) < 0.1
+    on_floor = measured & (rng.random(measured.shape) < np.repeat([1 / 3, 2 / 3], 200))
+    believed = most_around(on_floor, measured)
+    assert believed[:, :190][on_floor[:, :190]].mean() < 0.4
+    assert believed[:, 210:][on_floor[:, 210:]].mean() > 0.85
+    everywhere = most_around(on_floor, np.ones(measured.shape, bool))
+    assert not everywhere.any()
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_dark_things_in_little_light_are_not_floor(floor_kind):
+    """Their disparities are smeared with those of the floor, which they hardly differ from."""
+    dark = {'contrast': 10.0, 'grey': 20.0}
+    things = [box(x_m, y_m, 0.25, 0.05, **dark) for x_m, y_m in ((0.8, 0.1), (1.3, -0.3))]
+    scene = Scene([floor_patch(**floor_kind), *(side for one in things for side in one), wall(4.0)])
+    *images, floor, depth = scene.render()
+    rng = np.random.default_rng(0)
+    left, right = (
+        np.clip(np.rint(0.35 * image + rng.normal(0, 2, image.shape)), 0, 255).astype(np.uint8)
+        for image in images
+    )
+    stage = FloorSegmentation(scene.camera, FloorSegmentationSettings())
+    called = stage.process(left, right, scene.mount).mask == FLOOR
+    thing = ~floor & (depth < 1.6)
     assert (called & thing).sum() < 0.02 * thing.sum()
     wanted = floor & (depth > 0.5) & (depth < 3.0)
     assert (called & wanted).sum() > 0.9 * wanted.sum()
