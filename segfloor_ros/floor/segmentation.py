@@ -306,7 +306,7 @@ class FloorSegmentation:
             mask = fill_gaps(view, profile, mask, may_be)
             unlike = unlike_floor(left, mask == FLOOR)
             odd = unlike & (evidence.off | evidence.odd)
-            mask[unlike & evidence.off & (mask == FLOOR)] = NO_EVIDENCE
+            mask[unlike & evidence.off & textured & (mask == FLOOR)] = NO_EVIDENCE
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:
