@@ -204,7 +204,7 @@ def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray
     """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
     of what is matched wrongly lies on the floor by chance.
     """
-    window = (TEXTURE_WINDOW_PX, TEXTURE_WINDOW_PX)
+    window = (_WIDE_WINDOW, _WIDE_WINDOW)
     of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
     return np.asarray(of_said >= np.float32(0.5) * of_all)
 
