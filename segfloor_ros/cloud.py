@@ -8,6 +8,7 @@ sparse cloud with a label per point; a PLY file (binary, little endian) holds th
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_bytes
+from segfloor_ros.floor.observation import CELL_M
 from segfloor_ros.floor.observation import FLOOR as MASK_FLOOR
 from segfloor_ros.floor.observation import NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
@@ -31,6 +33,8 @@ _MAX_HEIGHT_LOG_ODDS = 2.0
 """Evidence of a height; less than that of the mask, for the floor is not a plane."""
 _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
+_ENOUGH_POINTS = 3
+"""So many points above a place of the size of a cell are something that stands there."""
 
 _COLUMNS = {
     'mask_log_odds': np.float32,
@@ -97,12 +101,7 @@ class CloudLabelling:
             stale[:] = True
             self._judged_by = settings
         self._judge(np.flatnonzero(stale), z_m)
-        return LabelledPoints(
-            point_id=cloud.point_id,
-            xyz_map=cloud.xyz_map,
-            label=table['label'].copy(),
-            confidence=table['confidence'].copy(),
-        )
+        return self._labelled(cloud)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return what is known of the points, for a file."""
@@ -115,6 +114,10 @@ class CloudLabelling:
     def labelled(self, cloud: SparseCloud) -> LabelledPoints:
         """Return a cloud with the labels known of its points, which are all in the table."""
         self._table.follow(cloud.point_id)
+        return self._labelled(cloud)
+
+    def _labelled(self, cloud: SparseCloud) -> LabelledPoints:
+        """Return the cloud with the labels in the table."""
         label, confidence = self._table['label'].copy(), self._table['confidence'].copy()
         return LabelledPoints(cloud.point_id, cloud.xyz_map, label, confidence)
 
@@ -271,6 +274,28 @@ class LabelledPoints:
     xyz_map: NDArray[np.float32]
     label: NDArray[np.uint8]
     confidence: NDArray[np.float32]
+
+    def standing(self) -> NDArray[np.intp]:
+        """Return the rows (M,) of obstacles for a costmap, which believes every point. What stands
+        somewhere has several corners: a lone one above the floor is a wrong match.
+        """
+        row = np.flatnonzero(self.label == OBSTACLE)
+        return row[count_around(self.xyz_map[row, :2]) >= _ENOUGH_POINTS]
+
+
+def count_around(points: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Return how many of the points (N, 2) lie around each, itself among them: in its square of
+    half a cell and the eight beside it.
+    """
+    squares = np.floor(points / (CELL_M / 2)).astype(np.int64)
+    key = (squares[:, 0] << 32) + squares[:, 1]
+    taken, at, here = np.unique(key, return_inverse=True, return_counts=True)
+    around = np.zeros(len(taken), np.intp)
+    for dx, dy in itertools.product((-1, 0, 1), repeat=2):
+        beside = taken + (dx << 32) + dy
+        row = np.minimum(np.searchsorted(taken, beside), len(taken) - 1)
+        around += np.where(taken[row] == beside, here[row], 0)
+    return around[at]
 
 
 def _header(count: int) -> bytes:

@@ -114,9 +114,8 @@ class Costmap:
         trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
-        standing = (grid.cells >= OCCUPIED) | (marked & ~trodden)
+        standing = (grid.cells >= OCCUPIED) | marked
         standing &= ~self._discs(driven[-1:], radius_m / 2)
-        self._trodden = trodden
         self.free = ((grid.cells == FREE) | trodden) & ~standing
         unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
         dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -124,7 +123,7 @@ class Costmap:
         """What is unknown, but for slits that the map leaves along walls."""
         beside = cv2.dilate(dark, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
         self._edge_m = grid.away_m(beside & self.free)
-        standing_m = grid.away_m(standing)
+        standing_m = self._standing_m = grid.away_m(standing)
         self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
@@ -160,12 +159,9 @@ class Costmap:
         arc = pose[:2] + chord_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return float(self.room_m[tuple(self._on_map(arc).T)].min(initial=np.inf))
 
-    def untrodden(self, points: Array) -> Array:
-        """Return the points (N, 2) where the robot has not been."""
-        cells = self.grid.cells_of(np.reshape(points, (-1, 2)))
-        inside = self.grid.holds(cells)
-        inside[inside] = ~self._trodden[tuple(cells[inside].T)]
-        return points[inside]
+    def standing_m(self, point: Array) -> float:
+        """Return how near to a point (2,) something stands."""
+        return float(self._standing_m[tuple(self._on_map(point).T)].min(initial=np.inf))
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -310,7 +306,7 @@ class Explorer:
         if not len(ahead):
             return False
         occupied = self.grid.centres_of(np.argwhere(self.grid.cells >= OCCUPIED))
-        standing = np.vstack([self._costmap.untrodden(self.obstacles), occupied])
+        standing = np.vstack([self.obstacles, occupied])
         if not len(standing):
             return False
         return bool(np.min(cKDTree(ahead).query(standing)[0]) < self.body.radius_m)
@@ -318,16 +314,13 @@ class Explorer:
     def _plan(self, time_s: float, pose: Array) -> None:
         """Choose what to drive to, and the way there."""
         assert self.grid is not None
-        body, driven = self.body, np.array([*self._driven, pose[:2]])
-        radius_m = body.radius_m + CELL_M  # as far from obstacles as they are known
-        self._costmap = costmap = Costmap(
-            self.grid, radius_m, 2 * radius_m, self.obstacles, driven, body.blind_m + radius_m
-        )
+        radius_m = self.body.radius_m + CELL_M  # as far from obstacles as they are known
+        self._costmap = costmap = self._costmap_with(self.obstacles, pose)
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
         if ways is not None and self.phase == 'exploring':
             self._aim_at(time_s, self._frontier(costmap, ways, pose))
             if self._target is None and self._tries >= MOST_TRIES:
-                self._begin_goals(costmap, ways)
+                self._begin_goals(pose)
         if self.phase == 'driving':
             self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
             self.phase = 'driving' if self._ahead else 'done'
@@ -338,6 +331,13 @@ class Explorer:
         if np.isfinite(ways.cost[number]) and away_m < radius_m:
             way = self.grid.centres_of(ways.cells[ways.to(number)])
             self.path = np.vstack([way, self._target])
+
+    def _costmap_with(self, obstacles: Array, pose: Array) -> Costmap:
+        """Return the map with obstacles (N, 2) as the robot may drive on it."""
+        assert self.grid is not None
+        radius_m, driven = self.body.radius_m + CELL_M, np.array([*self._driven, pose[:2]])
+        blind_m = self.body.blind_m + radius_m
+        return Costmap(self.grid, radius_m, 2 * radius_m, obstacles, driven, blind_m)
 
     def _turning_m(self, points: Array, pose: Array) -> Array:
         """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
@@ -364,10 +364,15 @@ class Explorer:
             self._facing = near.mean(axis=0) if len(near) else best
         return best
 
-    def _begin_goals(self, costmap: Costmap, ways: Ways) -> None:
-        """Everything is explored: draw the goals."""
+    def _begin_goals(self, pose: Array) -> None:
+        """Everything is explored: draw the goals, wherever the map leads; what stands in the way
+        now may go.
+        """
         self.phase, self._tries = 'driving', 0
         if isinstance(self.goals, int):
+            costmap = self._costmap_with(np.zeros((0, 2)), pose)
+            ways = costmap.ways_from(pose[:2], np.inf)
+            assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
             drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
             points = costmap.grid.centres_of(places[drawn])
@@ -394,7 +399,7 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
-        return self._pursue(pose) if len(self.path) else STOP
+        return self._get_clear(pose) or (self._pursue(pose) if len(self.path) else STOP)
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
         """Tick off a goal; look at what is unknown behind a frontier, and give up what stays so."""
@@ -438,6 +443,17 @@ class Explorer:
         goal.is_reached = is_reached
         self.ended.append(goal)
         self._target, self._tries, self._planned_s = None, 0, -np.inf
+
+    def _get_clear(self, pose: Array) -> tuple[float, float] | None:
+        """Return how to drive straight ahead or back where something stands so near that the robot
+        would touch it in a turn; None where nothing does, or neither leads away from it.
+        """
+        standing_m, radius_m = self._costmap.standing_m, self.body.radius_m
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        room_m, sign = max((standing_m(pose[:2] + s * radius_m * ahead), s) for s in (1.0, -1.0))
+        if standing_m(pose[:2]) > min(radius_m, room_m):
+            return None
+        return sign * self.body.speed_m_s / 2, 0.0
 
     def _pursue(self, pose: Array) -> tuple[float, float]:
         """Return the arc to a point ahead on the way: w = 2 v sin(a) / d (Coulter, 1992)."""

@@ -4,8 +4,11 @@ floor plan which it sees bit by bit.
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.floor.observation import FloorScan
@@ -76,6 +79,16 @@ def test_a_crate_in_the_door_closes_the_way() -> None:
         np.array([0.35, 0.85]), 0.3
     )
     assert not np.isfinite(ways.cost[ways.cells[:, 1] > 13]).any()
+
+
+def test_what_has_come_to_stand_where_the_robot_was_closes_the_way_too() -> None:
+    through_the_door = [(x, 0.55) for x in np.arange(2.05, 0.6, -0.1)]
+    post = [(1.35, 0.55)]
+    for obstacles, is_open in ((NOTHING, True), (post, False)):
+        ways = costmap_of(grid_of(TWO_ROOMS), obstacles, through_the_door).ways_from(
+            np.array([0.65, 0.55]), 0.3
+        )
+        assert np.isfinite(ways.cost[ways.cells[:, 1] > 15]).any() == is_open
 
 
 def test_where_the_robot_stands_is_free_and_what_it_cannot_see_before_it() -> None:
@@ -239,6 +252,27 @@ def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_op
         shut(truth, rows, False)
     drive.go_on(100.0)
     assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
+
+
+@pytest.mark.parametrize(('post', 'sign'), [((0.95, 0.55), -1), ((0.35, 0.55), 1)])
+def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) -> None:
+    body = dataclasses.replace(BODY, radius_m=0.35)
+    explorer = Explorer(body, [Goal(np.array([0.65, 1.3]))], phase='driving')
+    explorer.grid = grid_of(13 * (14 * '.' + '\n'))
+    explorer.obstacles = np.array([post, post])
+    assert explorer.step(0.0, pose_of(0.65, 0.55, 0.0)) == (sign * BODY.speed_m_s / 2, 0.0)
+    explorer.obstacles = NOTHING
+    forward, turn = explorer.step(1.0, pose_of(0.65, 0.55, 0.0))
+    assert forward == 0 and turn > 0
+
+
+def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way() -> None:
+    explorer = Explorer(BODY, 20, seed=1)
+    drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)
+    explorer.obstacles = np.array([(1.35, y) for y in np.arange(0.35, 0.8, 0.05)])
+    drive.go_on(20.0)
+    assert explorer.phase == 'driving'
+    assert any(goal.point[0] > 1.5 for goal in explorer._ahead)
 
 
 def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:
