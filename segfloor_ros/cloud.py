@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_bytes
-from segfloor_ros.floor.observation import CELL_M
+from segfloor_ros.floor.observation import CELL_M, NOT_FLOOR
 from segfloor_ros.floor.observation import FLOOR as MASK_FLOOR
-from segfloor_ros.floor.observation import NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.settings import RobotSettings
 from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud

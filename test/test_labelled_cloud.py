@@ -214,10 +214,10 @@ def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
 @pytest.mark.parametrize('at', [(0.0, 0.0), (-3.512, 40.26), (0.0249, -0.0249)])
 def test_a_costmap_gets_obstacles_with_several_corners_and_no_lone_point(at) -> None:
     xyz = np.array(
-        [(0.0, 0.0, 0.1), (0.02, 0.0, 0.4), (0.0, 0.02, 1.2), (0.5, 0.0, 0.2), (0.52, 0.01, 0.2)]
-        + [(0.51, 0.0, 0.0), (1.0, 1.0, 0.3)],
+        [(0, 0, 0.1), (0.02, 0, 0.4), (0, 0.02, 1.2), (0.5, 0, 0.2), (0.52, 0, 0.2), (0.51, 0, 0),
+         (1, 1, 0.3)],
         np.float32,
-    )
+    )  # fmt: skip
     xyz[:, :2] += at
     label = np.array([OBSTACLE] * 5 + [FLOOR, OBSTACLE], np.uint8)
     labelled = LabelledPoints(np.arange(7, dtype=np.int32), xyz, label, np.ones(7, np.float32))
