@@ -9,6 +9,7 @@ sparse cloud with a label per point; a PLY file (binary, little endian) holds th
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
 _ENOUGH_POINTS = 3
 """So many points above a place of the size of a cell are something that stands there."""
+_NEWS_KEYFRAMES = 5
+"""What was seen before the last so many keyframes is in the map by now, or is seen to be gone: as
+many mark a cell that was surely free.
+"""
 
 _COLUMNS = {
     'mask_log_odds': np.float32,
@@ -62,6 +67,7 @@ VERTEX = np.dtype(
         ('confidence', '<f4'),
     ]
 )
+_NO_IDS = np.zeros(0, np.int32)
 _PLY_TYPES = {'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
@@ -72,6 +78,7 @@ class CloudLabelling:
         self.settings = settings
         self._judged_by = settings
         self._table = PointTable()
+        self._news: deque[NDArray[np.int32]] = deque(maxlen=_NEWS_KEYFRAMES)
 
     def update(
         self,
@@ -89,6 +96,7 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
+        self._news.append(features.point_id[seen])
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, T_map_base)
@@ -109,6 +117,16 @@ class CloudLabelling:
     def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Go on with what is known of the points of a map."""
         self._table.from_arrays(arrays)
+        self._news.append(self._table.point_id)
+
+    def standing(self, points: LabelledPoints) -> NDArray[np.intp]:
+        """Return the rows (M,) of obstacles for a costmap, which lays them over the map: those that
+        the latest keyframes have seen. What stands somewhere has several corners: a lone point
+        above the floor is a wrong match.
+        """
+        row = np.flatnonzero(points.label == OBSTACLE)
+        row = row[np.isin(points.point_id[row], np.concatenate([*self._news, _NO_IDS]))]
+        return row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
 
     def labelled(self, cloud: SparseCloud) -> LabelledPoints:
         """Return a cloud with the labels known of its points, which are all in the table."""
@@ -273,13 +291,6 @@ class LabelledPoints:
     xyz_map: NDArray[np.float32]
     label: NDArray[np.uint8]
     confidence: NDArray[np.float32]
-
-    def standing(self) -> NDArray[np.intp]:
-        """Return the rows (M,) of obstacles for a costmap, which believes every point. What stands
-        somewhere has several corners: a lone one above the floor is a wrong match.
-        """
-        row = np.flatnonzero(self.label == OBSTACLE)
-        return row[count_around(self.xyz_map[row, :2]) >= _ENOUGH_POINTS]
 
 
 def count_around(points: NDArray[np.floating]) -> NDArray[np.intp]:

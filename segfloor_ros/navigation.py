@@ -41,6 +41,9 @@ where it came from, where the map is."""
 
 FACED_RAD = np.radians(10)
 
+BRAKING_S = 0.2
+"""Half the time in which a base stops from full speed, at 1 m/s²."""
+
 PATIENCE_S, MOST_TRIES = 8.0, 3
 """Without getting on for so long the robot turns, to see more; after so many tries it gives up."""
 
@@ -163,6 +166,16 @@ class Costmap:
         """Return how near to a point (2,) something stands."""
         return float(self._standing_m[tuple(self._on_map(point).T)].min(initial=np.inf))
 
+    def free_ahead_m(self, pose: Array, radius_m: float, reach_m: float) -> float:
+        """Return how far a robot of some radius gets from a pose x, y, yaw straight on, up to some
+        reach, without coming nearer to anything within the radius.
+        """
+        way_m = np.arange(0, reach_m, self.grid.resolution_m)
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
+        near = room_m < min(radius_m, room_m[0]) if len(room_m) else room_m > 0
+        return float(way_m[np.argmax(near)]) if near.any() else reach_m
+
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
         return np.asarray(self._index[tuple(cells.T)])
@@ -247,6 +260,8 @@ class Explorer:
         self._tries = 0
         self._lost_since_s: float | None = None
         self._turned, self._turn_back = 1.0, 1.0
+        self._stepped_s, self._period_s = -np.inf, 0.0
+        self._under_way = STOP
 
     @property
     def is_done(self) -> bool:
@@ -278,17 +293,29 @@ class Explorer:
         while it is not known.
         """
         if T_map_base is None or self.grid is None:
-            return self._look_for_place(time_s)
+            self._under_way = self._look_for_place(time_s)
+            return self._under_way
         self._lost_since_s = None
+        self._period_s = min(time_s - self._stepped_s, REPLAN_S)
+        self._stepped_s = time_s
         pose = planar(T_map_base)
         if not self._driven or np.hypot(*(self._driven[-1] - pose[:2])) > self.body.radius_m / 2:
             self._driven.append(pose[:2])
         if time_s >= self._planned_s + REPLAN_S or self._is_blocked(pose):
             self._planned_s = time_s
             self._plan(time_s, pose)
-        forward, turn = self._drive(time_s, pose)
+        forward, turn = self._drive(time_s, self._at_next_frame(pose))
         self._turned = float(np.sign(turn)) or self._turned
+        self._under_way = forward, turn
         return forward, turn
+
+    def _at_next_frame(self, pose: Array) -> Array:
+        """Return the pose x, y, yaw at which what is commanded now takes effect: until the next
+        frame the robot drives as commanded last.
+        """
+        way_m, turn = np.array(self._under_way) * self._period_s
+        heading = pose[2] + turn / 2
+        return pose + np.array([way_m * np.cos(heading), way_m * np.sin(heading), turn])
 
     def _look_for_place(self, time_s: float) -> tuple[float, float]:
         """Stand still, then turn back: SLAM knows what it has seen before."""
@@ -469,10 +496,13 @@ class Explorer:
             ahead += 1
         off = float(_bearings(self.path[ahead], pose))
         is_free = self._costmap.least_room_m(pose, self.path[ahead]) > body.radius_m
+        stop_s = self._period_s + BRAKING_S
         if abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
-            return 0.0, float(np.sign(off)) * body.turn_rad_s
+            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
         turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
-        slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9))
+        most_m = body.speed_m_s * stop_s
+        stop_m = min(self._costmap.free_ahead_m(pose, body.radius_m, most_m), away_m[-1])
+        slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
 
 

@@ -211,15 +211,26 @@ def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
     assert label_of(labelling.update(points, features({}), MASK, HERE)) == {1: UNKNOWN}
 
 
-@pytest.mark.parametrize('at', [(0.0, 0.0), (-3.512, 40.26), (0.0249, -0.0249)])
+@pytest.mark.parametrize('at', [(0.0, 0.0), (-1.512, 1.26), (0.0249, -0.0249)])
 def test_a_costmap_gets_obstacles_with_several_corners_and_no_lone_point(at) -> None:
-    xyz = np.array(
-        [(0, 0, 0.1), (0.02, 0, 0.4), (0, 0.02, 1.2), (0.5, 0, 0.2), (0.52, 0, 0.2), (0.51, 0, 0),
-         (1, 1, 0.3)],
-        np.float32,
-    )  # fmt: skip
-    xyz[:, :2] += at
-    label = np.array([OBSTACLE] * 5 + [FLOOR, OBSTACLE], np.uint8)
-    labelled = LabelledPoints(np.arange(7, dtype=np.int32), xyz, label, np.ones(7, np.float32))
-    assert labelled.standing().tolist() == [0, 1, 2]
-    assert dataclasses.replace(labelled, label=np.zeros(7, np.uint8)).standing().tolist() == []
+    places = [(0, 0, 0.1), (0.02, 0, 0.4), (0, 0.02, 0.5), (0.5, 0, 0.2), (0.52, 0, 0.2)]
+    points = {i: (x + at[0], y + at[1], z) for i, (x, y, z) in enumerate(places)}
+    labelling, seen = CloudLabelling(CloudLabellingSettings()), dict.fromkeys(points, ON_OBSTACLE)
+    labelled = labelling.update(cloud(points), features(seen), MASK, HERE)
+    assert set(label_of(labelled).values()) == {OBSTACLE}
+    assert labelling.standing(labelled).tolist() == [0, 1, 2]
+
+
+def test_a_costmap_gets_what_the_latest_keyframes_have_seen_the_rest_is_in_the_map() -> None:
+    old, new = ({i: (x, 0.01 * i, 0.3) for i in range(k, k + 3)} for x, k in ((1.0, 0), (3.0, 5)))
+    labelling = CloudLabelling(CloudLabellingSettings())
+    assert labelling.standing(labelling.labelled(cloud({}))).tolist() == []
+    counts = []
+    for seen in (old, *6 * [new]):
+        shown = features(dict.fromkeys(seen, ON_OBSTACLE))
+        labelled = labelling.update(cloud(old | new), shown, MASK, HERE)
+        counts.append(len(labelling.standing(labelled)))
+    assert counts == [3, 6, 6, 6, 6, 3, 3]
+    again = CloudLabelling(CloudLabellingSettings())
+    again.from_arrays(labelling.to_arrays())
+    assert len(again.standing(again.labelled(cloud(old | new)))) == 6

@@ -151,6 +151,7 @@ class Drive:
     ) -> None:
         self.truth, self.explorer, self.pose = truth, explorer, pose
         self.time_s, self.nearest_m = 0.0, np.inf
+        self._command = STOP
         self._known = truth.cells.copy() if is_known else np.full_like(truth.cells, UNKNOWN)
         room = cv2.distanceTransform((truth.cells == FREE).astype(np.uint8), cv2.DIST_L2, 5)
         self._room_m = room * CELL_M
@@ -172,7 +173,11 @@ class Drive:
         while self.time_s < until_s and not self.explorer.is_done:
             self.see()
             x, y, yaw = self.pose
-            forward, turn = self.explorer.step(self.time_s, pose_of(x, y, yaw))
+            # What is commanded at a frame takes effect at the next one.
+            (forward, turn), self._command = (
+                self._command,
+                self.explorer.step(self.time_s, pose_of(x, y, yaw)),
+            )
             step = np.array([forward * np.cos(yaw), forward * np.sin(yaw), turn])
             self.pose = self.pose + 0.2 * step
             self.time_s += 0.2
@@ -264,6 +269,18 @@ def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) 
     explorer.obstacles = NOTHING
     forward, turn = explorer.step(1.0, pose_of(0.65, 0.55, 0.0))
     assert forward == 0 and turn > 0
+
+
+@pytest.mark.parametrize('period_s', [0.1, 0.4])
+def test_it_stops_before_a_wall_although_commands_take_effect_a_frame_later(period_s) -> None:
+    explorer = Explorer(BODY, [Goal(np.array([2.2, 0.55]))], phase='driving')
+    explorer.grid = grid_of(TWO_ROOMS)
+    x_m, late = 1.55, [STOP]
+    for i in range(100):
+        late.append(explorer.step(i * period_s, pose_of(x_m, 0.55, 0.0)))
+        x_m += late.pop(0)[0] * period_s
+    assert explorer.is_done and explorer.ended[0].is_reached
+    assert x_m < 2.5 - BODY.radius_m - CELL_M, 'a radius and a cell from the wall'
 
 
 def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way() -> None:

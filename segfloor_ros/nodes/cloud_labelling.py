@@ -90,7 +90,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
             # Also for those who listen later: without keyframes it stays as it is.
-            self._obstacles = arrays.points_at(*at, labelled, labelled.standing())
+            self._obstacles = arrays.points_at(*at, labelled, self._stage.standing(labelled))
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
@@ -122,7 +122,9 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
         if self._obstacles_are_wanted():
-            self._obstacles = arrays.points_at(stamp_ns, frame_id, labelled, labelled.standing())
+            self._obstacles = arrays.points_at(
+                stamp_ns, frame_id, labelled, self._stage.standing(labelled)
+            )
             self.outputs.publish('obstacle_points', self._obstacles)
 
     def _obstacles_are_wanted(self) -> bool:
