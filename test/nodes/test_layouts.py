@@ -148,12 +148,9 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert parameters['plugins'] == ['static_layer', 'obstacle_layer', 'inflation_layer']
         assert parameters['static_layer.map_topic'] == '/map'
         assert parameters['static_layer.map_subscribe_transient_local'] is True
-        for source in ('obstacles', 'moving'):
-            topic = parameters[f'obstacle_layer.{source}.topic'].removeprefix('/')
-            data_type = parameters[f'obstacle_layer.{source}.data_type']
-            assert topic == f'{source.removesuffix("s")}_points'
-            assert TOPICS[topic].type_name.endswith(data_type)
-        assert parameters['obstacle_layer.observation_sources'] == 'obstacles moving floor'
+        assert parameters['obstacle_layer.obstacles.topic'] == '/obstacle_points'
+        assert parameters['obstacle_layer.obstacles.data_type'] == 'PointCloud2'
+        assert parameters['obstacle_layer.observation_sources'] == 'obstacles floor'
         floor = {
             name.removeprefix('obstacle_layer.floor.'): value
             for name, value in parameters.items()
