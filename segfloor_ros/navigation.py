@@ -136,6 +136,12 @@ class Costmap:
         tightness = np.clip((comfort_m - standing_m) / (comfort_m - radius_m), 0, 1)
         self._graph = graph_of(self.places, grid.resolution_m, 1 + 2 * tightness[self.places])
 
+    @classmethod
+    def around(cls, body: Body, grid: OccupancyGrid, obstacles: Array, driven: Array) -> Costmap:
+        """Return a map for a robot that keeps as far from things as they are known."""
+        radius_m = body.radius_m + CELL_M
+        return cls(grid, radius_m, 2 * radius_m, obstacles, driven, body.blind_m + radius_m)
+
     def ways_from(self, point: Array, reach_m: float) -> Ways | None:
         """Return the ways from the place nearest to a point (2,); None where none is in reach."""
         if not len(self._cells):
@@ -175,6 +181,16 @@ class Costmap:
         room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
         near = room_m < min(radius_m, room_m[0]) if len(room_m) else room_m > 0
         return float(way_m[np.argmax(near)]) if near.any() else reach_m
+
+    def way_out(self, pose: Array, radius_m: float) -> float:
+        """Return 1 for ahead or -1 for back where something stands within the radius of the robot
+        at a pose x, y, yaw, which would touch it in a turn; 0 where nothing does, or neither leads
+        away from it.
+        """
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        places = ((s, pose[:2] + s * radius_m * ahead) for s in (1.0, -1.0))
+        room_m, sign = max((self.standing_m(place), s) for s, place in places)
+        return 0.0 if self.standing_m(pose[:2]) > min(radius_m, room_m) else sign
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -304,18 +320,11 @@ class Explorer:
         if time_s >= self._planned_s + REPLAN_S or self._is_blocked(pose):
             self._planned_s = time_s
             self._plan(time_s, pose)
-        forward, turn = self._drive(time_s, self._at_next_frame(pose))
+        # What is commanded now takes effect at the next frame.
+        forward, turn = self._drive(time_s, driven_on(pose, self._under_way, self._period_s))
         self._turned = float(np.sign(turn)) or self._turned
         self._under_way = forward, turn
         return forward, turn
-
-    def _at_next_frame(self, pose: Array) -> Array:
-        """Return the pose x, y, yaw at which what is commanded now takes effect: until the next
-        frame the robot drives as commanded last.
-        """
-        way_m, turn = np.array(self._under_way) * self._period_s
-        heading = pose[2] + turn / 2
-        return pose + np.array([way_m * np.cos(heading), way_m * np.sin(heading), turn])
 
     def _look_for_place(self, time_s: float) -> tuple[float, float]:
         """Stand still, then turn back: SLAM knows what it has seen before."""
@@ -342,12 +351,13 @@ class Explorer:
         """Choose what to drive to, and the way there."""
         assert self.grid is not None
         radius_m = self.body.radius_m + CELL_M  # as far from obstacles as they are known
-        self._costmap = costmap = self._costmap_with(self.obstacles, pose)
+        driven = np.array([*self._driven, pose[:2]])
+        self._costmap = costmap = Costmap.around(self.body, self.grid, self.obstacles, driven)
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
         if ways is not None and self.phase == 'exploring':
             self._aim_at(time_s, self._frontier(costmap, ways, pose))
             if self._target is None and self._tries >= MOST_TRIES:
-                self._begin_goals(pose)
+                self._begin_goals(driven)
         if self.phase == 'driving':
             self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
             self.phase = 'driving' if self._ahead else 'done'
@@ -358,13 +368,6 @@ class Explorer:
         if np.isfinite(ways.cost[number]) and away_m < radius_m:
             way = self.grid.centres_of(ways.cells[ways.to(number)])
             self.path = np.vstack([way, self._target])
-
-    def _costmap_with(self, obstacles: Array, pose: Array) -> Costmap:
-        """Return the map with obstacles (N, 2) as the robot may drive on it."""
-        assert self.grid is not None
-        radius_m, driven = self.body.radius_m + CELL_M, np.array([*self._driven, pose[:2]])
-        blind_m = self.body.blind_m + radius_m
-        return Costmap(self.grid, radius_m, 2 * radius_m, obstacles, driven, blind_m)
 
     def _turning_m(self, points: Array, pose: Array) -> Array:
         """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
@@ -391,14 +394,15 @@ class Explorer:
             self._facing = near.mean(axis=0) if len(near) else best
         return best
 
-    def _begin_goals(self, pose: Array) -> None:
+    def _begin_goals(self, driven: Array) -> None:
         """Everything is explored: draw the goals, wherever the map leads; what stands in the way
         now may go.
         """
         self.phase, self._tries = 'driving', 0
         if isinstance(self.goals, int):
-            costmap = self._costmap_with(np.zeros((0, 2)), pose)
-            ways = costmap.ways_from(pose[:2], np.inf)
+            assert self.grid is not None
+            costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
+            ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
             drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
@@ -426,7 +430,10 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
-        return self._get_clear(pose) or (self._pursue(pose) if len(self.path) else STOP)
+        way_out = self._costmap.way_out(pose, self.body.radius_m)
+        if way_out:
+            return way_out * self.body.speed_m_s / 2, 0.0
+        return self._pursue(pose) if len(self.path) else STOP
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
         """Tick off a goal; look at what is unknown behind a frontier, and give up what stays so."""
@@ -471,17 +478,6 @@ class Explorer:
         self.ended.append(goal)
         self._target, self._tries, self._planned_s = None, 0, -np.inf
 
-    def _get_clear(self, pose: Array) -> tuple[float, float] | None:
-        """Return how to drive straight ahead or back where something stands so near that the robot
-        would touch it in a turn; None where nothing does, or neither leads away from it.
-        """
-        standing_m, radius_m = self._costmap.standing_m, self.body.radius_m
-        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
-        room_m, sign = max((standing_m(pose[:2] + s * radius_m * ahead), s) for s in (1.0, -1.0))
-        if standing_m(pose[:2]) > min(radius_m, room_m):
-            return None
-        return sign * self.body.speed_m_s / 2, 0.0
-
     def _pursue(self, pose: Array) -> tuple[float, float]:
         """Return the arc to a point ahead on the way: w = 2 v sin(a) / d (Coulter, 1992)."""
         body = self.body
@@ -504,6 +500,13 @@ class Explorer:
         stop_m = min(self._costmap.free_ahead_m(pose, body.radius_m, most_m), away_m[-1])
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
+
+
+def driven_on(pose: Array, command: tuple[float, float], period_s: float) -> Array:
+    """Return where a robot at a pose x, y, yaw is after a time with a command, m/s and rad/s."""
+    way_m, turn = np.array(command) * period_s
+    heading = pose[2] + turn / 2
+    return pose + np.array([way_m * np.cos(heading), way_m * np.sin(heading), turn])
 
 
 def _bearings(points: Array, pose: Array) -> Array:
