@@ -8,6 +8,8 @@ sparse cloud with a label per point; a PLY file (binary, little endian) holds th
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,8 @@ from numpy.typing import NDArray
 
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_bytes
+from segfloor_ros.floor.observation import CELL_M, NOT_FLOOR
 from segfloor_ros.floor.observation import FLOOR as MASK_FLOOR
-from segfloor_ros.floor.observation import NOT_FLOOR
 from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.settings import RobotSettings
 from segfloor_ros.slam.results import KeyframeFeatures, SparseCloud
@@ -31,6 +33,12 @@ _MAX_HEIGHT_LOG_ODDS = 2.0
 """Evidence of a height; less than that of the mask, for the floor is not a plane."""
 _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
+_ENOUGH_POINTS = 3
+"""So many points above a place of the size of a cell are something that stands there."""
+_NEWS_KEYFRAMES = 5
+"""What was seen before the last so many keyframes is in the map by now, or is seen to be gone: as
+many mark a cell that was surely free.
+"""
 
 _COLUMNS = {
     'mask_log_odds': np.float32,
@@ -59,6 +67,7 @@ VERTEX = np.dtype(
         ('confidence', '<f4'),
     ]
 )
+_NO_IDS = np.zeros(0, np.int32)
 _PLY_TYPES = {'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
@@ -69,6 +78,7 @@ class CloudLabelling:
         self.settings = settings
         self._judged_by = settings
         self._table = PointTable()
+        self._news: deque[NDArray[np.int32]] = deque(maxlen=_NEWS_KEYFRAMES)
 
     def update(
         self,
@@ -86,6 +96,7 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
+        self._news.append(features.point_id[seen])
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, T_map_base)
@@ -97,12 +108,7 @@ class CloudLabelling:
             stale[:] = True
             self._judged_by = settings
         self._judge(np.flatnonzero(stale), z_m)
-        return LabelledPoints(
-            point_id=cloud.point_id,
-            xyz_map=cloud.xyz_map,
-            label=table['label'].copy(),
-            confidence=table['confidence'].copy(),
-        )
+        return self._labelled(cloud)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return what is known of the points, for a file."""
@@ -111,10 +117,24 @@ class CloudLabelling:
     def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Go on with what is known of the points of a map."""
         self._table.from_arrays(arrays)
+        self._news.append(self._table.point_id)
+
+    def standing(self, points: LabelledPoints) -> NDArray[np.intp]:
+        """Return the rows (M,) of obstacles for a costmap, which lays them over the map: those that
+        the latest keyframes have seen. What stands somewhere has several corners: a lone point
+        above the floor is a wrong match.
+        """
+        row = np.flatnonzero(points.label == OBSTACLE)
+        row = row[np.isin(points.point_id[row], np.concatenate([*self._news, _NO_IDS]))]
+        return row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
 
     def labelled(self, cloud: SparseCloud) -> LabelledPoints:
         """Return a cloud with the labels known of its points, which are all in the table."""
         self._table.follow(cloud.point_id)
+        return self._labelled(cloud)
+
+    def _labelled(self, cloud: SparseCloud) -> LabelledPoints:
+        """Return the cloud with the labels in the table."""
         label, confidence = self._table['label'].copy(), self._table['confidence'].copy()
         return LabelledPoints(cloud.point_id, cloud.xyz_map, label, confidence)
 
@@ -271,6 +291,21 @@ class LabelledPoints:
     xyz_map: NDArray[np.float32]
     label: NDArray[np.uint8]
     confidence: NDArray[np.float32]
+
+
+def count_around(points: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Return how many of the points (N, 2) lie around each, itself among them: in its square of
+    half a cell and the eight beside it.
+    """
+    squares = np.floor(points / (CELL_M / 2)).astype(np.int64)
+    key = (squares[:, 0] << 32) + squares[:, 1]
+    taken, at, here = np.unique(key, return_inverse=True, return_counts=True)
+    around = np.zeros(len(taken), np.intp)
+    for dx, dy in itertools.product((-1, 0, 1), repeat=2):
+        beside = taken + (dx << 32) + dy
+        row = np.minimum(np.searchsorted(taken, beside), len(taken) - 1)
+        around += np.where(taken[row] == beside, here[row], 0)
+    return around[at]
 
 
 def _header(count: int) -> bytes:

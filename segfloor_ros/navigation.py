@@ -41,6 +41,9 @@ where it came from, where the map is."""
 
 FACED_RAD = np.radians(10)
 
+BRAKING_S = 0.2
+"""Half the time in which a base stops from full speed, at 1 m/s²."""
+
 PATIENCE_S, MOST_TRIES = 8.0, 3
 """Without getting on for so long the robot turns, to see more; after so many tries it gives up."""
 
@@ -114,9 +117,8 @@ class Costmap:
         trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
-        standing = (grid.cells >= OCCUPIED) | (marked & ~trodden)
+        standing = (grid.cells >= OCCUPIED) | marked
         standing &= ~self._discs(driven[-1:], radius_m / 2)
-        self._trodden = trodden
         self.free = ((grid.cells == FREE) | trodden) & ~standing
         unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
         dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -124,7 +126,7 @@ class Costmap:
         """What is unknown, but for slits that the map leaves along walls."""
         beside = cv2.dilate(dark, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
         self._edge_m = grid.away_m(beside & self.free)
-        standing_m = grid.away_m(standing)
+        standing_m = self._standing_m = grid.away_m(standing)
         self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
@@ -133,6 +135,12 @@ class Costmap:
         self._index[self.places] = np.arange(len(self._cells))
         tightness = np.clip((comfort_m - standing_m) / (comfort_m - radius_m), 0, 1)
         self._graph = graph_of(self.places, grid.resolution_m, 1 + 2 * tightness[self.places])
+
+    @classmethod
+    def around(cls, body: Body, grid: OccupancyGrid, obstacles: Array, driven: Array) -> Costmap:
+        """Return a map for a robot that keeps as far from things as they are known."""
+        radius_m = body.radius_m + CELL_M
+        return cls(grid, radius_m, 2 * radius_m, obstacles, driven, body.blind_m + radius_m)
 
     def ways_from(self, point: Array, reach_m: float) -> Ways | None:
         """Return the ways from the place nearest to a point (2,); None where none is in reach."""
@@ -160,12 +168,29 @@ class Costmap:
         arc = pose[:2] + chord_m[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         return float(self.room_m[tuple(self._on_map(arc).T)].min(initial=np.inf))
 
-    def untrodden(self, points: Array) -> Array:
-        """Return the points (N, 2) where the robot has not been."""
-        cells = self.grid.cells_of(np.reshape(points, (-1, 2)))
-        inside = self.grid.holds(cells)
-        inside[inside] = ~self._trodden[tuple(cells[inside].T)]
-        return points[inside]
+    def standing_m(self, point: Array) -> float:
+        """Return how near to a point (2,) something stands."""
+        return float(self._standing_m[tuple(self._on_map(point).T)].min(initial=np.inf))
+
+    def free_ahead_m(self, pose: Array, radius_m: float, reach_m: float) -> float:
+        """Return how far a robot of some radius gets from a pose x, y, yaw straight on, up to some
+        reach, without coming nearer to anything within the radius.
+        """
+        way_m = np.arange(0, reach_m, self.grid.resolution_m)
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
+        near = room_m < min(radius_m, room_m[0]) if len(room_m) else room_m > 0
+        return float(way_m[np.argmax(near)]) if near.any() else reach_m
+
+    def way_out(self, pose: Array, radius_m: float) -> float:
+        """Return 1 for ahead or -1 for back where something stands within the radius of the robot
+        at a pose x, y, yaw, which would touch it in a turn; 0 where nothing does, or neither leads
+        away from it.
+        """
+        ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
+        places = ((s, pose[:2] + s * radius_m * ahead) for s in (1.0, -1.0))
+        room_m, sign = max((self.standing_m(place), s) for s, place in places)
+        return 0.0 if self.standing_m(pose[:2]) > min(radius_m, room_m) else sign
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -251,6 +276,8 @@ class Explorer:
         self._tries = 0
         self._lost_since_s: float | None = None
         self._turned, self._turn_back = 1.0, 1.0
+        self._stepped_s, self._period_s = -np.inf, 0.0
+        self._under_way = STOP
 
     @property
     def is_done(self) -> bool:
@@ -282,16 +309,21 @@ class Explorer:
         while it is not known.
         """
         if T_map_base is None or self.grid is None:
-            return self._look_for_place(time_s)
+            self._under_way = self._look_for_place(time_s)
+            return self._under_way
         self._lost_since_s = None
+        self._period_s = min(time_s - self._stepped_s, REPLAN_S)
+        self._stepped_s = time_s
         pose = planar(T_map_base)
         if not self._driven or np.hypot(*(self._driven[-1] - pose[:2])) > self.body.radius_m / 2:
             self._driven.append(pose[:2])
         if time_s >= self._planned_s + REPLAN_S or self._is_blocked(pose):
             self._planned_s = time_s
             self._plan(time_s, pose)
-        forward, turn = self._drive(time_s, pose)
+        # What is commanded now takes effect at the next frame.
+        forward, turn = self._drive(time_s, driven_on(pose, self._under_way, self._period_s))
         self._turned = float(np.sign(turn)) or self._turned
+        self._under_way = forward, turn
         return forward, turn
 
     def _look_for_place(self, time_s: float) -> tuple[float, float]:
@@ -310,7 +342,7 @@ class Explorer:
         if not len(ahead):
             return False
         occupied = self.grid.centres_of(np.argwhere(self.grid.cells >= OCCUPIED))
-        standing = np.vstack([self._costmap.untrodden(self.obstacles), occupied])
+        standing = np.vstack([self.obstacles, occupied])
         if not len(standing):
             return False
         return bool(np.min(cKDTree(ahead).query(standing)[0]) < self.body.radius_m)
@@ -318,16 +350,14 @@ class Explorer:
     def _plan(self, time_s: float, pose: Array) -> None:
         """Choose what to drive to, and the way there."""
         assert self.grid is not None
-        body, driven = self.body, np.array([*self._driven, pose[:2]])
-        radius_m = body.radius_m + CELL_M  # as far from obstacles as they are known
-        self._costmap = costmap = Costmap(
-            self.grid, radius_m, 2 * radius_m, self.obstacles, driven, body.blind_m + radius_m
-        )
+        radius_m = self.body.radius_m + CELL_M  # as far from obstacles as they are known
+        driven = np.array([*self._driven, pose[:2]])
+        self._costmap = costmap = Costmap.around(self.body, self.grid, self.obstacles, driven)
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
         if ways is not None and self.phase == 'exploring':
             self._aim_at(time_s, self._frontier(costmap, ways, pose))
             if self._target is None and self._tries >= MOST_TRIES:
-                self._begin_goals(costmap, ways)
+                self._begin_goals(driven)
         if self.phase == 'driving':
             self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
             self.phase = 'driving' if self._ahead else 'done'
@@ -364,10 +394,16 @@ class Explorer:
             self._facing = near.mean(axis=0) if len(near) else best
         return best
 
-    def _begin_goals(self, costmap: Costmap, ways: Ways) -> None:
-        """Everything is explored: draw the goals."""
+    def _begin_goals(self, driven: Array) -> None:
+        """Everything is explored: draw the goals, wherever the map leads; what stands in the way
+        now may go.
+        """
         self.phase, self._tries = 'driving', 0
         if isinstance(self.goals, int):
+            assert self.grid is not None
+            costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
+            ways = costmap.ways_from(driven[-1], np.inf)
+            assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
             drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
             points = costmap.grid.centres_of(places[drawn])
@@ -394,6 +430,9 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
+        way_out = self._costmap.way_out(pose, self.body.radius_m)
+        if way_out:
+            return way_out * self.body.speed_m_s / 2, 0.0
         return self._pursue(pose) if len(self.path) else STOP
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
@@ -453,11 +492,21 @@ class Explorer:
             ahead += 1
         off = float(_bearings(self.path[ahead], pose))
         is_free = self._costmap.least_room_m(pose, self.path[ahead]) > body.radius_m
+        stop_s = self._period_s + BRAKING_S
         if abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
-            return 0.0, float(np.sign(off)) * body.turn_rad_s
+            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
         turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
-        slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9))
+        most_m = body.speed_m_s * stop_s
+        stop_m = min(self._costmap.free_ahead_m(pose, body.radius_m, most_m), away_m[-1])
+        slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
+
+
+def driven_on(pose: Array, command: tuple[float, float], period_s: float) -> Array:
+    """Return where a robot at a pose x, y, yaw is after a time with a command, m/s and rad/s."""
+    way_m, turn = np.array(command) * period_s
+    heading = pose[2] + turn / 2
+    return pose + np.array([way_m * np.cos(heading), way_m * np.sin(heading), turn])
 
 
 def _bearings(points: Array, pose: Array) -> Array:

@@ -209,3 +209,28 @@ def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
     assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: OBSTACLE}
     labelling.settings = dataclasses.replace(labelling.settings, robot_height_m=0.4)
     assert label_of(labelling.update(points, features({}), MASK, HERE)) == {1: UNKNOWN}
+
+
+@pytest.mark.parametrize('at', [(0.0, 0.0), (-1.512, 1.26), (0.0249, -0.0249)])
+def test_a_costmap_gets_obstacles_with_several_corners_and_no_lone_point(at) -> None:
+    places = [(0, 0, 0.1), (0.02, 0, 0.4), (0, 0.02, 0.5), (0.5, 0, 0.2), (0.52, 0, 0.2)]
+    points = {i: (x + at[0], y + at[1], z) for i, (x, y, z) in enumerate(places)}
+    labelling, seen = CloudLabelling(CloudLabellingSettings()), dict.fromkeys(points, ON_OBSTACLE)
+    labelled = labelling.update(cloud(points), features(seen), MASK, HERE)
+    assert set(label_of(labelled).values()) == {OBSTACLE}
+    assert labelling.standing(labelled).tolist() == [0, 1, 2]
+
+
+def test_a_costmap_gets_what_the_latest_keyframes_have_seen_the_rest_is_in_the_map() -> None:
+    old, new = ({i: (x, 0.01 * i, 0.3) for i in range(k, k + 3)} for x, k in ((1.0, 0), (3.0, 5)))
+    labelling = CloudLabelling(CloudLabellingSettings())
+    assert labelling.standing(labelling.labelled(cloud({}))).tolist() == []
+    counts = []
+    for seen in (old, *6 * [new]):
+        shown = features(dict.fromkeys(seen, ON_OBSTACLE))
+        labelled = labelling.update(cloud(old | new), shown, MASK, HERE)
+        counts.append(len(labelling.standing(labelled)))
+    assert counts == [3, 6, 6, 6, 6, 3, 3]
+    again = CloudLabelling(CloudLabellingSettings())
+    again.from_arrays(labelling.to_arrays())
+    assert len(again.standing(again.labelled(cloud(old | new)))) == 6

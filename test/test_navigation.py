@@ -4,8 +4,11 @@ floor plan which it sees bit by bit.
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.floor.observation import FloorScan
@@ -78,6 +81,16 @@ def test_a_crate_in_the_door_closes_the_way() -> None:
     assert not np.isfinite(ways.cost[ways.cells[:, 1] > 13]).any()
 
 
+def test_what_has_come_to_stand_where_the_robot_was_closes_the_way_too() -> None:
+    through_the_door = [(x, 0.55) for x in np.arange(2.05, 0.6, -0.1)]
+    post = [(1.35, 0.55)]
+    for obstacles, is_open in ((NOTHING, True), (post, False)):
+        ways = costmap_of(grid_of(TWO_ROOMS), obstacles, through_the_door).ways_from(
+            np.array([0.65, 0.55]), 0.3
+        )
+        assert np.isfinite(ways.cost[ways.cells[:, 1] > 15]).any() == is_open
+
+
 def test_where_the_robot_stands_is_free_and_what_it_cannot_see_before_it() -> None:
     grid = grid_of('???????????\n' * 11)
     costmap = Costmap(grid, 0.15, 0.3, NOTHING, np.array([(0.55, 0.55)]), 0.4)
@@ -138,6 +151,7 @@ class Drive:
     ) -> None:
         self.truth, self.explorer, self.pose = truth, explorer, pose
         self.time_s, self.nearest_m = 0.0, np.inf
+        self._command = STOP
         self._known = truth.cells.copy() if is_known else np.full_like(truth.cells, UNKNOWN)
         room = cv2.distanceTransform((truth.cells == FREE).astype(np.uint8), cv2.DIST_L2, 5)
         self._room_m = room * CELL_M
@@ -159,7 +173,11 @@ class Drive:
         while self.time_s < until_s and not self.explorer.is_done:
             self.see()
             x, y, yaw = self.pose
-            forward, turn = self.explorer.step(self.time_s, pose_of(x, y, yaw))
+            # What is commanded at a frame takes effect at the next one.
+            (forward, turn), self._command = (
+                self._command,
+                self.explorer.step(self.time_s, pose_of(x, y, yaw)),
+            )
             step = np.array([forward * np.cos(yaw), forward * np.sin(yaw), turn])
             self.pose = self.pose + 0.2 * step
             self.time_s += 0.2
@@ -239,6 +257,39 @@ def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_op
         shut(truth, rows, False)
     drive.go_on(100.0)
     assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
+
+
+@pytest.mark.parametrize(('post', 'sign'), [((0.95, 0.55), -1), ((0.35, 0.55), 1)])
+def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) -> None:
+    body = dataclasses.replace(BODY, radius_m=0.35)
+    explorer = Explorer(body, [Goal(np.array([0.65, 1.3]))], phase='driving')
+    explorer.grid = grid_of(13 * (14 * '.' + '\n'))
+    explorer.obstacles = np.array([post, post])
+    assert explorer.step(0.0, pose_of(0.65, 0.55, 0.0)) == (sign * BODY.speed_m_s / 2, 0.0)
+    explorer.obstacles = NOTHING
+    forward, turn = explorer.step(1.0, pose_of(0.65, 0.55, 0.0))
+    assert forward == 0 and turn > 0
+
+
+@pytest.mark.parametrize('period_s', [0.1, 0.4])
+def test_it_stops_before_a_wall_although_commands_take_effect_a_frame_later(period_s) -> None:
+    explorer = Explorer(BODY, [Goal(np.array([2.2, 0.55]))], phase='driving')
+    explorer.grid = grid_of(TWO_ROOMS)
+    x_m, late = 1.55, [STOP]
+    for i in range(100):
+        late.append(explorer.step(i * period_s, pose_of(x_m, 0.55, 0.0)))
+        x_m += late.pop(0)[0] * period_s
+    assert explorer.is_done and explorer.ended[0].is_reached
+    assert x_m < 2.5 - BODY.radius_m - CELL_M, 'a radius and a cell from the wall'
+
+
+def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way() -> None:
+    explorer = Explorer(BODY, 20, seed=1)
+    drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)
+    explorer.obstacles = np.array([(1.35, y) for y in np.arange(0.35, 0.8, 0.05)])
+    drive.go_on(20.0)
+    assert explorer.phase == 'driving'
+    assert any(goal.point[0] > 1.5 for goal in explorer._ahead)
 
 
 def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:

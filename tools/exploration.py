@@ -65,7 +65,7 @@ def row(name: str, found: dict[str, Any]) -> str:
     return (
         f'| {name} | {found["robot"]} | {found["seed"]} | {100 * found["mapped_share"]:.1f} % '
         f'| {found["bumps"]} | {found["goals_reached"]} of {found["goals_total"]} '
-        f'| {found["path_rmse_m"]:.3f} | {precision:.1f} / {recall:.1f} | {found["path_m"]:.0f} '
+        f'| {found["path_rmse_m"]} | {precision:.1f} / {recall:.1f} | {found["path_m"]:.0f} '
         f'| {found["sim_s"]:.0f} | {found["real_time_factor"]:.2f} |\n'
     )
 

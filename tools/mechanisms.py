@@ -101,6 +101,7 @@ SLAM: dict[str, Mechanism] = {
     'images weighed against wheels': Mechanism(
         {'slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
     ),
+    'bias of the gyroscope at rest': Mechanism({'slam.sensors.body_motion.AT_REST': (-1.0, -1.0)}),
     'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'slam.sparse_map.PROOF': 1 << 30}),

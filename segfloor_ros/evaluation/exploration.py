@@ -76,8 +76,11 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
     maps = compare(grid, MapTruth(truth, found.start))
     cells = score_cells(maps)
     stamps = sorted(found.poses)
-    estimated = from_frame(np.array([found.poses[t][:2, 3] for t in stamps]), found.start)
-    true = np.array([found.true_poses[t][:2, 3] for t in stamps])
+    rmse_m = None  # where it was never found in a saved map
+    if stamps:
+        estimated = from_frame(np.array([found.poses[t][:2, 3] for t in stamps]), found.start)
+        true = np.array([found.true_poses[t][:2, 3] for t in stamps])
+        rmse_m = round(float(np.sqrt(np.mean(np.sum((estimated - true) ** 2, 1)))), 4)
     sim_s = (max(found.true_poses) - min(found.true_poses)) * 1e-9
     way = np.array([pose[:2, 3] for _, pose in sorted(found.true_poses.items())])
     return {
@@ -85,7 +88,7 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
         'bumps': len(found.bumps_ns),
         'goals_reached': sum(_is_at(goal, pose, found.start) for goal, pose in found.goals),
         'goals_total': len(found.goals),
-        'path_rmse_m': round(float(np.sqrt(np.mean(np.sum((estimated - true) ** 2, 1)))), 4),
+        'path_rmse_m': rmse_m,
         'free_precision': round(cells.free_precision, 4),
         'free_recall': round(cells.free_recall, 4),
         'tracked_share': round(len(stamps) / len(found.true_poses), 4),

@@ -27,7 +27,7 @@ from stereo_msgs.msg import DisparityImage
 from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCalibration
 from segfloor_ros.camera.images import colour_image, depth_image, grey_image
 from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import Grey
 from segfloor_ros.files.results import FORMAT, MapFile, from_bytes, to_bytes
@@ -173,13 +173,11 @@ def labelled_arrays(message: PointCloud2, topic: str) -> LabelledPoints:
     )
 
 
-def points_of_label(
-    stamp_ns: int, frame_id: str, labelled: LabelledPoints, label: int
+def points_at(
+    stamp_ns: int, frame_id: str, labelled: LabelledPoints, rows: NDArray[np.intp]
 ) -> PointCloud2:
-    """Return the points of one label (`FLOOR` or `OBSTACLE`) as a cloud with x y z and id."""
-    assert label in (FLOOR, OBSTACLE)
-    chosen = labelled.label == label
-    cloud = SparseCloud(labelled.point_id[chosen], labelled.xyz_map[chosen])
+    """Return some rows (M,) of the points as a cloud with x y z and id."""
+    cloud = SparseCloud(labelled.point_id[rows], labelled.xyz_map[rows])
     return sparse_cloud_message(stamp_ns, frame_id, cloud)
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2
 
-from segfloor_ros.cloud import FLOOR, OBSTACLE, CloudLabelling, LabelledPoints
+from segfloor_ros.cloud import FLOOR, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.files.results import MapFile
 from segfloor_ros.messages import arrays
@@ -89,7 +90,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
             # Also for those who listen later: without keyframes it stays as it is.
-            self._obstacles = arrays.points_of_label(*at, labelled, OBSTACLE)
+            self._obstacles = arrays.points_at(*at, labelled, self._stage.standing(labelled))
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
@@ -117,10 +118,13 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
         """Publish floor and obstacles, each while someone listens."""
         if self.outputs.listeners('floor_points'):
-            floor = arrays.points_of_label(stamp_ns, frame_id, labelled, FLOOR)
+            rows = np.flatnonzero(labelled.label == FLOOR)
+            floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
         if self._obstacles_are_wanted():
-            self._obstacles = arrays.points_of_label(stamp_ns, frame_id, labelled, OBSTACLE)
+            self._obstacles = arrays.points_at(
+                stamp_ns, frame_id, labelled, self._stage.standing(labelled)
+            )
             self.outputs.publish('obstacle_points', self._obstacles)
 
     def _obstacles_are_wanted(self) -> bool:

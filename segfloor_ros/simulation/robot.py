@@ -25,8 +25,8 @@ from segfloor_ros.simulation.scene_file import EXPECTED, shipped
 from segfloor_ros.simulation.solids import Prism, floor_height_m, floors, obstacles, place
 from segfloor_ros.simulation.world import import_mujoco
 
-STEPS_PER_S, MEASUREMENTS_PER_S = 500, 100
-"""Of the physics; of wheels and IMU, whose measurements are means over their steps."""
+STEPS_PER_S, STEPS_A_MEASUREMENT = 500, 5
+"""Of the physics; wheels and IMU measure means over so many, and so often others take a step."""
 
 REMEMBERED_S = 1.0
 """So far back the poses are known, for pictures of moments that are past."""
@@ -148,13 +148,14 @@ class DrivenRobot:
         """Let the time go on to a moment."""
         while self._steps < round(time_s * STEPS_PER_S):
             self._follow_command()
-            self._place_movers()
+            if self._steps % STEPS_A_MEASUREMENT == 0:
+                self._place_movers()
             self._step(self._model, self._data)
             self._steps += 1
             self._poses.append(self._pose_now())
             self._mover_times.append([steps / STEPS_PER_S for steps in self._mover_steps])
             self._felt.append(self._data.sensordata.copy())
-            if self._steps % (STEPS_PER_S // MEASUREMENTS_PER_S) == 0:
+            if self._steps % STEPS_A_MEASUREMENT == 0:
                 self._measure()
             self._look_for_bumps()
 
@@ -196,7 +197,7 @@ class DrivenRobot:
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
             if self._steps >= 0 and not self._waits(mover, self._mover_steps[index]):
-                self._mover_steps[index] += 1
+                self._mover_steps[index] += STEPS_A_MEASUREMENT
             x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
             self._data.mocap_pos[index, :2] = x, y
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)

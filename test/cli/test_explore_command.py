@@ -36,14 +36,14 @@ path: {waypoints: [[0, 0], [0.5, 0]]}
 
 
 CHAMBER = """
-description: As little as can be explored; few and small images keep it below a minute of CPU time.
+description: As little as can be explored; few and small images keep it to a minute of CPU time.
 seed: 5
 floor: {texture: marble}
 walls:
-  - {points: [[-0.5, -0.6], [1.4, -0.6], [1.4, 0.6], [-0.5, 0.6]], closed: true,
+  - {points: [[-0.5, -0.5], [1.0, -0.5], [1.0, 0.5], [-0.5, 0.5]], closed: true,
      texture: rough_plaster, posters: 6}
-camera: {width: 320, height: 240, rate_hz: 3}
-path: {waypoints: [[0, 0], [0.5, 0]]}
+camera: {width: 320, height: 240, rate_hz: 2}
+path: {waypoints: [[0, 0], [0.3, 0]]}
 """
 
 
@@ -76,8 +76,7 @@ def kill_slam_once_busy(busy_s: float) -> threading.Thread:
     return thread
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(300)
 def test_a_robot_maps_a_chamber_and_drives_to_a_goal(tmp_path) -> None:
     scene, out = tmp_path / 'chamber.yaml', tmp_path / 'out'
     scene.write_text(CHAMBER)

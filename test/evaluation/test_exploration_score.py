@@ -57,6 +57,9 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     assert told['path_rmse_m'] == pytest.approx(0.0, abs=1e-4)
     assert told['path_m'] == pytest.approx(0.3 + np.hypot(0.1, 0.5), abs=0.01)
     assert told['real_time_factor'] == pytest.approx(0.5)
+    found.poses.clear()
+    never_found = figures(found, two_rooms(), 0.2)
+    assert (never_found['path_rmse_m'], never_found['tracked_share']) == (None, 0.0)
 
 
 def test_the_picture_has_a_strip_of_what_was_seen_below_the_map() -> None:

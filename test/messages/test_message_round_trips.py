@@ -274,7 +274,7 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
     back = arrays.labelled_arrays(message, 'labelled_points')
     for name in ('point_id', 'xyz_map', 'label', 'confidence'):
         np.testing.assert_array_equal(getattr(back, name), getattr(labelled, name))
-    obstacles = arrays.points_of_label(0, 'map', labelled, OBSTACLE)
+    obstacles = arrays.points_at(0, 'map', labelled, np.array([1]))
     only = arrays.sparse_cloud_arrays(obstacles, 'obstacle_points')
     assert only.point_id.tolist() == [4]
     np.testing.assert_array_equal(only.xyz_map, [[3, 4, 5]])

@@ -29,6 +29,9 @@ from segfloor_ros.slam.sensors.wheel_odometry import (
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""
 
+AT_REST = 1e-4, 1e-4
+"""The base stands where its wheels turn by less, in metres and radians, between two frames."""
+
 WINDOW = 0.1, 0.1
 """A stretch of the drive to learn from ends after so many metres or radians, or a moment."""
 
@@ -92,6 +95,7 @@ class BodyMotion:
         self._window_rate_rad_s = math.nan
         self._last_seen: tuple[int, Array] | None = None
         self._slipped_ns: int | None = None
+        self._stood_ns = -1
 
     def add(self, measurement: Measurement) -> None:
         """Take in what a sensor measured; what is no measurement is dropped and counted."""
@@ -130,6 +134,10 @@ class BodyMotion:
         measured = self._wheels.stretch(before_ns + lag_ns, now_ns + lag_ns)
         if measured is None or self.T_base_left is None:
             return None
+        if is_within(measured.T_before_now, AT_REST) and before_ns >= self._stood_ns:
+            # Also of a frame in which the images show nothing; each is asked for several times.
+            self.gyroscope.learn(np.eye(3), before_ns, now_ns, 0.0)
+            self._stood_ns = now_ns
         R_base_left = self.T_base_left[:3, :3]
         seconds = (now_ns - before_ns) * 1e-9
         turn = self.gyroscope.turn(before_ns, now_ns)

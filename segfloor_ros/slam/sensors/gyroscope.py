@@ -233,14 +233,16 @@ class Gyroscope:
             turns.append(turns[-1] @ R)
         return _Path(nodes, np.stack(turns), rates, at_nodes[:, 3:], samples[-1].place_m)
 
-    def learn(self, seen: Array, before_ns: int, now_ns: int) -> None:
-        """Learn bias and lag from R_before_now (3, 3) as the images show it (a Kalman filter)."""
+    def learn(
+        self, seen: Array, before_ns: int, now_ns: int, sigma_seen_rad: float = SIGMA_SEEN_RAD
+    ) -> None:
+        """Learn bias and lag from R_before_now (3, 3) as it was seen (a Kalman filter)."""
         path = self._path(before_ns, now_ns)
         if path is None or now_ns <= before_ns:
             return
         seconds = float(path.seconds[-1])
         excess = Rotation.from_matrix(seen.T @ path.turns[-1]).as_rotvec()
-        noise = SIGMA_SEEN_RAD + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
+        noise = sigma_seen_rad + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
         # What is measured is late by what is left of the lag: by its rate of the turn at either
         # end.
         speeding_up = path.speeding_up

@@ -69,6 +69,37 @@ def gyroscope(rate, bias=(0.0, 0.0, 0.0), until=1000):
     return gyro
 
 
+def standing_body():
+    body = BodyMotion()
+    body.T_base_left = Mount(0.3, 0.1, 0.0).T_base_left
+    return body
+
+
+@pytest.mark.parametrize('turn_rad_s', [0.0, 0.3])
+def test_the_bias_of_the_gyroscope_is_learnt_while_the_wheels_stand_without_any_image(turn_rad_s):
+    body, bias = standing_body(), np.array([0.004, -0.008, 0.003])
+    rate = np.array([0.0, -turn_rad_s, 0.0])
+    for t in range(0, 1500, 10):
+        body.add(ImuSample(t * MS, rate + bias, np.zeros(3)))
+        body.add(WheelPose(t * MS, base_pose(2.0, 1.0, 1e-3 * t * turn_rad_s)))
+    for t in range(0, 1200, 100):
+        for _ in range(3):
+            body.between(t * MS, (t + 100) * MS)
+    found = bias if not turn_rad_s else np.zeros(3)
+    np.testing.assert_allclose(body.gyroscope.bias_rad_s, found, atol=2e-4)
+
+
+def test_a_robot_that_is_turned_while_its_wheels_stand_has_no_other_bias():
+    body = standing_body()
+    for t in range(0, 3000, 10):
+        turned = 0.2 * (t > 1500)
+        body.add(ImuSample(t * MS, np.array([0.0, 0.005 + turned, 0.0]), np.zeros(3)))
+        body.add(WheelPose(t * MS, np.eye(4)))
+    for t in range(0, 2900, 100):
+        body.between(t * MS, (t + 100) * MS)
+    np.testing.assert_allclose(body.gyroscope.bias_rad_s, [0.0, 0.005, 0.0], atol=3e-4)
+
+
 def test_rates_integrate_to_the_turn_between_two_samples():
     # A rate that grows by 2 rad/s each second about x: from 0.2 to 0.7 s it turns by 0.7² - 0.2².
     turn, _ = gyroscope(lambda t: (2 * t, 0, 0)).turn(202 * MS, 698 * MS)
