@@ -224,7 +224,7 @@ def _slope(patches: Patches, axis: int, out: Patches) -> None:
     step = 1 if axis == 0 else patches.shape[2]
     flat, into = patches.ravel(), out.reshape(-1)
     np.subtract(flat[2 * step :], flat[: -2 * step], out=into[step:-step])
-    into *= np.float32(0.5)
+    into[step:-step] *= np.float32(0.5)
     values, ends = (np.moveaxis(array, 2 - axis, 0) for array in (patches, out))
     np.subtract(values[1], values[0], out=ends[0])
     np.subtract(values[-1], values[-2], out=ends[-1])
