@@ -296,14 +296,15 @@ class FloorSegmentation:
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
         left = np.ascontiguousarray(left_rows[:, :: view.step])
-        for _ in range(2):
+        for is_known_better in (False, True):
+            if is_known_better:
+                odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
             barred = beside | odd
             mask = fill_regions(
                 view, mask, left_rows, disparity, compared, textured, evidence.standing, barred
             )
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)
-            odd = evidence.odd & (evidence.off | unlike_floor(left, mask == FLOOR))
         if said is not None:
             self.network.note(said, mask)
         if said is not None and self.network.is_trusted:
