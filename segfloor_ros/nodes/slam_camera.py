@@ -295,6 +295,7 @@ class CameraWatch:
         """Watch these two topics from now on."""
         self._stamps: dict[str, deque[int]] = {t: deque(maxlen=RECENT) for t in (left, right)}
         self._last_image_s: dict[str, float] = {}
+        self._taken: deque[bool] = deque(maxlen=RECENT)
         self._is_live = False
 
     def saw_image(self, topic: str, stamp_ns: int) -> None:
@@ -303,6 +304,10 @@ class CameraWatch:
         now_ns = self._node.get_clock().now().nanoseconds
         self._last_image_s[topic] = 1e-9 * now_ns
         self._is_live = abs(now_ns - stamp_ns) < 1e9 * PATIENCE_S
+
+    def note_taken(self) -> None:
+        """Note that a pair is tracked."""
+        self._taken.append(True)
 
     def report_skipped(self, stamp_ns: int, is_ready: bool) -> None:
         """Report a pair that was left out because newer ones had overtaken it. is_ready: tracking
@@ -315,11 +320,15 @@ class CameraWatch:
             reporter.report(stamp_ns, Level.WARN, words)
             return
         reporter.report(stamp_ns, Level.WARN, 'skipped: tracking is slower than the camera')
+        self._taken.append(False)
+        topic, stamps_ns = next(iter(self._stamps.items()))
+        rate_hz = (len(stamps_ns) - 1) / max(1e-9 * (stamps_ns[-1] - stamps_ns[0]), 1e-3)
         reporter.diagnose(
             'skipped',
-            f'{next(iter(self._stamps))} comes faster than it is tracked, so that frames are '
-            'skipped; lower the rate or the size of the images or num_features of stereo_slam, or '
-            'play a recording with lossless set on stereo_camera',
+            f'{topic} comes faster than it is tracked: {rate_hz * np.mean(self._taken):.0f} of '
+            f'{rate_hz:.0f} images a second; the others are skipped; lower the rate or the size '
+            'of the images or num_features of stereo_slam, or play a recording with lossless set '
+            'on stereo_camera',
             lasts_s=PATIENCE_S,
         )
 

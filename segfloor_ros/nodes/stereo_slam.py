@@ -130,6 +130,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         stamp_ns, pair = pairs.popleft()
         self._work()
         if self._is_in_order(stamp_ns):
+            self._camera.watch.note_taken()
             self._process(stamp_ns, pair)
         self._answer(stamp_ns)
 

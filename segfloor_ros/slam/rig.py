@@ -240,5 +240,5 @@ def huber_weights(chi2: Array, limit: Array) -> Array:
 
 def huber_cost(chi2: Array, limit: Array) -> float:
     """Return the summed Huber cost (Hartley & Zisserman, Multiple View Geometry, A6.8)."""
-    linear = 2.0 * np.sqrt(limit * chi2) - limit
-    return float(np.where(chi2 <= limit, chi2, linear).sum())
+    inside = np.minimum(chi2, limit)
+    return float((2.0 * np.sqrt(inside * chi2) - inside).sum())

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
+from node_chain import CHAIN, NodeChain
 from node_messages import cloud_messages, publish
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_graph import fresh_graph
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
@@ -130,6 +133,35 @@ def test_frames_that_come_faster_than_they_are_tracked_are_skipped_and_said(
     assert taken == [0, 9, 10, 11], 'as many as may wait, the newest ones'
     assert all(by_stamp[frames[i].stamp_ns].level is Level.OK for i in taken)
     graph.until(lambda: health(graph, 'stereo_slam')[-1].values['skipped'] == '8', 'the count')
-    assert (
-        'left/image_raw comes faster than it is tracked' in health(graph, 'stereo_slam')[-1].message
-    )
+    message = health(graph, 'stereo_slam')[-1].message
+    assert re.search(r'left/image_raw comes faster than it is tracked: \d of 10 images', message)
+
+
+def test_no_keyframe_is_lost_where_images_come_faster_than_they_are_tracked(tmp_path) -> None:
+    """Bursts as of a camera of 30 Hz whose images wait for a core that is busy: what is skipped was
+    never a keyframe, and every keyframe comes into the map.
+    """
+    bursts, together = 6, 8
+    frames, _ = room_drive(2 + bursts * together, step_m=0.01, arc_rad=0.02)
+    with fresh_graph() as graph:
+        chain = NodeChain(graph, tmp_path)
+        try:
+            chain.start(*CHAIN, max_waiting_frames=3)
+            chain.drive(frames[:2])
+            for burst in range(bursts):
+                first = 2 + burst * together
+                for frame in frames[first : first + together]:
+                    chain.send(frame)
+                graph.comes(lambda: False, together / 30)
+            chain.answers([frames[-1].stamp_ns])
+            answers = graph.reports('stereo_slam')
+            keyframes = [a.stamp_ns for a in answers if a.values.get('keyframe') == '1']
+            for stamp_ns in keyframes:
+                chain.mapped(stamp_ns)
+        finally:
+            chain.stop()
+        skipped = [a for a in answers if 'skipped' in a.message]
+        in_map = {s.stamp_ns for s in graph.reports('occupancy_grid') if s.level is Level.OK}
+    assert len(skipped) >= bursts and len(keyframes) > 2
+    assert all(a.values['tracked'] == '1' for a in answers if a not in skipped)
+    assert in_map == set(keyframes)

@@ -211,10 +211,10 @@ def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray
 
 def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Tell of each pixel of a mask (R, W) whether the next evidence up its column is floor."""
-    rows = np.arange(len(mask), dtype=np.int16)[:, None]
-    next_up = np.maximum.accumulate(np.where(mask != NO_EVIDENCE, rows, np.int16(0)), axis=0)
-    is_floor: NDArray[np.bool_] = np.take_along_axis(mask, next_up, axis=0) == FLOOR
-    return is_floor
+    twice_row = np.arange(0, 2 * len(mask), 2, dtype=np.int16)[:, None]
+    evidence = twice_row * (mask != NO_EVIDENCE)  # odd where it is floor
+    evidence |= mask == FLOOR
+    return np.maximum.accumulate(evidence, axis=0, out=evidence) & 1 > 0
 
 
 def mean_height(heights: Heights) -> NDArray[np.float32]:

@@ -275,14 +275,15 @@ class MovingRegions:
             inside = (z > MIN_DEPTH_M) & (u >= 0) & (u < self._small.size[0])
             inside &= (v >= 0) & (v < self._small.size[1])
             at = np.where(inside, v * self._small.size[0] + u, 0).astype(np.intp)
-            inside &= view.disparity.ravel()[at] > 0
+            seen_px = view.disparity.take(at)
+            inside &= seen_px > 0
             expected = self._small.disparity_m / depth
-            tolerance = TOLERANCE_PX * np.sqrt(1 + (expected / disparity) ** 4)
-            differs = np.abs(view.disparity.ravel()[at] - expected) / tolerance
+            tolerance = TOLERANCE_PX * np.sqrt(1 + np.square(np.square(expected / disparity)))
+            differs = np.abs(seen_px - expected) / tolerance
             tolerance *= static_scale(differs[inside])
-            nearest = view.nearest.ravel()[at]
+            nearest = view.nearest.take(at)
             behind = nearest < expected - tolerance
-            before = view.farthest.ravel()[at] > expected + tolerance
+            before = view.farthest.take(at) > expected + tolerance
             through += inside & behind
             # Farther along much the same ray by as much as the earlier view says.
             seen = np.flatnonzero(inside & behind)

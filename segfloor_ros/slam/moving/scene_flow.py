@@ -191,7 +191,8 @@ def static_scale(ratios: Array) -> float:
     if len(ratios) == 0:
         return 1.0
     quarter = 0.25
-    sigma = float(np.quantile(ratios, quarter)) / np.sqrt(chi2_limit(1, quarter))
+    rank = int(quarter * (len(ratios) - 1))  # `np.quantile` takes three times as long
+    sigma = float(np.partition(ratios, rank)[rank]) / np.sqrt(chi2_limit(1, quarter))
     return max(1.0, sigma * np.sqrt(chi2_limit(1, GATE)))
 
 
@@ -230,10 +231,13 @@ def _discs(disparity: Disparity, uv: Array, of_corner: Array) -> NDArray[np.uint
     """Return the pixels (h, w) around corners that are at the same depth."""
     height, width = disparity.shape
     mask = np.zeros(disparity.shape, np.uint8)
-    for (u, v), d in zip(np.rint(uv).astype(int), of_corner, strict=True):
-        rows = slice(max(0, v - APART_PX), min(height, v + APART_PX + 1))
-        columns = slice(max(0, u - APART_PX), min(width, u + APART_PX + 1))
-        mask[rows, columns] |= np.abs(disparity[rows, columns] - d) < 2 * TOLERANCE_PX
+    reach = np.arange(-APART_PX, APART_PX + 1)
+    u, v = np.rint(uv).astype(np.intp).T[:, :, None, None]
+    u, v = np.broadcast_arrays(u + reach, v + reach[:, None])
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    at = np.where(inside, v * width + u, 0)
+    alike = np.abs(disparity.take(at) - of_corner[:, None, None]) < 2 * TOLERANCE_PX
+    mask.ravel()[at[inside & alike]] = 1
     return mask
 
 
@@ -262,8 +266,9 @@ class SmallCamera:
 
     def contains(self, uv: Array) -> NDArray[np.bool_]:
         """Return which pixels (N, 2) lie in the image."""
-        at = np.rint(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0))
-        return np.asarray((at >= 0).all(axis=1) & (at < self.size).all(axis=1))
+        u, v = np.rint(uv).T
+        width, height = self.size
+        return np.asarray((u >= 0) & (u < width) & (v >= 0) & (v < height))
 
     def at(self, image: NDArray[Any], uv: Array) -> Array:
         """Return the values (N,) of an image (h, w) at pixels (N, 2), 0 outside."""

@@ -68,7 +68,7 @@ keyframe, what was measured in them."""
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
 
-TRACKED_POINTS = 400
+TRACKED_POINTS = 300
 """Map points, spread over the image, that are measured in a frame between keyframes."""
 
 MAX_FOLLOWED = 250
@@ -119,10 +119,12 @@ class Tracker:
         T_camera_world: Array,
         known: PoseEstimate | None = None,
         is_given: bool = False,
+        measured_before: Track | None = None,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
         `track` for the rest. known: the pose by the same images before; or, with is_given,
-        where the camera is, and only its points are looked for.
+        where the camera is, and only its points are looked for. measured_before: points that were
+        measured in the same images.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -138,9 +140,18 @@ class Tracker:
             return None
         ids = seen.ids[points]
         if isinstance(images, Images):
-            align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
-            guess_px = seen.uvd_px[points, 2] + offset_px
-            measure_disparity(images, observations, rows, guess_px)
+            left = np.ones(len(rows), bool)
+            if measured_before is not None:
+                at = np.full(len(self._map.alive), -1)
+                at[measured_before.point_ids] = np.arange(len(measured_before.point_ids))
+                before = at[ids]
+                left = before < 0
+                same, before = rows[~left], before[~left]
+                observations.uvd_px[same] = measured_before.observations.uvd_px[before]
+                observations.sigma_px[same] = measured_before.observations.sigma_px[before]
+            points, fresh = points[left], rows[left]
+            align_pixels(images.left, observations, fresh, self._map, ids[left], T_camera_world)
+            measure_disparity(images, observations, fresh, seen.uvd_px[points, 2] + offset_px)
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:

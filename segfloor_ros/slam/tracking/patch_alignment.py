@@ -28,8 +28,9 @@ from segfloor_ros.slam.tracking.images import SIDE_PX, Images
 from segfloor_ros.timing import timed
 
 HALF_PATCH_PX = SIDE_PX // 2
-STEPS = 4
-"""Gauss-Newton steps; a start within reach converges in three."""
+STEPS, SETTLED_PX = 4, 0.02
+"""Gauss-Newton steps, and the length of one after which the next would change nothing that counts:
+noise of the template makes each a half or more of what is missing."""
 
 AFFINE_SIGMA = 0.3
 """Prior standard deviation of the affine part, px per px; the floor under a low camera reaches
@@ -49,6 +50,8 @@ MIN_SIGMA_PIXEL, MIN_SIGMA_DISPARITY = 0.15, 0.1
 MIN_CORRELATION = 0.7
 """Of the patches of one point in both images."""
 
+MAX_STEP = np.array([MAX_SHIFT_STEP_PX, AFFINE_SIGMA, AFFINE_SIGMA])[:, None]
+
 Patches = NDArray[np.float32]
 
 ALIASED = 0.3
@@ -59,6 +62,17 @@ CELLS, PER_CELL = 80, 3
 
 LEAST_SHIFT = 1e-4
 """Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
+
+
+_STEPS_PX = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
+_Y, _X = (grid.ravel() for grid in np.meshgrid(_STEPS_PX, _STEPS_PX, indexing='ij'))
+XY1 = np.stack([_X, _Y, np.ones_like(_X)])
+_GAUSSIAN = np.exp(-0.5 * (_X**2 + _Y**2) / (0.6 * HALF_PATCH_PX) ** 2)
+WINDOW = _GAUSSIAN / _GAUSSIAN.sum()
+BASIS = np.ascontiguousarray(WINDOW[:, None] * XY1[[2, 0, 1]].T)
+SQUARES = (BASIS[:, :, None] * XY1[[2, 0, 1]].T[:, None]).reshape(-1, 9)
+"""Of the pixels (P,) of a patch: where they are, (3, P), their weights, of sum 1, and these times
+1, x and y, (P, 3), and times the products of two of them, (P, 9)."""
 
 
 @dataclass(frozen=True)
@@ -84,99 +98,179 @@ def align_patches(
     template: (N, SIDE_PX, SIDE_PX) grey levels. image: (H, W) float32. start_uv_px: (N, 2). zoom:
     (N,) how much larger the patch appears in the image than in the template. along_row: the match
     of a rectified pair, where only u is unknown. Inverse compositional Gauss-Newton: slopes and
-    normal equations come from the template, once. A fit is sound when it stays near its start, has
-    settled, and explains the patch better than a plain grey level would.
+    normal equations come from the template, once; a patch that has settled takes no further steps.
+    A fit is sound when it stays near its start, has settled, and explains the patch better than a
+    plain grey level would.
     """
-    if len(template) == 0:
+    count, axes = len(template), 1 if along_row else 2
+    if count == 0:
         return Alignment(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_))
-    fit = _Fit(template, image, 1 if along_row else 2)
-    A = zoom[:, None, None] * np.eye(2)
-    offset = np.zeros((len(template), 2))
-    prior = np.where(np.arange(3 * fit.axes) % 3 == 0, 0.0, AFFINE_SIGMA**-2)
-    max_step = np.where(prior > 0, AFFINE_SIGMA, MAX_SHIFT_STEP_PX)
-    step = np.zeros((len(template), 2, 3))
-    deviation = np.zeros((len(template), fit.axes, 3))
+    fit = _Fit.of(template, axes)
+    contrast, of_level = fit.contrast, float(WINDOW.max())
+    warp: Array = np.zeros((2, 3, count))
+    warp[0, 0] = warp[1, 1] = zoom
+    warp[:, 2] = start_uv_px.T
+    noise, last = np.zeros(count), np.zeros((axes, count))
+    moving = np.arange(count)
     for iteration in range(STEPS):
-        noise, rhs = fit.misfit(np.dstack([A, start_uv_px + offset]).astype(np.float32))
-        level = np.maximum(noise, GREY_NOISE**2) * fit.weight.max()
+        W = warp[:, :, moving]
+        noise[moving], rhs = fit.misfit(image, W)
         if iteration == 0:
-            prior_level = level[:, None]
-            inverse = np.linalg.inv(fit.H + prior_level[..., None] * np.diag(prior + 1e-9))
-        deviation[:, :, 1:] = (A / zoom[:, None, None] - np.eye(2))[:, : fit.axes]
-        rhs += prior_level * prior * deviation.reshape(rhs.shape)
-        found = np.clip((inverse @ rhs[..., None])[..., 0], -max_step, max_step)
-        step[:, : fit.axes] = found.reshape(len(found), fit.axes, 3)
-        A = A @ _inverse_2x2(np.eye(2) + step[:, :, 1:])
-        offset -= (A @ step[:, :, :1])[..., 0]
-    variance = np.einsum('naa->na', inverse)[:, ::3] * level[:, None]
-    sigma = np.zeros((len(template), 2))
-    sigma[:, : fit.axes] = zoom[:, None] * np.sqrt(np.maximum(variance, 0.0))
-    sound = (
-        (np.abs(offset) < ALIGNED_PX).all(axis=1)
-        & (np.abs(step[:, :, 0]) < MIN_SIGMA_DISPARITY).all(axis=1)
-        & (noise < MAJORITY * fit.contrast)
-    )
-    return Alignment(start_uv_px + offset, sigma, sound)
+            prior = np.maximum(noise, GREY_NOISE**2) * of_level
+            H = fit.H
+            for unknown in range(3 * axes):
+                H[unknown, unknown] += prior * (AFFINE_SIGMA**-2 if unknown % 3 else 1e-9)
+            inverse = _inverse(H)
+        shear = W[:axes, :2] / zoom[moving]
+        for axis in range(axes):
+            shear[axis, axis] -= 1.0
+        rhs[:, 1:] += (AFFINE_SIGMA**-2 * prior[moving]) * shear
+        step = np.einsum('abn,bn->an', inverse[:, :, moving], rhs.reshape(3 * axes, -1))
+        step = np.clip(step.reshape(rhs.shape), -MAX_STEP, MAX_STEP)
+        warp[:, :, moving] = _stepped(W, step)
+        last[:, moving] = step[:, 0]
+        still = np.abs(step[:, 0]).max(axis=0) > SETTLED_PX
+        if not still.any():
+            break
+        fit, moving = fit.take(still), moving[still]
+    level = np.maximum(noise, GREY_NOISE**2) * of_level
+    sigma: Array = np.zeros((2, count))
+    variance = np.einsum('aan->an', inverse)[::3] * level
+    sigma[:axes] = zoom * np.sqrt(np.maximum(variance, 0.0))
+    offset = warp[:, 2] - start_uv_px.T
+    sound = (np.abs(offset) < ALIGNED_PX).all(axis=0) & (noise < MAJORITY * contrast)
+    sound &= (np.abs(last) < MIN_SIGMA_DISPARITY).all(axis=0)
+    return Alignment(start_uv_px + offset.T, sigma.T, sound)
 
 
+@dataclass(frozen=True)
 class _Fit:
-    """Sums of grey levels over patches (N, SIDE_PX, SIDE_PX), of which the image (H, W) and its
-    brightness alone are new in each step: no array holds the derivatives of each pixel by each
-    unknown. An unknown is the shift of a pixel along an axis, constant, or by its x or y.
+    """Sums of grey levels over patches, of which the image and its brightness alone are new in each
+    step: no array holds the derivatives of each pixel by each unknown. An unknown is the shift of a
+    pixel along an axis, constant, or by its x or y.
 
-    weight: (P,) Gaussian, of sum 1. contrast: (N,) variance of each patch. H: (N, 3 axes, 3 axes)
-    normal matrices, freed of what a change of brightness could explain.
+    mean: (N,) of the patches. parts: (1 + axes, N, P) how their pixels differ from it, and how they
+    change along each axis. contrast: (N,) variance of each patch. of_slopes, of_target: (axes, 3,
+    N) sums of the latter, and of their products with the first. H: (3 axes, 3 axes, N) normal
+    matrices, freed of what a change of brightness could explain.
     """
 
-    def __init__(self, template: Patches, image: NDArray[np.float32], axes: int) -> None:
-        self.axes, self._image, count = axes, image, len(template)
-        steps = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
-        y, x = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing='ij'))
-        window = np.exp(-0.5 * (x**2 + y**2) / (0.6 * HALF_PATCH_PX) ** 2)
-        self.weight = window / window.sum()
-        self._xy1, basis = np.stack([x, y, np.ones_like(x)]), np.stack([np.ones_like(x), x, y])
-        self._basis = np.ascontiguousarray((self.weight * basis).T)
-        self._mean = (template.reshape(count, -1) @ self.weight)[:, None]
-        slope_v, slope_u = np.gradient(template, axis=(1, 2))
-        parts = [template - self._mean[..., None], slope_u, slope_v][: 1 + axes]
-        self._parts = np.stack(parts, axis=1).reshape(count, 1 + axes, -1)
-        self._products = self._parts[:, :1] * self._parts
-        of_target = self._sums(self._products)
-        self.contrast, self._of_target = of_target[:, 0, 0], of_target[:, 1:].reshape(count, -1)
-        slopes = self._parts[:, 1:]
-        self._of_slopes = self._sums(slopes).reshape(count, -1)
-        squares = (self.weight * basis[:, None] * basis).reshape(9, -1).T
-        pairs = (slopes[:, :, None] * slopes[:, None]).reshape(-1, len(self.weight)) @ squares
-        H = pairs.reshape(count, axes, axes, 3, 3).swapaxes(2, 3).reshape(count, 3 * axes, -1)
-        self.H = H - self._of_slopes[:, :, None] * self._of_slopes[:, None]
+    mean: Patches
+    parts: Patches
+    contrast: Array
+    of_slopes: Array
+    of_target: Array
+    H: Array
 
-    def misfit(self, warp: Patches) -> tuple[Array, Array]:
-        """Return the mean squared difference (N,) of the patches from the image where a warp (N, 2,
-        3) = (shear, place) has them, at the gain and offset that fit best, and its slope (N, 3
-        axes) by the unknowns, halved.
+    @staticmethod
+    def of(template: Patches, axes: int) -> _Fit:
+        """Return them for patches (N, SIDE_PX, SIDE_PX) of which some axes are unknown."""
+        count = len(template)
+        parts = np.empty((1 + axes, count, SIDE_PX**2), np.float32)
+        flat = template.reshape(count, -1)
+        mean = flat @ WINDOW
+        np.subtract(flat, mean[:, None], out=parts[0])
+        for axis in range(axes):
+            _slope(template, axis, parts[1 + axis].reshape(template.shape))
+        of_slopes = _sums(parts[1:], BASIS)
+        of_target = _sums(parts[0] * parts, BASIS)
+        pairs = [(j, k) for j in range(axes) for k in range(j, axes)]
+        H: Array = np.empty((axes, 3, axes, 3, count))
+        products = np.stack([parts[1 + j] * parts[1 + k] for j, k in pairs])
+        for (j, k), sums in zip(pairs, _sums(products, SQUARES), strict=True):
+            H[j, :, k] = H[k, :, j] = sums.reshape(3, 3, count)
+        H -= of_slopes[:, :, None, None] * of_slopes
+        H = H.reshape(3 * axes, 3 * axes, count)
+        return _Fit(mean, parts, of_target[0, 0], of_slopes, of_target[1:], H)
+
+    def take(self, rows: NDArray[np.bool_]) -> _Fit:
+        """Return the chosen patches, for further steps."""
+        return replace(
+            self,
+            mean=self.mean[rows],
+            parts=self.parts[:, rows],
+            contrast=self.contrast[rows],
+            of_slopes=self.of_slopes[..., rows],
+            of_target=self.of_target[..., rows],
+        )
+
+    def misfit(self, image: NDArray[np.float32], warp: Array) -> tuple[Array, Array]:
+        """Return the mean squared difference (N,) of the patches from an image (H, W) where a warp
+        (2, 3, N) = (shear, place) has them, at the gain and offset that fit best, and its slope
+        (axes, 3, N) by the unknowns, halved.
         """
-        seen = _remap(self._image, warp[:, 0] @ self._xy1, warp[:, 1] @ self._xy1)
-        seen -= self._mean
-        sums = self._sums(np.multiply(seen[:, None], self._parts, out=self._products))
-        mean = np.asarray(seen @ self.weight, np.float64)
-        variance = np.maximum(np.square(seen, out=seen) @ self.weight - mean**2, 1e-3)
-        shared = sums[:, 0, 0]
+        u, v = (axis.T.astype(np.float32) @ XY1 for axis in warp)
+        seen = _remap(image, u, v)
+        seen -= self.mean[:, None]
+        sums = _sums(seen * self.parts, BASIS)
+        mean = (seen @ WINDOW).astype(np.float64)
+        variance = np.maximum(np.square(seen, out=seen) @ WINDOW - mean**2, 1e-3)
+        shared = sums[0, 0]
         gain = shared / variance
-        slope = sums[:, 1:].reshape(len(gain), -1) - mean[:, None] * self._of_slopes
-        return self.contrast - gain * shared, gain[:, None] * slope - self._of_target
-
-    def _sums(self, values: Patches) -> Array:
-        """Return weighted sums (N, A, 3) of values (N, A, P): plain, by x and by y."""
-        sums = values.reshape(-1, len(self.weight)) @ self._basis
-        return sums.reshape(len(values), -1, 3).astype(np.float64)
+        slope = gain * (sums[1:] - mean * self.of_slopes) - self.of_target
+        return self.contrast - gain * shared, slope
 
 
-def _inverse_2x2(A: Array) -> Array:
-    inverse = np.empty_like(A)
-    inverse[:, 0, 0], inverse[:, 1, 1] = A[:, 1, 1], A[:, 0, 0]
-    inverse[:, 0, 1], inverse[:, 1, 0] = -A[:, 0, 1], -A[:, 1, 0]
-    determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
-    return inverse / determinant[:, None, None]
+def _sums(values: Patches, basis: Patches) -> Array:
+    """Return the sums (A, B, N) of values (A, N, P) times each of a basis (P, B)."""
+    sums = values.reshape(-1, len(basis)) @ basis
+    return sums.reshape(*values.shape[:2], -1).swapaxes(1, 2).astype(np.float64)
+
+
+def _slope(patches: Patches, axis: int, out: Patches) -> None:
+    """Write how patches (N, rows, columns) change along their columns, or with axis 1 their rows,
+    to `out`, as `np.gradient` does.
+    """
+    step = 1 if axis == 0 else patches.shape[2]
+    flat, into = patches.ravel(), out.reshape(-1)
+    np.subtract(flat[2 * step :], flat[: -2 * step], out=into[step:-step])
+    into[step:-step] *= np.float32(0.5)
+    values, ends = (np.moveaxis(array, 2 - axis, 0) for array in (patches, out))
+    np.subtract(values[1], values[0], out=ends[0])
+    np.subtract(values[-1], values[-2], out=ends[-1])
+
+
+def _stepped(warp: Array, step: Array) -> Array:
+    """Return warps (2, 3, N) = (A, place) with a step (axes, 3, N) = (shift, shear) taken back."""
+    (a, b, _), (c, d, _) = warp
+    (du, p, q), (dv, r, s) = step if len(step) == 2 else (step[0], np.zeros_like(step[0]))
+    p, s = 1.0 + p, 1.0 + s
+    scale = 1.0 / (p * s - q * r)
+    stepped = np.empty_like(warp)
+    for row, (x, y, place) in zip(stepped, ((a, b, warp[0, 2]), (c, d, warp[1, 2])), strict=True):
+        row[0], row[1] = (x * s - y * r) * scale, (y * p - x * q) * scale
+        row[2] = place - row[0] * du - row[1] * dv
+    return stepped
+
+
+def _inverse(H: Array) -> Array:
+    """Return the inverses (K, K, N) of positive symmetric matrices (K, K, N), of blocks of three by
+    the Schur complement.
+    """
+    first = _inverse_of_three(H[:3, :3])
+    if len(H) == 3:
+        return first
+    across = np.einsum('abn,bcn->acn', first, H[:3, 3:])
+    inverse: Array = np.empty_like(H)
+    rest = H[3:, 3:] - np.einsum('ban,bcn->acn', H[:3, 3:], across)
+    inverse[3:, 3:] = _inverse_of_three(rest)
+    inverse[:3, 3:] = -np.einsum('abn,bcn->acn', across, inverse[3:, 3:])
+    inverse[3:, :3] = inverse[:3, 3:].swapaxes(0, 1)
+    inverse[:3, :3] = first - np.einsum('abn,cbn->acn', inverse[:3, 3:], across)
+    return inverse
+
+
+def _inverse_of_three(A: Array) -> Array:
+    """Return the inverses (3, 3, N) of symmetric matrices (3, 3, N), by their cofactors."""
+    (a, b, c), (_, d, e), (_, _, f) = A
+    inverse: Array = np.empty_like(A)
+    inverse[0] = d * f - e * e, c * e - b * f, b * e - c * d
+    inverse[1, 1:] = a * f - c * c, b * c - a * e
+    inverse[2, 2] = a * d - b * b
+    determinant = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
+    inverse[1, 0], inverse[2, :2] = inverse[0, 1], inverse[[0, 1], 2]
+    inverse /= determinant
+    return inverse
 
 
 def correlation_along_row(

@@ -8,6 +8,7 @@ standing still. They are distinguished, not averaged, where they contradict each
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,17 +131,17 @@ def refine_pose(
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
         pose = _minimise(pose, seen.take(inliers))
-        points, _, chi2 = seen.at(pose)
-        chi2[points[2] <= MIN_DEPTH_M] = np.inf
-        factor = float(np.sqrt(np.clip(np.median(chi2 / seen.median), 1.0, max_noise_factor**2)))
+        rays, _, chi2 = seen.at(pose)
+        chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
+        middle = float(np.median(chi2 / seen.median))
+        factor = math.sqrt(min(max(middle, 1.0), max_noise_factor**2))
         before, inliers = inliers, chi2 <= factor**2 * seen.limit
         if inliers.sum() < 4 or (inliers != before).mean() < SAME_INLIERS:
             break
     if inliers.sum() < 4:
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
     # Huber's weight of an inlier is 1.
-    root = np.sqrt(seen.information[:, inliers]) / factor
-    J = seen.weighted_jacobian(points[:, inliers], root)
+    J = seen.take(inliers).jacobian(rays[:, inliers], np.float64(1 / factor))
     return PoseEstimate(pose, inliers, np.linalg.pinv(J @ J.T, hermitian=True), factor)
 
 
@@ -159,65 +160,90 @@ def squared_distances(
 
 @dataclass(frozen=True)
 class _Seen:
-    """Points and their observations, one long row (N,) for each coordinate: points_world, uvd_px
-    and information (3, N), 0 where nothing is measured; limit, median: (N,) of chi2.
+    """Points and their observations, one long row (N,) for each coordinate, in few arrays: NumPy
+    takes as long to begin as to compute hundreds of numbers.
+
+    rows: (11, N), points of the world, focal lengths and disparity times depth, what was measured
+    from the principal point, both in standard deviations, 0 where nothing is measured; limit and
+    median of chi2.
     """
 
-    camera: StereoCamera
-    points_world: Array
-    uvd_px: Array
-    information: Array
-    limit: Array
-    median: Array
+    rows: Array
 
     @staticmethod
     def of(camera: StereoCamera, points_world: Array, observations: Observations) -> _Seen:
         """Return them, for points (N, 3)."""
-        return _Seen(
-            camera,
-            np.ascontiguousarray(points_world.T),
-            np.nan_to_num(observations.uvd_px.T.copy()),
-            np.ascontiguousarray(observations.information.T),
-            observations.chi2_limit,
-            observations.chi2_median,
-        )
+        rows = np.empty((11, len(points_world)))
+        rows[:3] = points_world.T
+        measured = np.isfinite(observations.uvd_px)
+        certainty = np.where(measured, 1.0 / observations.sigma_px, 0.0)
+        scale = camera.fx, camera.fy, camera.disparity_times_depth
+        np.multiply(certainty, scale, out=rows[3:6].T)
+        from_centre = observations.uvd_px - (camera.cx, camera.cy, 0.0)
+        rows[6:9] = np.where(measured, from_centre * certainty, 0.0).T
+        rows[9], rows[10] = observations.chi2_limit, observations.chi2_median
+        return _Seen(rows)
 
-    def take(self, rows: NDArray[np.bool_]) -> _Seen:
-        """Return the chosen rows."""
-        columns = self.points_world, self.uvd_px, self.information, self.limit, self.median
-        return _Seen(self.camera, *(column[..., rows] for column in columns))
+    @property
+    def limit(self) -> Array:
+        """The bound (N,) of chi2."""
+        return self.rows[9]
+
+    @property
+    def median(self) -> Array:
+        """What chi2 (N,) is in the median, when all is well."""
+        return self.rows[10]
+
+    def take(self, columns: NDArray[np.bool_]) -> _Seen:
+        """Return the chosen ones."""
+        return self if columns.all() else _Seen(self.rows[:, columns])
 
     def at(self, T_camera_world: Array) -> tuple[Array, Array, Array]:
-        """Return the points and residuals (3, N) at a pose, and the squares of these (N,); points
-        that are behind the camera are just before it.
+        """Return rays (3, N) = (x / z, y / z, 1 / z) to the points at a pose, the residuals (3, N)
+        in standard deviations, and their squares (N,); points that are behind the camera are just
+        before it.
         """
-        camera = self.camera
-        points = T_camera_world[:3, :3] @ self.points_world + T_camera_world[:3, 3:]
-        np.maximum(points[2], MIN_DEPTH_M, out=points[2])
-        inverse_z = 1.0 / points[2]
-        residual = np.empty_like(points)
-        residual[0] = camera.fx * points[0] * inverse_z + camera.cx
-        residual[1] = camera.fy * points[1] * inverse_z + camera.cy
-        residual[2] = camera.disparity_times_depth * inverse_z
-        residual -= self.uvd_px
-        return points, residual, (residual**2 * self.information).sum(axis=0)
+        rays = T_camera_world[:3, :3] @ self.rows[:3]
+        rays += T_camera_world[:3, 3:]
+        inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
+        rays[:2] *= inverse_z
+        rays[2] = inverse_z
+        residual = rays * self.rows[3:6]
+        residual -= self.rows[6:9]
+        return rays, residual, np.einsum('an,an->n', residual, residual)
 
-    def weighted_jacobian(self, points: Array, root: Array) -> Array:
-        """Return the derivatives (6, 3 N) of what is seen of points (3, N) of the camera by the
-        twist of its pose, times the roots (3, N) of their weights.
+    def jacobian(self, rays: Array, root: Array) -> Array:
+        """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
+        pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183).
         """
-        return with_moment(points, weighted_jacobian(self.camera, points.T, root)).reshape(6, -1)
+        x, y, inverse_z = rays
+        by_z = self.rows[3:6] * root
+        u, v = by_z[:2]
+        along = by_z * rays
+        J: Array = np.zeros((6, *rays.shape))
+        np.multiply(u, inverse_z, out=J[0, 0])
+        np.multiply(v, inverse_z, out=J[1, 1])
+        np.multiply(along, -inverse_z, out=J[2])
+        np.multiply(along, -y, out=J[3])
+        J[3, 1] -= v
+        np.multiply(along, x, out=J[4])
+        J[4, 0] += u
+        np.multiply(u, -y, out=J[5, 0])
+        np.multiply(v, x, out=J[5, 1])
+        return J.reshape(6, -1)
 
 
 def _minimise(pose: Array, seen: _Seen) -> Array:
     damping = 1e-4
-    points, residual, chi2 = seen.at(pose)
+    rays, residual, chi2 = seen.at(pose)
     cost = huber_cost(chi2, seen.limit)
     for _ in range(STEPS_PER_ROUND):
-        root = np.sqrt(seen.information * huber_weights(chi2, seen.limit))
-        J = seen.weighted_jacobian(points, root)
+        root = np.sqrt(huber_weights(chi2, seen.limit))
+        J = seen.jacobian(rays, root)
         H, g = J @ J.T, J @ (residual * root).ravel()
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), -g)
+        diagonal = H.ravel()[::7]
+        diagonal += damping * (diagonal + 1e-9)
+        step = np.linalg.solve(H, -g)
         candidate = se3_exp(step) @ pose
         if -g @ step < CONVERGED * cost:
             return candidate
@@ -225,7 +251,7 @@ def _minimise(pose: Array, seen: _Seen) -> Array:
         trial_cost = huber_cost(trial[2], seen.limit)
         if trial_cost <= cost:
             converged = cost - trial_cost < CONVERGED * cost
-            pose, (points, residual, chi2), cost = candidate, trial, trial_cost
+            pose, (rays, residual, chi2), cost = candidate, trial, trial_cost
             damping *= 0.2
             if converged:
                 break

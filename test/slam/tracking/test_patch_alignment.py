@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from segfloor_ros.slam.tracking import patch_alignment
 from segfloor_ros.slam.tracking.patch_alignment import (
+    _remap,
     align_patches,
     refine_disparity,
     sample_patches,
@@ -48,6 +50,26 @@ def test_finds_a_subpixel_shift_under_another_brightness():
     error = found.uv_px[found.sound] - (uv[found.sound] + [0.62, -0.35])
     assert np.abs(np.median(error, axis=0)).max() < 0.02
     assert np.percentile(np.abs(error), 90) < 0.1
+
+
+def test_a_patch_that_has_settled_is_not_looked_at_again(monkeypatch):
+    texture = Texture()
+    image = texture.image()
+    uv = grid_of_features()
+    start = uv + np.where(np.arange(len(uv)) % 2, 0.0, 1.2)[:, None]
+    looked_at = []
+
+    def noted(image, u, v):
+        looked_at.append(len(u))
+        return _remap(image, u, v)
+
+    template = sample_patches(image, uv)
+    monkeypatch.setattr(patch_alignment, '_remap', noted)
+    found = align_patches(template, image, start, np.ones(len(uv)))
+    # Those that start where they lie take the first step alone, the others more.
+    assert looked_at[0] == len(uv) and looked_at[1] == pytest.approx(len(uv) / 2, abs=1)
+    assert found.sound.mean() > 0.9
+    assert np.percentile(np.abs(found.uv_px - uv)[found.sound], 90) < 0.1
 
 
 def test_follows_a_zoom():
