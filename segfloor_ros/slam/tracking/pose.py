@@ -141,7 +141,7 @@ def refine_pose(
     if inliers.sum() < 4:
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
     # Huber's weight of an inlier is 1.
-    J = seen.take(inliers).jacobian(rays[:, inliers], np.float64(1 / factor))
+    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
     return PoseEstimate(pose, inliers, np.linalg.pinv(J @ J.T, hermitian=True), factor)
 
 
@@ -212,7 +212,7 @@ class _Seen:
         residual -= self.rows[6:9]
         return rays, residual, np.einsum('an,an->n', residual, residual)
 
-    def jacobian(self, rays: Array, root: Array) -> Array:
+    def jacobian(self, rays: Array, root: Array | float) -> Array:
         """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
         pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183).
         """
