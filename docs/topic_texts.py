@@ -31,7 +31,8 @@ ABOUT = {
     'pose': 'Every tracked frame: base_link in map. Published while someone listens.',
     'odometry/corrected': (
         'What came on odometry before the mount of the camera was known, or the map was found '
-        'again: the same frames, corrected once. For who records.'
+        'again: the same frames, corrected once; and frames that saw the place before it was '
+        'certain. For who records.'
     ),
     'pose/corrected': 'So for pose.',
     'dynamic_mask': (
