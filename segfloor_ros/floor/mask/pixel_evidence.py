@@ -53,6 +53,9 @@ _LIKENESS_GREY = 3.0
 _WIDE_WINDOW, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = 15, 1.15, 0.05, 0.65
 """What too little texture leaves open in a small window a larger one often tells: floor is denied
 there where it differs by this much more than what was matched, over so much of the window."""
+_FOREIGN = 0.4, 0.3
+"""Correlation of both eyes from which on it says something, if all differences are noise; and the
+share of it below which they show different things."""
 _MARGIN_PX = 4.0
 """So near to the right image's border interpolation is unsure."""
 _NOISE_SHARE = 2.0
@@ -341,13 +344,18 @@ def compare(
     floor_px = profile.at_pixels(view.derolled[part])
     matched_px = disparity[part]
 
-    def difference(disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    def right_at(disparity_px: NDArray[np.float32]) -> NDArray[np.uint8]:
         at = columns - disparity_px
         seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return _local_difference(sampled, seen)
+        return seen.astype(np.uint8, copy=False)
 
-    matched = difference(matched_px)
-    floor = difference(np.where(on_floor[part], matched_px, floor_px))
+    reached = columns >= floor_px + _MARGIN_PX
+    lying = on_floor[part] & (matched_px > 0)
+    as_floor = right_at(np.where(lying, matched_px, floor_px))
+    matched = _local_difference(sampled, right_at(matched_px))
+    floor = _local_difference(sampled, as_floor)
+    lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
+    foreign = _foreign(sampled, as_floor, lying, noise_grey)
     margin = _AGAINST_GREY + 0.5 * noise_grey
     against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
     unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
@@ -356,8 +364,8 @@ def compare(
     worse = floor > 1.1 * matched
     denied &= (matched_px > 0) & worse
     denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
-    contrary = against | (floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey)
-    reached = columns >= floor_px + _MARGIN_PX
+    contrary = against | foreign
+    contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
     contradicted = (against, denied, unlike)
     masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
     return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
@@ -378,6 +386,30 @@ def compare_measured(
     against &= ~on_floor
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
+
+
+def _foreign(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], lying: NDArray[np.bool_], noise_grey: float
+) -> NDArray[np.bool_]:
+    """Return where the left image (R, W) has texture that the right one, drawn as if all were
+    floor, has not: what stands so near, or so askew, that it is not matched at all.
+
+    lying: where what is matched lies on the floor; what the two differ by there is noise, too.
+    """
+    window = (_WIDE_WINDOW, _WIDE_WINDOW)
+    a, b = left.astype(np.float32), right.astype(np.float32)
+    mean_a, mean_b = cv2.blur(a, window), cv2.blur(b, window)
+    variance = np.maximum(cv2.blur(a * a, window) - mean_a**2, np.float32(1e-3))
+    other = np.maximum(cv2.blur(b * b, window) - mean_b**2, np.float32(1e-3))
+    shared = cv2.blur(a * b, window) - mean_a * mean_b
+    noise = noise_grey**2
+    if np.count_nonzero(lying) > window[0] * window[1]:
+        noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
+    expected = 1 - np.float32(noise) / variance
+    texture, least = _FOREIGN
+    return np.asarray(
+        (expected > texture) & (shared < least * expected * np.sqrt(variance * other))
+    )
 
 
 def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
