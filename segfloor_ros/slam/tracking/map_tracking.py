@@ -68,7 +68,7 @@ keyframe, what was measured in them."""
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
 
-TRACKED_POINTS = 300
+TRACKED_POINTS = 400
 """Map points, spread over the image, that are measured in a frame between keyframes."""
 
 MAX_FOLLOWED = 250
