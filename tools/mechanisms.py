@@ -142,6 +142,9 @@ FLOOR: dict[str, Mechanism] = {
     'looks of the floor': Mechanism(
         {'floor.segmentation.unlike_floor': lambda image, floor: _nowhere(image)}
     ),
+    'texture that is not of the floor': Mechanism(
+        {'floor.mask.pixel_evidence._foreign': lambda left, *_: _nowhere(left)}
+    ),
     'most of what is measured around': Mechanism(
         {'floor.mask.pixel_evidence.most_around': lambda said, _: ~_nowhere(said)}
     ),

@@ -62,3 +62,19 @@ def test_a_near_board_of_hardly_any_texture_is_not_filled(floor_kind, contrast):
     left, right, floor, depth = scene.render()
     mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
     assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.02
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_wall_right_beside_the_camera_is_not_filled(floor_kind):
+    """So near and so askew it is not matched, and it has hardly more texture than noise."""
+    faint = {'grey': floor_kind.get('grey', 120.0), 'contrast': 10.0, 'seed': 9}
+    beside = Patch((-0.5, -0.2, 0.0), (4.5, 0, 0), (0, 0, 1.5), False, **faint)
+    *images, floor, depth = Scene([floor_patch(**floor_kind), wall(4.0), beside]).render()
+    rng = np.random.default_rng(1)
+    left, right = (
+        np.clip(np.rint(image + rng.normal(0, 3, image.shape)), 0, 255).astype(np.uint8)
+        for image in images
+    )
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.05
+    assert (mask == FLOOR)[floor & (depth > 0.5) & (depth < 3.0)].mean() > 0.95
