@@ -64,15 +64,20 @@ LEAST_SHIFT = 1e-4
 """Information in 1/px² of the shift of a pixel along an edge, or on a plain face."""
 
 
-_STEPS_PX = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
-_Y, _X = (grid.ravel() for grid in np.meshgrid(_STEPS_PX, _STEPS_PX, indexing='ij'))
-XY1 = np.stack([_X, _Y, np.ones_like(_X)])
-_GAUSSIAN = np.exp(-0.5 * (_X**2 + _Y**2) / (0.6 * HALF_PATCH_PX) ** 2)
-WINDOW = _GAUSSIAN / _GAUSSIAN.sum()
-BASIS = np.ascontiguousarray(WINDOW[:, None] * XY1[[2, 0, 1]].T)
-SQUARES = (BASIS[:, :, None] * XY1[[2, 0, 1]].T[:, None]).reshape(-1, 9)
-"""Of the pixels (P,) of a patch: where they are, (3, P), their weights, of sum 1, and these times
-1, x and y, (P, 3), and times the products of two of them, (P, 9)."""
+def _sums_of_a_patch() -> tuple[Patches, Patches, Patches, Patches]:
+    """Return of the pixels (P,) of a patch: where they are, (3, P), their weights, of sum 1, and
+    these times 1, x and y, (P, 3), and times the products of two of them, (P, 9).
+    """
+    steps_px = np.arange(-HALF_PATCH_PX, HALF_PATCH_PX + 1, dtype=np.float32)
+    y, x = (grid.ravel() for grid in np.meshgrid(steps_px, steps_px, indexing='ij'))
+    xy1 = np.stack([x, y, np.ones_like(x)])
+    gaussian = np.exp(-0.5 * (x**2 + y**2) / (0.6 * HALF_PATCH_PX) ** 2)
+    window = gaussian / gaussian.sum()
+    basis = np.ascontiguousarray(window[:, None] * xy1[[2, 0, 1]].T)
+    return xy1, window, basis, (basis[:, :, None] * xy1[[2, 0, 1]].T[:, None]).reshape(-1, 9)
+
+
+XY1, WINDOW, BASIS, SQUARES = _sums_of_a_patch()
 
 
 @dataclass(frozen=True)
