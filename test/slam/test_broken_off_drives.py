@@ -90,8 +90,9 @@ def test_a_place_that_is_not_seen_is_held_and_said_to_be_unsure(frames):
         )
     assert result.state == 'tracking'
     assert error_m(result.T_map_odom @ result.T_odom_base, FRAMES + GAP - 2) < 0.03
-    # `odom` goes on from where the pose was held; the correction is less than was said.
-    np.testing.assert_allclose(result.T_odom_base, held.T_odom_base, atol=1e-3)
+    # `odom` goes on from where the pose was held, but for the noise of a frame, which is a
+    # hundredth of the correction; that is less than was said.
+    np.testing.assert_allclose(result.T_odom_base, held.T_odom_base, atol=3e-3)
     jump_m = np.linalg.norm(result.T_map_odom[:3, 3] - held.T_map_odom[:3, 3])
     assert 0.1 < jump_m < 3 * sigma_m(held)
 

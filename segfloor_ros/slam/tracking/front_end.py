@@ -284,7 +284,7 @@ class FrontEnd:
             return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
         pose = self.motion.T_camera_world
         matched = self.tracker.track_at(
-            images, features, self.local.point_ids, pose, track.estimate, measured_before=track
+            images, features, self.local.point_ids, pose, track.estimate
         )
         if matched is None:
             return None

@@ -119,12 +119,10 @@ class Tracker:
         T_camera_world: Array,
         known: PoseEstimate | None = None,
         is_given: bool = False,
-        measured_before: Track | None = None,
     ) -> Track | None:
         """Find which features show map points, and the pose, which is known to a few pixels; as
         `track` for the rest. known: the pose by the same images before; or, with is_given,
-        where the camera is, and only its points are looked for. measured_before: points that were
-        measured in the same images.
+        where the camera is, and only its points are looked for.
         """
         if len(features) == 0 or len(local_ids) == 0:
             return None
@@ -140,18 +138,9 @@ class Tracker:
             return None
         ids = seen.ids[points]
         if isinstance(images, Images):
-            left = np.ones(len(rows), bool)
-            if measured_before is not None:
-                at = np.full(len(self._map.alive), -1)
-                at[measured_before.point_ids] = np.arange(len(measured_before.point_ids))
-                before = at[ids]
-                left = before < 0
-                same, before = rows[~left], before[~left]
-                observations.uvd_px[same] = measured_before.observations.uvd_px[before]
-                observations.sigma_px[same] = measured_before.observations.sigma_px[before]
-            points, fresh = points[left], rows[left]
-            align_pixels(images.left, observations, fresh, self._map, ids[left], T_camera_world)
-            measure_disparity(images, observations, fresh, seen.uvd_px[points, 2] + offset_px)
+            align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
+            guess_px = seen.uvd_px[points, 2] + offset_px
+            measure_disparity(images, observations, rows, guess_px)
         measured = observations.take(rows).without_offset(offset_px)
         found = None
         if not is_given:

@@ -9,9 +9,8 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.slam.tracking import map_tracking
 from segfloor_ros.slam.tracking.images import Images, follow_pixels, shrink
-from segfloor_ros.slam.tracking.map_tracking import TRACKED_POINTS, align_pixels
+from segfloor_ros.slam.tracking.map_tracking import TRACKED_POINTS
 
 SETTINGS = StereoSlamSettings(num_features=800)
 
@@ -55,28 +54,6 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
     assert len(track.point_ids) <= TRACKED_POINTS
     assert np.isin(track.point_ids, track.visible_ids).all()
     assert follow(other) is None
-
-
-def test_a_keyframe_takes_over_what_was_measured_of_its_frame(room, monkeypatch):
-    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
-    slam.process(room.frame(0, planar_pose(0, 0, 0)))
-    frame = room.frame(1, planar_pose(0.03, 0, 0.02))
-    images, front_end = Images.of(frame, CAMERA), slam.front_end
-    track = front_end.follower.follow(images, front_end.local.point_ids, np.eye(4))
-    aligned = []
-
-    def noted(left, observations, rows, sparse_map, ids, pose):
-        aligned.append(ids)
-        return align_pixels(left, observations, rows, sparse_map, ids, pose)
-
-    monkeypatch.setattr(map_tracking, 'align_pixels', noted)
-    front_end.motion.T_camera_world = track.T_camera_world
-    observed = front_end.observe(frame, images, track)
-    rows = np.flatnonzero(np.isin(observed.point_id, track.point_ids))
-    assert len(rows) > 100
-    assert not np.isin(np.concatenate(aligned), track.point_ids).any()
-    at = [track.point_ids.tolist().index(i) for i in observed.point_id[rows]]
-    np.testing.assert_array_equal(observed.observations.uvd_px[rows], track.observations.uvd_px[at])
 
 
 def test_points_that_are_gone_are_not_followed(room):
