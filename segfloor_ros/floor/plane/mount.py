@@ -44,10 +44,10 @@ from segfloor_ros.floor.mask.pixel_evidence import (
     texture_grey,
 )
 from segfloor_ros.floor.plane.plane import (
+    FINER_SCALES_PX,
     HEIGHT_RANGE_M,
     LEVEL_SIGMA,
     LOOKS,
-    NEAR_SCALES_PX,
     SAMPLES,
     SWAY,
     PlaneFit,
@@ -361,7 +361,7 @@ class PlaneSearch:
         self, near: list[Samples], start: Array, travel: Array, prior: tuple[Array, Array]
     ) -> PlaneFit:
         """Return a plane (3,) that is nearly known, refined by all samples of frames near it."""
-        return refine(Samples.joined(near), start, self._known, travel, *prior, NEAR_SCALES_PX)
+        return refine(Samples.joined(near), start, self._known, travel, *prior, FINER_SCALES_PX)
 
     def _scatter(self, frames: list[Samples], fit: PlaneFit, prior: tuple[Array, Array]) -> Array:
         """Return the standard deviations (3,) of a plane by how much those of parts of the drive

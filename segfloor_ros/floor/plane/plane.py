@@ -43,7 +43,9 @@ _CORRELATED_SAMPLES = 12.0
 """Neighbouring samples err together: so many count as one."""
 _SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
 NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
-"""Of the biweight with which a plane is refined, one per step; of one that is nearly known."""
+FINER_SCALES_PX = NEAR_SCALES_PX[2:]
+"""Of the biweight with which a plane is refined, one per step; of one that is nearly known, and of
+one that was refined by some of its samples."""
 _CLIMB, _SWAY_M = 0.03, 0.03
 """How far from parallel to the floor a camera travels: a slope, and what it sways."""
 _FAITH = 2.0
@@ -54,6 +56,8 @@ _SWING_RAD = math.radians(3.0)
 """So far robots swing on their wheels; what the map says beyond that is drift."""
 _FLAT_WEIGHT = 0.1
 """Of samples whose disparity does not rise down the image as a floor's does."""
+_AT_ONCE = 200
+"""So many samples are compared with all planes at once: what they take fits a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +90,17 @@ class Samples:
 
     def every(self, step: int) -> Samples:
         """Return only one of every so many, which weighs as much as these."""
+        some = self.take(np.s_[::step])
+        return replace(some, weight=step * some.weight)
+
+    def take(self, rows: slice | NDArray[np.intp]) -> Samples:
+        """Return the chosen ones."""
         return replace(
             self,
-            rays=self.rays[::step],
-            disparity_px=self.disparity_px[::step],
-            weight=self.weight[::step] * step,
-            rise=None if self.rise is None else self.rise[::step],
+            rays=self.rays[rows],
+            disparity_px=self.disparity_px[rows],
+            weight=self.weight[rows],
+            rise=None if self.rise is None else self.rise[rows],
         )
 
     @classmethod
@@ -109,13 +118,8 @@ class Samples:
     def near(self, angles_height: Array) -> Samples:
         """Return only those that matter where a plane, (3,), is refined that is nearly known."""
         error, _, visible = _seen(self, plane_of(angles_height)[None])
-        rows = np.flatnonzero(visible[:, 0] & (np.abs(error[:, 0]) < 2 * NEAR_SCALES_PX[0]))
-        return replace(
-            self,
-            rays=self.rays[rows],
-            disparity_px=self.disparity_px[rows],
-            weight=self.weight[rows],
-            rise=None if self.rise is None else self.rise[rows],
+        return self.take(
+            np.flatnonzero(visible[:, 0] & (np.abs(error[:, 0]) < 2 * FINER_SCALES_PX[0]))
         )
 
     def weight_on(self, plane: Array) -> Array:
@@ -233,13 +237,12 @@ def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.boo
     how much less than that lies clearly below the plane, and whether it is visible there at all,
     each (N, M).
     """
-    expected = samples.rays @ planes.T
-    # In place: thousands of samples times hundreds of planes take most of a process's memory.
-    expected *= -samples.disparity_m
+    scaled = (-samples.disparity_m * planes).astype(np.float32)
+    expected = samples.rays.astype(np.float32) @ scaled.T
     visible = expected > SAME_PX
-    error = samples.disparity_px[:, None] - expected
-    expected *= -_BEND
-    expected -= 2 * SAME_PX
+    error = samples.disparity_px[:, None].astype(np.float32) - expected
+    expected *= np.float32(-_BEND)
+    expected -= np.float32(2 * SAME_PX)
     return error, expected, visible
 
 
@@ -249,16 +252,19 @@ def scores(samples: Samples, angles_height: Array) -> Array:
 
     The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
     """
-    planes = plane_of(angles_height)
-    error, limit, visible = _seen(samples, planes)
-    below = visible & (error < limit)
-    on = np.divide(error, SAME_PX, out=error)
-    np.multiply(on, on, out=on)
-    np.subtract(1, on, out=on)
-    np.maximum(on, 0, out=on)
-    on[~visible] = 0
-    on -= _VIOLATION_WEIGHT * below
-    return samples.weight @ on
+    planes, total = plane_of(angles_height), np.zeros(len(angles_height))
+    for start in range(0, len(samples.weight), _AT_ONCE):
+        part = samples.take(slice(start, start + _AT_ONCE))
+        error, limit, visible = _seen(part, planes)
+        below = error < limit
+        against = np.multiply(error, np.float32(1 / SAME_PX), out=error)
+        np.multiply(against, against, out=against)
+        np.minimum(against, 1, out=against)
+        against += np.multiply(below, np.float32(_VIOLATION_WEIGHT), out=limit)
+        against -= 1
+        against *= visible
+        total -= part.weight @ against
+    return total
 
 
 def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
@@ -316,6 +322,7 @@ def refine(
     scales_px: of the biweight, one per iteration.
     """
     state = start.copy()
+    samples = replace(samples, rays=np.asfortranarray(samples.rays))
     free = np.isnan(known)
     information: Array = np.eye(3)
     shared: Array = np.zeros(3)
@@ -352,16 +359,20 @@ def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Arr
     """Return the information (3, 3), the gradient (3,), and that (3,) of an error of a pixel which
     all disparities share.
     """
-    by_state = _jacobian(state)
-    plane = -state[2] * by_state[:, 2]
-    expected = -samples.disparity_m * (samples.rays @ plane)
+    by_state = -samples.disparity_m * _jacobian(state)
+    expected = samples.rays @ (-state[2] * by_state[:, 2])
     error = samples.disparity_px - expected
-    weight = samples.weight_on(plane) * np.maximum(1 - (error / (2 * scale)) ** 2, 0) ** 2
-    weight = np.where(expected > SAME_PX, weight, 0)
+    biweight = error * error
+    biweight *= -1 / (4 * scale**2)
+    biweight += 1
+    np.maximum(biweight, 0, out=biweight)
+    weight = samples.weight_on(plane_of(state)) * (expected > SAME_PX)
+    weight *= biweight
+    weight *= biweight
     weight /= _CORRELATED_SAMPLES * NOISE_PX**2
-    jacobian = -samples.disparity_m * (samples.rays @ by_state)
-    information = jacobian.T @ (jacobian * weight[:, None])
-    return information, jacobian.T @ (weight * error), jacobian.T @ weight
+    weighted = samples.rays.T * weight
+    information = by_state.T @ (weighted @ samples.rays) @ by_state
+    return information, by_state.T @ (weighted @ error), by_state.T @ weighted.sum(axis=1)
 
 
 def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
