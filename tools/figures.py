@@ -8,6 +8,7 @@ write` puts its figures between the marks of the two pages.
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,14 +44,15 @@ LONGEST_LAG_S = 10.0
 @dataclass(frozen=True)
 class Drive:
     """label: in README, where it stands there. scene: rendered, else a recording of that name.
-    truth: file of the path in the recording. end: true last position of the left camera in its
-    first pose's frame.
+    truth: file of the path in the recording. is_mapped: it has a level floor. end: true last
+    position of the left camera in its first pose's frame.
     """
 
     about: str
     label: str = ''
     scene: str = ''
     truth: str = ''
+    is_mapped: bool = True
     end: tuple[float, float, float] | None = None
 
 
@@ -80,6 +82,13 @@ DRIVES = {
                    'a rover in sand, 1 image a second', truth='truth_xy.csv'),
     'kitchen': Drive(
         'a kitchen, hand-held Kinect, repeated images', 'a hand-held Kinect', truth='truth.txt'
+    ),
+    'backyard': Drive(
+        'a walk through a garden and a wood, 320×240, unrectified', is_mapped=False
+    ),
+    'euroc_tiny': Drive('EuRoC V1_01, standing still, 752×480, unrectified', is_mapped=False),
+    'tumvi': Drive(
+        'TUM-VI, fisheye, 16 bits, nearly still', truth='truth.txt', is_mapped=False
     ),
 }  # fmt: skip
 
@@ -133,12 +142,14 @@ def _measured(name: str, drive: Drive, data: Path, work: Path) -> dict[str, floa
                         lambda total: announce(f'rendering {name}', total))  # fmt: skip
     out = work / name
     if not (out / 'summary.json').is_file():
-        words = ['run', str(recording), '--out', str(out), '--save-masks', 'all']
+        words = ['run', str(recording), '--out', str(out)]
+        words += ['--save-masks', 'all'] if drive.is_mapped else ['--no-map']
         run_segfloor(words, work / f'{name}.txt', TIMEOUT_S)
     summary = read_json(out / 'summary.json', 'a summary')
     truth = recording if (recording / 'poses.txt').is_file() else None
     found = measure_run(out, truth, None, start_pose_of(truth))
-    found['frames'], found['moving_frames'] = summary['frames'], summary['moving_frames']
+    names = ['frames', 'moving_frames', 'camera_pitch_rad']
+    found |= {name: summary[name] for name in names if summary[name] is not None}
     poses = read_trajectory(out / 'camera_trajectory.txt')[1]
     found['length_m'] = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     if drive.end is not None:
@@ -206,7 +217,7 @@ def _short_table(figures: dict[str, Any]) -> str:
 def _long_table(figures: dict[str, Any]) -> str:
     heads = ('recording', 'what', 'frames, length', 'tracked', 'path error',
              'road map, precision / recall', 'free cells', 'floor masks; false floor',
-             'frames with something that moves', 'time')  # fmt: skip
+             'frames with something that moves', 'camera: height, pitch', 'time')  # fmt: skip
     rows = []
     for name, drive in DRIVES.items():
         found = figures['drives'][name]
@@ -217,7 +228,7 @@ def _long_table(figures: dict[str, Any]) -> str:
             (
                 name, drive.about, f'{found["frames"]:.0f}, {found["length_m"]:.1f} m',
                 _tracked(found), _path(found), _pair(found, ''), _pair(found, 'free'), masks,
-                f'{found["moving_frames"]:.0f}', f'{found["wall_s"]:.0f} s',
+                f'{found["moving_frames"]:.0f}', _mount(found), f'{found["wall_s"]:.0f} s',
             )
         )  # fmt: skip
     return _table(heads, rows)
@@ -233,6 +244,13 @@ def _path(found: dict[str, float]) -> str:
             f'{found["path_error_m"]:.3f} m'
         )  # fmt: skip
     return f'ends {found["end_error_m"]:.2f} m off' if 'end_error_m' in found else '–'
+
+
+def _mount(found: dict[str, float]) -> str:
+    if 'camera_pitch_rad' not in found:
+        return 'not known'
+    pitch_deg = math.degrees(found['camera_pitch_rad'])
+    return f'{found["camera_height_m"]:.3g} m, {pitch_deg:.1f}°'
 
 
 def _pair(found: dict[str, float], kind: str) -> str:
