@@ -38,13 +38,11 @@ _NEIGHBOURS_PX = 9
 _MOST_SIGMAS = np.float32(10)
 _LEAST_KNOWN = 0.2
 
-_WINDOW_SHARE = 0.25
-"""Of the image's width: floor so near looks alike. A sun, a lamp and dust change it slowly."""
-_FEW = 0.1
-"""Where floor covers less than this share of the window, all floor of the image counts."""
-_SHRINK = 4
-_STEP_GREY = 1.0
-"""Grey levels are whole: no surface is known better."""
+_DIRT = 0.1
+"""By such a share of its brightness a floor varies: dust, wear."""
+_SAMPLED, _FITS = 4, 4
+"""Every such row and column tells how light falls on the floor; so often it is asked."""
+_FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
 
 _AGAINST_GREY = 1.0
 """By how much the images must contradict the floor to deny it, beyond their noise."""
@@ -284,42 +282,39 @@ def _below_contact(
 
 def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which pixels of an image (R, W) are darker or brighter than nearly all of the floor
-    (R, W) around them.
+    (R, W) would be there.
 
-    What is measured as floor may be a thing that is hardly higher: the mean is taken twice, the
-    second time without what stood out.
+    A sun, a lamp, a lens and dust change the floor's brightness slowly: its logarithm is taken for
+    a quadratic of row and column. What is measured as floor may be a thing that is hardly higher:
+    it is fitted again without what stood out.
     """
-    grey = cv2.blur(image, (BLOCK_PX, BLOCK_PX)).astype(np.float32)
-    odd: NDArray[np.bool_] = np.zeros(image.shape, np.bool_)
-    for _ in range(2):
-        counted = (floor & ~odd).astype(np.float32)
-        if not counted.any():
-            return odd
-        mean, variance = _around(grey, counted)
-        odd = (grey - mean) ** 2 > SIGMAS**2 * (variance + _STEP_GREY**2)
-    return odd
+    grey = cv2.blur(image, (BLOCK_PX, BLOCK_PX)).astype(np.float32) + 1
+    brightness = cv2.log(grey)
+    y, x = (np.linspace(-1, 1, size, dtype=np.float32) for size in image.shape)
+    part = np.s_[::_SAMPLED, ::_SAMPLED]
+    rows, columns = np.nonzero(floor[part])
+    if len(rows) == 0:
+        return np.zeros(image.shape, np.bool_)
+    terms = _quadratic(x[::_SAMPLED][columns], y[::_SAMPLED][rows])
+    seen = brightness[part][rows, columns]
+    counted = np.ones(len(rows), np.float32)
+    for _ in range(_FITS):
+        weighted = terms * counted
+        weighted /= counted.sum()
+        # A few pixels do not tell how it bends.
+        light = np.linalg.solve(weighted @ terms.T + _FLAT, weighted @ seen)
+        squares = (seen - light @ terms) ** 2
+        variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
+        counted = (squares < SIGMAS**2 * variance).astype(np.float32)
+    one, across, down, across2, both, down2 = light
+    expected = (one + down * y + down2 * y * y)[:, None] + (across + both * y)[:, None] * x
+    expected += across2 * x * x
+    # Grey levels are whole: no surface is known better.
+    return (brightness - expected) ** 2 > SIGMAS**2 * (variance + 1 / grey**2)
 
 
-def _around(
-    grey: NDArray[np.float32], counted: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean and variance (R, W) of what counts around each pixel. Both change slowly: they
-    are computed at a quarter of the resolution.
-    """
-    width, height = grey.shape[1], grey.shape[0]
-    small = (max(1, width // _SHRINK), max(1, height // _SHRINK))
-    side = int(_WINDOW_SHARE * small[0]) | 1
-    sums = []
-    for value in (counted, counted * grey, counted * grey**2):
-        shrunk = cv2.resize(value, small, interpolation=cv2.INTER_AREA)
-        share = cv2.blur(shrunk, (side, side), borderType=cv2.BORDER_CONSTANT)
-        sums.append(share + np.float32(_FEW / counted.mean() * value.mean()))
-    mean = sums[1] / sums[0]
-    variance = np.maximum(sums[2] / sums[0] - mean**2, 0)
-    return (
-        cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR),
-        cv2.resize(variance, (width, height), interpolation=cv2.INTER_LINEAR),
-    )
+def _quadratic(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def compare(
