@@ -11,12 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import ImuSample, Mount, WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.geometry import Array, invert, make_transform, quaternion_xyzw, transform_points
+from segfloor_ros.geometry import (
+    Array,
+    invert,
+    make_transform,
+    quaternion_xyzw,
+    rotation_from_angles,
+    transform_from_quaternion,
+    transform_points,
+)
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation.camera import rectified_camera
 from segfloor_ros.simulation.motion import plan_drive
@@ -83,7 +90,7 @@ class Robot:
         turn = float(rims_m[1] - rims_m[0]) / (self.wheel_separation_m * self.skid)
         way = float(rims_m.mean())
         along = np.array([way * np.cos(turn / 2), way * np.sin(turn / 2), 0.0])
-        return make_transform(Rotation.from_euler('Z', turn).as_matrix(), along)
+        return make_transform(rotation_from_angles(turn, 0.0, 0.0), along)
 
 
 def open_robot(name: str) -> tuple[Robot, list[str]]:
@@ -105,7 +112,9 @@ class DrivenRobot:
     def __init__(self, scene: Scene, robot: Robot) -> None:
         rig = scene.camera
         pitch, roll = np.radians((rig.pitch_deg, rig.roll_deg))
-        self.mount = Mount(rig.height_m, float(pitch), float(roll), rig.forward_m)
+        # Both eyes sit within the robot: one beside it would be in a wall that it drives along.
+        middle_m = rig.baseline_m / 2
+        self.mount = Mount(rig.height_m, float(pitch), float(roll), rig.forward_m, middle_m)
         self._robot, self._scene = robot, scene
         start = plan_drive(scene.path, rig.rate_hz).xy_yaw[0]
         mujoco = import_mujoco()
@@ -119,9 +128,9 @@ class DrivenRobot:
         self._imu_axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         self._wanted_m_s: Array = np.zeros(2)
         self._rims_m_s: Array = np.zeros(2)
-        self._poses: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
+        self._places: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
         self._mover_steps = [0] * len(scene.movers)
-        self._mover_times: deque[list[float]] = deque(maxlen=self._poses.maxlen)
+        self._mover_times: deque[list[float]] = deque(maxlen=self._places.maxlen)
         self._steps = -round(SETTLING_S * STEPS_PER_S)
         self._felt: list[Array] = []
         self._touched_s = -np.inf
@@ -152,7 +161,7 @@ class DrivenRobot:
                 self._place_movers()
             self._step(self._model, self._data)
             self._steps += 1
-            self._poses.append(self._pose_now())
+            self._places.append(self._data.qpos[:7].copy())
             self._mover_times.append([steps / STEPS_PER_S for steps in self._mover_steps])
             self._felt.append(self._data.sensordata.copy())
             if self._steps % STEPS_A_MEASUREMENT == 0:
@@ -170,7 +179,8 @@ class DrivenRobot:
 
     def T_world_base(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the base at a time not long past."""
-        return self._poses[self._index(time_s)]
+        x, y, z, *quat_wxyz = self._places[self._index(time_s)]
+        return transform_from_quaternion(np.array([x, y, z]), np.roll(quat_wxyz, -1))
 
     def mover_times_s(self, time_s: float) -> list[float]:
         """Return the time of each mover at a time not long past: people wait for the robot."""
@@ -179,7 +189,7 @@ class DrivenRobot:
     def _index(self, time_s: float) -> int:
         """Return where a time not long past is among what is remembered."""
         back = self._steps - round(time_s * STEPS_PER_S)
-        return max(len(self._poses) - 1 - max(back, 0), 0)
+        return max(len(self._places) - 1 - max(back, 0), 0)
 
     def T_world_left(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the rectified left optical frame at a time not long
@@ -192,7 +202,7 @@ class DrivenRobot:
         most = ACCELERATION_M_S2 / STEPS_PER_S
         self._rims_m_s += np.clip(self._wanted_m_s - self._rims_m_s, -most, most)
         turning = self._rims_m_s / self._robot.wheel_radius_m
-        self._data.ctrl[:] = np.resize(turning, self._model.nu)
+        self._data.ctrl.reshape(-1, 2)[:] = turning
 
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
@@ -212,10 +222,6 @@ class DrivenRobot:
             for later_s in (0.0, LOOKS_S)
         )
         return bool(soon < min(now, self._robot.radius_m + PERSON_RADIUS_M))
-
-    def _pose_now(self) -> Array:
-        w, x, y, z = self._data.qpos[3:7]
-        return make_transform(Rotation.from_quat([x, y, z, w]).as_matrix(), self._data.qpos[:3])
 
     def _rim_positions(self) -> Array:
         """Return how far the rims of the left and the right wheels have run (2,), the mean of
@@ -247,7 +253,7 @@ class DrivenRobot:
         if not hits.any():
             return
         if self._steps >= 0 and self.time_s > self._touched_s + BREAK_S:
-            T_base_world = invert(self._poses[-1])
+            T_base_world = invert(self.T_world_base(self.time_s))
             self.bumps.append(
                 (self.time_s, transform_points(T_base_world, self._data.contact.pos[hits])[0])
             )

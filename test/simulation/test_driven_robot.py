@@ -31,6 +31,15 @@ def test_it_starts_where_the_drive_of_the_scene_does() -> None:
 
 
 @pytest.mark.parametrize('name', ['turtlebot3_burger', 'husky'])
+def test_both_eyes_sit_so_far_within_it_that_they_see_the_wall_that_it_touches(name) -> None:
+    driven, (robot, values), nearest_m = robot_in('lane', name), open_robot(name), 0.02
+    baseline_m = open_scene('lane', values).camera.baseline_m
+    eyes = driven.mount.T_base_left @ [[0, baseline_m], [0, 0], [0, 0], [1, 1]]
+    off_middle_m = np.abs(eyes[:2] - [[robot.middle_m], [0]])
+    assert (off_middle_m < np.array(robot.size_m)[:2, None] / 2 - nearest_m).all()
+
+
+@pytest.mark.parametrize('name', ['turtlebot3_burger', 'husky'])
 def test_it_drives_straight_at_the_speed_it_is_told_and_no_faster_than_it_can(name) -> None:
     driven, (published, _) = robot_in('lane', name), open_robot(name)
     driven.drive(0.2, 0.0)
