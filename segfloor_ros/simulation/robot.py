@@ -52,8 +52,8 @@ TYRE_FRICTION, WALL_FRICTION = 0.9, 0.3
 
 PERSON_RADIUS_M = 0.25
 
-LOOKS_S = 1.0
-"""People do not take a step that would bring them into the robot within this time."""
+PERSONAL_M = 0.45
+"""People come no nearer to where the robot turns: personal space begins there (Hall, 1966)."""
 
 
 @dataclass(frozen=True)
@@ -213,15 +213,12 @@ class DrivenRobot:
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
     def _waits(self, mover: Mover, steps: int) -> bool:
-        """Whether somebody would walk into the robot."""
+        """Whether somebody's next step would lead too near to the robot."""
         if not isinstance(mover, Person):
             return False
-        here = *self._data.qpos[:2], 0.0
-        now, soon = (
-            np.hypot(*np.subtract(place(mover, steps / STEPS_PER_S + later_s), here)[:2])
-            for later_s in (0.0, LOOKS_S)
-        )
-        return bool(soon < min(now, self._robot.radius_m + PERSON_RADIUS_M))
+        ways = [place(mover, s / STEPS_PER_S)[:2] for s in (steps, steps + STEPS_A_MEASUREMENT)]
+        now_m, next_m = np.hypot(*(np.array(ways) - self._data.qpos[:2]).T)
+        return bool(next_m < min(now_m, self._robot.radius_m + PERSON_RADIUS_M + PERSONAL_M))
 
     def _rim_positions(self) -> Array:
         """Return how far the rims of the left and the right wheels have run (2,), the mean of

@@ -109,14 +109,22 @@ def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     driven.advance(5.0)
     assert not driven.bumps
     (waited_s,) = driven.mover_times_s(5.0)
-    # In a second the person would touch the robot, which turns within 0.135 m.
-    assert 2.0 - waited_s - 1.0 == pytest.approx(0.135 + 0.25, abs=0.02)
+    # The robot turns within 0.135 m, the person is 0.5 m thick.
+    assert 2.0 - waited_s == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
     driven.drive(-0.2, 0.6)
     driven.advance(5.0 + 0.5 * np.pi / 0.6)
     driven.drive(-0.2, 0.0)
     driven.advance(12.0)
     assert not driven.bumps
     assert driven.mover_times_s(12.0)[0] > 3.0
+
+
+def test_people_do_not_walk_past_it_within_reach_of_its_turn() -> None:
+    past = 'people=[{points: [[2, 0.5], [-2, 0.5]], speed_m_s: 1.0, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', past)
+    driven.advance(6.0)
+    reached_m = 2.0 - driven.mover_times_s(6.0)[0]
+    assert np.hypot(reached_m, 0.5) == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
 
 
 def test_a_crate_stops_it_where_somebody_has_put_it_down_and_no_longer_when_it_is_gone() -> None:
