@@ -45,7 +45,7 @@ BREAK_S = 1.0
 """Contacts with shorter breaks between them are one bump."""
 
 ACCELERATION_M_S2 = 1.0
-"""At which the motors' controller lets a wheel take up another speed."""
+"""At which the motors' controller lets the wheels take up another speed, ahead and in a turn."""
 
 TYRE_FRICTION, WALL_FRICTION = 0.9, 0.3
 """Coulomb friction of rubber on a dry floor, of plastic on plaster."""
@@ -200,7 +200,9 @@ class DrivenRobot:
     def _follow_command(self) -> None:
         """Let the controller of the motors turn the wheels, at its own pace."""
         most = ACCELERATION_M_S2 / STEPS_PER_S
-        self._rims_m_s += np.clip(self._wanted_m_s - self._rims_m_s, -most, most)
+        change = self._wanted_m_s - self._rims_m_s
+        ahead = change.sum() / 2
+        self._rims_m_s += np.clip(ahead, -most, most) + np.clip(change - ahead, -most, most)
         turning = self._rims_m_s / self._robot.wheel_radius_m
         self._data.ctrl.reshape(-1, 2)[:] = turning
 

@@ -75,6 +75,16 @@ def test_standing_its_accelerometer_measures_gravity() -> None:
     assert set(np.diff(stamps)) == {10_000_000}
 
 
+def test_it_stops_as_soon_when_it_also_has_to_turn() -> None:
+    driven = robot_in('lane', 'husky')
+    driven.drive(0.4, 0.3)
+    driven.advance(2.0)
+    driven.drive(0.0, -0.6)
+    driven.advance(3.0)
+    before, after = driven.T_world_base(2.0), driven.T_world_base(3.0)
+    assert np.hypot(*(after - before)[:2, 3]) == pytest.approx(0.4**2 / 2, abs=0.02)
+
+
 def test_four_wheels_slip_in_a_turn() -> None:
     driven = robot_in('lane', 'husky')
     driven.drive(0.0, 0.6)
