@@ -208,19 +208,25 @@ class DrivenRobot:
 
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
-            if self._steps >= 0 and not self._waits(mover, self._mover_steps[index]):
-                self._mover_steps[index] += STEPS_A_MEASUREMENT
+            if self._steps >= 0:
+                self._mover_steps[index] += self._stride(mover, self._mover_steps[index])
             x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
             self._data.mocap_pos[index, :2] = x, y
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
-    def _waits(self, mover: Mover, steps: int) -> bool:
-        """Whether somebody's next step would lead too near to the robot."""
+    def _stride(self, mover: Mover, steps: int) -> int:
+        """Return by how much the time of a mover goes on. Somebody waits where the next step would
+        lead too near to the robot, and goes back before a robot that comes too near.
+        """
+        stride = STEPS_A_MEASUREMENT
         if not isinstance(mover, Person):
-            return False
-        ways = [place(mover, s / STEPS_PER_S)[:2] for s in (steps, steps + STEPS_A_MEASUREMENT)]
-        now_m, next_m = np.hypot(*(np.array(ways) - self._data.qpos[:2]).T)
-        return bool(next_m < min(now_m, self._robot.radius_m + PERSON_RADIUS_M + PERSONAL_M))
+            return stride
+        ways = [place(mover, (steps + by) / STEPS_PER_S)[:2] for by in (0, stride, -stride)]
+        now_m, ahead_m, back_m = np.hypot(*(np.array(ways) - self._data.qpos[:2]).T)
+        near_m = self._robot.radius_m + PERSON_RADIUS_M + PERSONAL_M
+        if ahead_m >= min(now_m, near_m):
+            return stride
+        return -stride if steps and back_m > now_m and now_m < near_m else 0
 
     def _rim_positions(self) -> Array:
         """Return how far the rims of the left and the right wheels have run (2,), the mean of

@@ -129,6 +129,17 @@ def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     assert driven.mover_times_s(12.0)[0] > 3.0
 
 
+def test_people_go_back_before_it_where_it_comes_too_near() -> None:
+    person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 0.5, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', person)
+    driven.advance(4.0)
+    driven.drive(0.2, 0.0)
+    driven.advance(8.0)
+    person_m = 2.0 - 0.5 * driven.mover_times_s(8.0)[0]
+    assert not driven.bumps
+    assert person_m - driven.T_world_base(8.0)[0, 3] == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
+
+
 def test_people_do_not_walk_past_it_within_reach_of_its_turn() -> None:
     past = 'people=[{points: [[2, 0.5], [-2, 0.5]], speed_m_s: 1.0, returns: false}]'
     driven = robot_in('lane', 'turtlebot3_burger', past)
