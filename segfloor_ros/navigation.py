@@ -172,25 +172,25 @@ class Costmap:
         """Return how near to a point (2,) something stands."""
         return float(self._standing_m[tuple(self._on_map(point).T)].min(initial=np.inf))
 
-    def free_ahead_m(self, pose: Array, radius_m: float, reach_m: float) -> float:
-        """Return how far a robot of some radius gets from a pose x, y, yaw straight on, up to some
-        reach, without coming nearer to anything within the radius.
+    def free_ahead_m(self, pose: Array, reach_m: float) -> float:
+        """Return how far the robot gets from a pose x, y, yaw straight on, up to some reach,
+        without coming nearer to anything within its radius.
         """
         way_m = np.arange(0, reach_m, self.grid.resolution_m)
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
-        near = room_m < min(radius_m, room_m[0]) if len(room_m) else room_m > 0
+        near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
         return float(way_m[np.argmax(near)]) if near.any() else reach_m
 
-    def way_out(self, pose: Array, radius_m: float) -> float:
+    def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
-        at a pose x, y, yaw, which would touch it in a turn; 0 where nothing does, or neither leads
+        at a pose x, y, yaw, which might touch it in a turn; 0 where nothing does, or neither leads
         away from it.
         """
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
-        places = ((s, pose[:2] + s * radius_m * ahead) for s in (1.0, -1.0))
+        places = ((s, pose[:2] + s * self._radius_m * ahead) for s in (1.0, -1.0))
         room_m, sign = max((self.standing_m(place), s) for s, place in places)
-        return 0.0 if self.standing_m(pose[:2]) > min(radius_m, room_m) else sign
+        return 0.0 if self.standing_m(pose[:2]) >= min(self._radius_m, room_m) else sign
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -430,7 +430,7 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
-        way_out = self._costmap.way_out(pose, self.body.radius_m)
+        way_out = self._costmap.way_out(pose)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
         return self._pursue(pose) if len(self.path) else STOP
@@ -497,7 +497,7 @@ class Explorer:
             return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
         turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         most_m = body.speed_m_s * stop_s
-        stop_m = min(self._costmap.free_ahead_m(pose, body.radius_m, most_m), away_m[-1])
+        stop_m = min(self._costmap.free_ahead_m(pose, most_m), away_m[-1])
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
 

@@ -271,6 +271,23 @@ def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) 
     assert forward == 0 and turn > 0
 
 
+@pytest.mark.parametrize('yaw', [0.0, np.pi])
+def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw) -> None:
+    body = dataclasses.replace(BODY, radius_m=0.35)
+    explorer = Explorer(body, [Goal(np.array([1.3, 1.5]))], phase='driving')
+    explorer.grid = grid_of('#' * 26 + 20 * ('\n' + 26 * '.') + '\n' + '#' * 26)
+    forward, turn = explorer.step(0.0, pose_of(1.3, 0.35, yaw))
+    assert forward == 0 and turn != 0
+
+
+def test_it_would_stop_a_radius_and_what_a_map_is_off_from_a_wall() -> None:
+    body = dataclasses.replace(BODY, radius_m=0.18)
+    costmap = Costmap.around(body, grid_of(TWO_ROOMS), NOTHING, np.array([(1.55, 0.55)]))
+    # The wall's cells have their middle at 2.55 m; a step beyond is what it notices it by.
+    most_m = 2.55 - (0.18 + 0.05) - 1.55 + CELL_M
+    assert costmap.free_ahead_m(np.array([1.55, 0.55, 0.0]), 2.0) < most_m
+
+
 @pytest.mark.parametrize('period_s', [0.1, 0.4])
 def test_it_stops_before_a_wall_although_commands_take_effect_a_frame_later(period_s) -> None:
     explorer = Explorer(BODY, [Goal(np.array([2.2, 0.55]))], phase='driving')

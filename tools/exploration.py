@@ -1,8 +1,8 @@
 """How well a simulated robot explores: scenes and floor plans, each with several seeds.
 
-    python -m tools.exploration WORK [--maps FOLDER] [--seeds 3]
+    python -m tools.exploration WORK [SCENE…] [--maps FOLDER] [--seeds 3] [--goals 7]
 
-Every drive is a `segfloor explore` into WORK/SCENE_SEED, first all scenes with one seed, then with
+Every drive is a `segfloor explore` into WORK/SCENE_SEED, first the scenes with one seed, then with
 the next; what is there already is not driven again. After each, WORK/table.md is written anew.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,8 +22,6 @@ from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import read_json
 
 CAMERA = ('kind=realsense', 'width=480', 'height=360', 'rate_hz=3')
-GOALS = 7
-"""Of each drive; three seeds have 20 and one."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,14 @@ class Job:
     robot: str = 'turtlebot3_burger'
     minutes: float = 15.0
 
-    def command(self, seed: int, maps: Path, out: Path) -> list[str]:
-        """Return the command line."""
+    def command(self, seed: int, goals: int, maps: Path, out: Path) -> list[str]:
+        """Return the command line, of the package that is measured."""
         scene = str(maps / self.scene) if self.scene.endswith('.yaml') else self.scene
         values = [word for value in CAMERA for word in ('--set', f'camera.{value}')]
-        numbers = {'goals': GOALS, 'seed': seed, 'minutes': self.minutes, 'robot': self.robot}
+        numbers = {'goals': goals, 'seed': seed, 'minutes': self.minutes, 'robot': self.robot}
         options = [word for name, value in numbers.items() for word in (f'--{name}', str(value))]
-        return ['segfloor', 'explore', scene, '--out', str(out), *options, *values]
+        program = [sys.executable, '-m', 'segfloor_ros.cli.main']
+        return [*program, 'explore', scene, '--out', str(out), *options, *values]
 
 
 JOBS = {
@@ -72,17 +72,19 @@ def row(name: str, found: dict[str, Any]) -> str:
 
 def main(
     work: Annotated[Path, typer.Argument(help='Folder for the drives and the table.')],
+    scenes: Annotated[list[str] | None, typer.Argument(help='Which, without a name all.')] = None,
     maps: Annotated[Path, typer.Option(help='Folder with the floor plans.')] = Path('maps'),
     seeds: Annotated[int, typer.Option(help='How many seeds.', min=1)] = 3,
+    goals: Annotated[int, typer.Option(help='Goals of each drive.', min=0)] = 7,
 ) -> None:
     """Drive what has not been driven yet, and write the table."""
     work.mkdir(parents=True, exist_ok=True)
     for seed in range(1, seeds + 1):
-        for name, job in JOBS.items():
+        for name in scenes or JOBS:
             out = work / f'{name}_{seed}'
             if not (out / 'summary.json').is_file():
                 with (work / f'{name}_{seed}.log').open('w') as log:
-                    command = job.command(seed, maps, out)
+                    command = JOBS[name].command(seed, goals, maps, out)
                     status = subprocess.run(command, stdout=log, stderr=log, check=False).returncode
                 console.print(f'{name} {seed}: {"done" if not status else f"ended with {status}"}')
             write_file(work / 'table.md', table(work, seeds).encode())

@@ -11,12 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import ImuSample, Mount, WheelPose
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.geometry import Array, invert, make_transform, quaternion_xyzw, transform_points
+from segfloor_ros.geometry import (
+    Array,
+    invert,
+    make_transform,
+    quaternion_xyzw,
+    rotation_from_angles,
+    transform_from_quaternion,
+    transform_points,
+)
 from segfloor_ros.settings import suggestion
 from segfloor_ros.simulation.camera import rectified_camera
 from segfloor_ros.simulation.motion import plan_drive
@@ -38,15 +45,15 @@ BREAK_S = 1.0
 """Contacts with shorter breaks between them are one bump."""
 
 ACCELERATION_M_S2 = 1.0
-"""At which the motors' controller lets a wheel take up another speed."""
+"""At which the motors' controller lets the wheels take up another speed, ahead and in a turn."""
 
 TYRE_FRICTION, WALL_FRICTION = 0.9, 0.3
 """Coulomb friction of rubber on a dry floor, of plastic on plaster."""
 
 PERSON_RADIUS_M = 0.25
 
-LOOKS_S = 1.0
-"""People do not take a step that would bring them into the robot within this time."""
+PERSONAL_M = 0.45
+"""People come no nearer to where the robot turns: personal space begins there (Hall, 1966)."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,7 @@ class Robot:
         turn = float(rims_m[1] - rims_m[0]) / (self.wheel_separation_m * self.skid)
         way = float(rims_m.mean())
         along = np.array([way * np.cos(turn / 2), way * np.sin(turn / 2), 0.0])
-        return make_transform(Rotation.from_euler('Z', turn).as_matrix(), along)
+        return make_transform(rotation_from_angles(turn, 0.0, 0.0), along)
 
 
 def open_robot(name: str) -> tuple[Robot, list[str]]:
@@ -105,7 +112,9 @@ class DrivenRobot:
     def __init__(self, scene: Scene, robot: Robot) -> None:
         rig = scene.camera
         pitch, roll = np.radians((rig.pitch_deg, rig.roll_deg))
-        self.mount = Mount(rig.height_m, float(pitch), float(roll), rig.forward_m)
+        # Both eyes sit within the robot: one beside it would be in a wall that it drives along.
+        middle_m = rig.baseline_m / 2
+        self.mount = Mount(rig.height_m, float(pitch), float(roll), rig.forward_m, middle_m)
         self._robot, self._scene = robot, scene
         start = plan_drive(scene.path, rig.rate_hz).xy_yaw[0]
         mujoco = import_mujoco()
@@ -119,9 +128,9 @@ class DrivenRobot:
         self._imu_axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         self._wanted_m_s: Array = np.zeros(2)
         self._rims_m_s: Array = np.zeros(2)
-        self._poses: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
+        self._places: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
         self._mover_steps = [0] * len(scene.movers)
-        self._mover_times: deque[list[float]] = deque(maxlen=self._poses.maxlen)
+        self._mover_times: deque[list[float]] = deque(maxlen=self._places.maxlen)
         self._steps = -round(SETTLING_S * STEPS_PER_S)
         self._felt: list[Array] = []
         self._touched_s = -np.inf
@@ -152,7 +161,7 @@ class DrivenRobot:
                 self._place_movers()
             self._step(self._model, self._data)
             self._steps += 1
-            self._poses.append(self._pose_now())
+            self._places.append(self._data.qpos[:7].copy())
             self._mover_times.append([steps / STEPS_PER_S for steps in self._mover_steps])
             self._felt.append(self._data.sensordata.copy())
             if self._steps % STEPS_A_MEASUREMENT == 0:
@@ -170,7 +179,8 @@ class DrivenRobot:
 
     def T_world_base(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the base at a time not long past."""
-        return self._poses[self._index(time_s)]
+        x, y, z, *quat_wxyz = self._places[self._index(time_s)]
+        return transform_from_quaternion(np.array([x, y, z]), np.roll(quat_wxyz, -1))
 
     def mover_times_s(self, time_s: float) -> list[float]:
         """Return the time of each mover at a time not long past: people wait for the robot."""
@@ -179,7 +189,7 @@ class DrivenRobot:
     def _index(self, time_s: float) -> int:
         """Return where a time not long past is among what is remembered."""
         back = self._steps - round(time_s * STEPS_PER_S)
-        return max(len(self._poses) - 1 - max(back, 0), 0)
+        return max(len(self._places) - 1 - max(back, 0), 0)
 
     def T_world_left(self, time_s: float) -> Array:
         """Return the true pose (4, 4) of the rectified left optical frame at a time not long
@@ -190,32 +200,33 @@ class DrivenRobot:
     def _follow_command(self) -> None:
         """Let the controller of the motors turn the wheels, at its own pace."""
         most = ACCELERATION_M_S2 / STEPS_PER_S
-        self._rims_m_s += np.clip(self._wanted_m_s - self._rims_m_s, -most, most)
+        change = self._wanted_m_s - self._rims_m_s
+        ahead = change.sum() / 2
+        self._rims_m_s += np.clip(ahead, -most, most) + np.clip(change - ahead, -most, most)
         turning = self._rims_m_s / self._robot.wheel_radius_m
-        self._data.ctrl[:] = np.resize(turning, self._model.nu)
+        self._data.ctrl.reshape(-1, 2)[:] = turning
 
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
-            if self._steps >= 0 and not self._waits(mover, self._mover_steps[index]):
-                self._mover_steps[index] += STEPS_A_MEASUREMENT
+            if self._steps >= 0:
+                self._mover_steps[index] += self._stride(mover, self._mover_steps[index])
             x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
             self._data.mocap_pos[index, :2] = x, y
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
-    def _waits(self, mover: Mover, steps: int) -> bool:
-        """Whether somebody would walk into the robot."""
+    def _stride(self, mover: Mover, steps: int) -> int:
+        """Return by how much the time of a mover goes on. Somebody waits where the next step would
+        lead too near to the robot, and goes back before a robot that comes too near.
+        """
+        stride = STEPS_A_MEASUREMENT
         if not isinstance(mover, Person):
-            return False
-        here = *self._data.qpos[:2], 0.0
-        now, soon = (
-            np.hypot(*np.subtract(place(mover, steps / STEPS_PER_S + later_s), here)[:2])
-            for later_s in (0.0, LOOKS_S)
-        )
-        return bool(soon < min(now, self._robot.radius_m + PERSON_RADIUS_M))
-
-    def _pose_now(self) -> Array:
-        w, x, y, z = self._data.qpos[3:7]
-        return make_transform(Rotation.from_quat([x, y, z, w]).as_matrix(), self._data.qpos[:3])
+            return stride
+        ways = [place(mover, (steps + by) / STEPS_PER_S)[:2] for by in (0, stride, -stride)]
+        now_m, ahead_m, back_m = np.hypot(*(np.array(ways) - self._data.qpos[:2]).T)
+        near_m = self._robot.radius_m + PERSON_RADIUS_M + PERSONAL_M
+        if ahead_m >= min(now_m, near_m):
+            return stride
+        return -stride if steps and back_m > now_m and now_m < near_m else 0
 
     def _rim_positions(self) -> Array:
         """Return how far the rims of the left and the right wheels have run (2,), the mean of
@@ -247,7 +258,7 @@ class DrivenRobot:
         if not hits.any():
             return
         if self._steps >= 0 and self.time_s > self._touched_s + BREAK_S:
-            T_base_world = invert(self._poses[-1])
+            T_base_world = invert(self.T_world_base(self.time_s))
             self.bumps.append(
                 (self.time_s, transform_points(T_base_world, self._data.contact.pos[hits])[0])
             )

@@ -31,6 +31,15 @@ def test_it_starts_where_the_drive_of_the_scene_does() -> None:
 
 
 @pytest.mark.parametrize('name', ['turtlebot3_burger', 'husky'])
+def test_both_eyes_sit_so_far_within_it_that_they_see_the_wall_that_it_touches(name) -> None:
+    driven, (robot, values), nearest_m = robot_in('lane', name), open_robot(name), 0.02
+    baseline_m = open_scene('lane', values).camera.baseline_m
+    eyes = driven.mount.T_base_left @ [[0, baseline_m], [0, 0], [0, 0], [1, 1]]
+    off_middle_m = np.abs(eyes[:2] - [[robot.middle_m], [0]])
+    assert (off_middle_m < np.array(robot.size_m)[:2, None] / 2 - nearest_m).all()
+
+
+@pytest.mark.parametrize('name', ['turtlebot3_burger', 'husky'])
 def test_it_drives_straight_at_the_speed_it_is_told_and_no_faster_than_it_can(name) -> None:
     driven, (published, _) = robot_in('lane', name), open_robot(name)
     driven.drive(0.2, 0.0)
@@ -64,6 +73,16 @@ def test_standing_its_accelerometer_measures_gravity() -> None:
     assert mean == pytest.approx(9.81 * driven.mount.up_in_camera, abs=0.1)
     stamps = [sample.stamp_ns for sample in driven.imu]
     assert set(np.diff(stamps)) == {10_000_000}
+
+
+def test_it_stops_as_soon_when_it_also_has_to_turn() -> None:
+    driven = robot_in('lane', 'husky')
+    driven.drive(0.4, 0.3)
+    driven.advance(2.0)
+    driven.drive(0.0, -0.6)
+    driven.advance(3.0)
+    before, after = driven.T_world_base(2.0), driven.T_world_base(3.0)
+    assert np.hypot(*(after - before)[:2, 3]) == pytest.approx(0.4**2 / 2, abs=0.02)
 
 
 def test_four_wheels_slip_in_a_turn() -> None:
@@ -100,14 +119,33 @@ def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     driven.advance(5.0)
     assert not driven.bumps
     (waited_s,) = driven.mover_times_s(5.0)
-    # In a second the person would touch the robot, which turns within 0.135 m.
-    assert 2.0 - waited_s - 1.0 == pytest.approx(0.135 + 0.25, abs=0.02)
+    # The robot turns within 0.135 m, the person is 0.5 m thick.
+    assert 2.0 - waited_s == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
     driven.drive(-0.2, 0.6)
     driven.advance(5.0 + 0.5 * np.pi / 0.6)
     driven.drive(-0.2, 0.0)
     driven.advance(12.0)
     assert not driven.bumps
     assert driven.mover_times_s(12.0)[0] > 3.0
+
+
+def test_people_go_back_before_it_where_it_comes_too_near() -> None:
+    person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 0.5, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', person)
+    driven.advance(4.0)
+    driven.drive(0.2, 0.0)
+    driven.advance(8.0)
+    person_m = 2.0 - 0.5 * driven.mover_times_s(8.0)[0]
+    assert not driven.bumps
+    assert person_m - driven.T_world_base(8.0)[0, 3] == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
+
+
+def test_people_do_not_walk_past_it_within_reach_of_its_turn() -> None:
+    past = 'people=[{points: [[2, 0.5], [-2, 0.5]], speed_m_s: 1.0, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', past)
+    driven.advance(6.0)
+    reached_m = 2.0 - driven.mover_times_s(6.0)[0]
+    assert np.hypot(reached_m, 0.5) == pytest.approx(0.135 + 0.25 + 0.45, abs=0.02)
 
 
 def test_a_crate_stops_it_where_somebody_has_put_it_down_and_no_longer_when_it_is_gone() -> None:
