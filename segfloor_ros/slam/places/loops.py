@@ -113,30 +113,17 @@ class LoopDetector:
     def _from_above(
         self, keyframe: KeyframeRecord, others: NDArray[np.bool_], reach_m: Array
     ) -> Match | None:
-        """Look for the floor of other keyframes (K,), within reach (K,), that look another way;
-        None where they do not agree.
-        """
+        """Look for the floor of other keyframes (K,), within reach (K,), that look another way."""
         mount, keyframes = self._map.rig.mount, self._map.keyframes
         if mount is None or not len(keyframe.ground.xy_m):
             return None
-        T_left_base = invert(mount.T_base_left)
-        middle = T_left_base @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
+        middle = invert(mount.T_base_left) @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
         poses = invert(np.stack([k.T_camera_world for k in keyframes]))
         distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
         turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= MIN_VIEW_COSINE
         shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
         near = np.flatnonzero(others & turned & shown & (distance < reach_m + seen_ahead_m(mount)))
-        found: list[Match] = []
-        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
-        for place in near[np.argsort(distance[near])][:PROOF].tolist():
-            ground = keyframes[place].ground
-            T_base_place = motion_between(keyframe.ground, ground, mount.height_m)
-            if T_base_place is not None:
-                T_camera_place = T_left_base @ T_base_place @ mount.T_base_left
-                pose = T_camera_place @ keyframes[place].T_camera_world
-                found.append(Match(keyframe.index, place, pose, *nothing))
-        agree = found and all(self._matcher.agree(match, found[0]) for match in found[1:])
-        return found[0] if agree else None
+        return self._matcher.look_at_floor(keyframe, near[np.argsort(distance[near])])
 
 
 def path_lengths(sparse_map: SparseMap, index: int) -> Array:
@@ -219,6 +206,24 @@ class PlaceMatcher:
         stable_ids = self._known.stable_id[ids]
         return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids)
 
+    def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> Match | None:
+        """Look for the floor of the first of known keyframes (N,), by index, from whatever side;
+        None where they do not agree.
+        """
+        mount, found = self._map.rig.mount, list[Match]()
+        if mount is None:
+            return None
+        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
+        for place in places[:PROOF].tolist():
+            known = self._known.keyframes[place]
+            T_base_place = motion_between(keyframe.ground, known.ground, mount.height_m)
+            if T_base_place is not None:
+                T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
+                pose = T_camera_place @ known.T_camera_world
+                found.append(Match(keyframe.index, place, pose, *nothing))
+        agree = found and all(self.agree(match, found[0]) for match in found[1:])
+        return found[0] if agree else None
+
     def add(self, match: Match | None) -> bool:
         """Take in what the next keyframe sees of the place; returns whether enough of them agree,
         two of them so far apart that each of so many views on the way is new.
@@ -295,14 +300,17 @@ class PlaceMatcher:
         place = self._known.keyframes[match.place]
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         known = place.point_id[place.point_id != NO_POINT]
-        if self._known is self._map:
-            own = np.setdiff1d(own, known)
-        in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
-        in_place = transform_points(place.T_camera_world, self._known.xyz_world[known])
-        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
+        others = np.setdiff1d(own, known) if self._known is self._map else own, known
+        if self._known is not self._map and not len(match.rows):
+            # Who looks the other way sees what others of the map see, too.
+            others = np.flatnonzero(self._map.alive), np.flatnonzero(self._known.alive)
+        T_place_own = place.T_camera_world @ invert(match.T_camera_world) @ keyframe.T_camera_world
+        own_seen = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
+        known_seen = transform_points(place.T_camera_world, self._known.xyz_world[known])
+        from_place = transform_points(T_place_own, self._map.xyz_world[others[0]])
+        from_here = transform_points(match.T_camera_world, self._known.xyz_world[others[1]])
         return max(
-            self._share_in_front(transform_points(T_place_now, in_now), in_place),
-            self._share_in_front(transform_points(invert(T_place_now), in_place), in_now),
+            self._share_in_front(from_place, known_seen), self._share_in_front(from_here, own_seen)
         )
 
     def _share_in_front(self, points: Array, seen: Array) -> float:

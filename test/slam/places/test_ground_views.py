@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.files.results import from_bytes, to_bytes
 from segfloor_ros.geometry import invert
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.places.views import GroundViews, motion_between
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Rig
@@ -16,6 +18,7 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)
 RNG = np.random.default_rng(5)
+SETTINGS = StereoSlamSettings(num_features=600)
 TILE = np.kron(RNG.integers(60, 200, (8, 8)), np.ones((5, 5)))
 """0.4 m wide."""
 
@@ -60,7 +63,7 @@ def driven_back():
     room = StereoRoom(0)
     room.reset_noise()
     camera = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)
-    slam, results = StereoSlam(camera, StereoSlamSettings(num_features=600), MOUNT), []
+    slam, results = StereoSlam(camera, SETTINGS, MOUNT), []
     for k, pose in enumerate(THERE + TURN + BACK):
         results += slam.process(room.frame(k, pose))
     return slam, results
@@ -83,3 +86,40 @@ def test_a_saved_map_keeps_what_the_floor_ties_together(driven_back):
     again = StereoSlam(slam.rig.camera, StereoSlamSettings())
     load_slam(again, slam.rig.camera, save_slam(slam, slam.rig.camera), 'x')
     assert [loop.by_floor for loop in again.map.loops] == [True] * len(slam.map.loops)
+
+
+@pytest.fixture(scope='module')
+def there():
+    """The map of a way that is driven in one direction."""
+    room, slam = StereoRoom(0), StereoSlam(CAMERA, SETTINGS, MOUNT)
+    for k, pose in enumerate(THERE):
+        slam.process(room.frame(k, pose))
+    return slam, from_bytes(to_bytes(save_slam(slam, CAMERA)), 'there.map')
+
+
+def test_views_of_the_floor_are_saved(there):
+    slam, saved = there
+    other = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    load_slam(other, CAMERA, saved, 'there.map')
+    for before, after in zip(slam.map.keyframes, other.map.keyframes, strict=True):
+        np.testing.assert_array_equal(after.ground.descriptor, before.ground.descriptor)
+        np.testing.assert_allclose(after.ground.xy_m, before.ground.xy_m, atol=0.001)
+    assert sum(len(k.ground.xy_m) for k in other.map.keyframes) > 1000
+    corners = 'keyframe_corners', 'corner_xy_m', 'corner_descriptor'
+    earlier = {n: a for n, a in saved.parts['slam'].items() if n not in corners}
+    load_slam(
+        StereoSlam(CAMERA, SETTINGS, MOUNT), CAMERA, replace(saved, parts={'slam': earlier}), 'x'
+    )
+
+
+@pytest.mark.parametrize('seed', [0, 2], ids=['same floor', 'another room'])
+def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(there, seed):
+    slam, results = StereoSlam(CAMERA, SETTINGS, MOUNT), []
+    load_slam(slam, CAMERA, there[1], 'there.map')
+    room, poses = StereoRoom(seed), [BACK[0]] * 16 + BACK[:22]
+    for k, pose in enumerate(poses):
+        results += slam.process(room.frame(k, pose))
+    is_known = slam.back_end.submap is Submap.KNOWN
+    assert is_known == (seed == 0)
+    off = invert(invert(THERE[0]) @ poses[-1]) @ results[-1].T_map_odom @ results[-1].T_odom_base
+    assert (np.linalg.norm(off[:3, 3]) < 0.02) == is_known
