@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
@@ -275,6 +276,25 @@ class PlaceMatcher:
         tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
         return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_SLOPE)
 
+    def stands_alike(self, match: Match) -> bool:
+        """Whether what stands around the keyframe stands where the known map has it, and not as
+        well in a place beside: floors repeat themselves.
+        """
+        mount = self._map.rig.mount
+        assert mount is not None
+        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
+        own = upright(self._map, mount, self._map.points_of(recent))
+        known = cKDTree(upright(self._known, mount, np.flatnonzero(self._known.alive)))
+        own = transform_points(invert(drift(self._map, match)), own)
+        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
+        along, aside, _ = mount.T_base_left[:3, :3]
+        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
+        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
+        gaps_m, _ = known.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        here, *beside = np.isfinite(gaps_m).sum(axis=0)
+        return bool(here >= ENOUGH and here - np.sqrt(here) > max(beside) + np.sqrt(max(beside)))
+
     def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
         """Whether the keyframe's own points lie where the place's keyframe sees what they match."""
         own = keyframe.point_id[match.rows]
@@ -300,17 +320,14 @@ class PlaceMatcher:
         place = self._known.keyframes[match.place]
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         known = place.point_id[place.point_id != NO_POINT]
-        others = np.setdiff1d(own, known) if self._known is self._map else own, known
-        if self._known is not self._map and not len(match.rows):
-            # Who looks the other way sees what others of the map see, too.
-            others = np.flatnonzero(self._map.alive), np.flatnonzero(self._known.alive)
-        T_place_own = place.T_camera_world @ invert(match.T_camera_world) @ keyframe.T_camera_world
-        own_seen = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
-        known_seen = transform_points(place.T_camera_world, self._known.xyz_world[known])
-        from_place = transform_points(T_place_own, self._map.xyz_world[others[0]])
-        from_here = transform_points(match.T_camera_world, self._known.xyz_world[others[1]])
+        if self._known is self._map:
+            own = np.setdiff1d(own, known)
+        in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
+        in_place = transform_points(place.T_camera_world, self._known.xyz_world[known])
+        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
         return max(
-            self._share_in_front(from_place, known_seen), self._share_in_front(from_here, own_seen)
+            self._share_in_front(transform_points(T_place_now, in_now), in_place),
+            self._share_in_front(transform_points(invert(T_place_now), in_place), in_now),
         )
 
     def _share_in_front(self, points: Array, seen: Array) -> float:
@@ -335,6 +352,12 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
+
+
+def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
+    """Return those of points (N,), (M, 3), that stand higher than a step above the floor."""
+    xyz = sparse_map.xyz_world[ids]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > MAX_STEP_UP_M]
 
 
 def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
