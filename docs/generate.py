@@ -93,6 +93,18 @@ SERVICES = {
             '`std_srvs/srv/Trigger`',
             'Write the whole map, with what the nodes behind know of it, to the file `save_map`.',
         ),
+        (
+            '`~/prune_map`',
+            '`std_srvs/srv/Trigger`',
+            'Prune the file `save_map`, as `segfloor map prune` does; the map in use stays as it '
+            'is until `~/load_map`.',
+        ),
+        (
+            '`~/map_info`',
+            '`std_srvs/srv/Trigger`',
+            'Return what the map in use holds, as JSON: keyframes, points, loops, and the drives '
+            'that made it.',
+        ),
     ],
     ROBOT: [
         (*PAUSE, 'Let the time stand still (true) or go on (false).'),
@@ -131,6 +143,8 @@ STATUS = {
     SLAM: 'One status per frame: OK while tracking, WARN while the mount is measured, ERROR while '
     'lost, with the reason. Values: `tracked`, `keyframe`, `matches`, `reference_keyframe_ns` (the '
     'keyframe a pose is relative to), `lost_s` (for how long), `recovered_after_s` (once), '
+    '`in_map_s` (for how long the place in the map has been known), `place_sigma_m` and '
+    '`place_sigma_rad` (how well, one sigma), '
     '`submap` (1: mapped in a submap that was merged later), '
     '`processing_ms`, `rss_mb`.',
     FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '

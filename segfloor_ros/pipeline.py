@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
 from segfloor_ros.cloud import CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
-from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import Arrays, MapFile, take
+from segfloor_ros.files.results import Arrays, MapFile, read_map_file, take, write_map_file
 from segfloor_ros.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.floor.plane.mount import MountEstimator
 from segfloor_ros.floor.segmentation import FloorSegmentation
@@ -36,7 +36,7 @@ from segfloor_ros.slam.results import (
     StereoSlamSettings,
 )
 from segfloor_ros.slam.saved_slam import PART as SLAM
-from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, prune_slam, save_slam
+from segfloor_ros.slam.saved_slam import LoadedMap, load_slam, parts_that_fit, prune_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.timing import StageTimes
 
@@ -151,15 +151,13 @@ class KeyframeStages:
         """Go on with a map that SLAM has loaded. Raises InputError, by the file's name, for parts
         that are damaged.
         """
-        try:
+        with parts_that_fit(name):
             self._labelling.from_arrays(parts['cloud'])
             self.labelled = self._labelling.labelled(loaded.cloud)
             self._mapper.from_arrays(parts['grid'], parts['grid']['stamp_ns'] + loaded.shift_ns)
             self._path = loaded.path
             if LABELS in parts:
                 self._label_map.from_arrays(parts[LABELS], loaded.shift_ns)
-        except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
-            raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
         self._is_loaded = True
 
     def grid(self) -> OccupancyGrid | None:
@@ -172,17 +170,27 @@ def prune(saved: MapFile) -> MapFile:
     keyframes and points that go, goes with them. Raises KeyError, IndexError or ValueError for a
     map that is damaged.
     """
-    slam = prune_slam(saved.parts[SLAM])
+    slam, latest_ns = prune_slam(saved.parts[SLAM])
     parts = saved.parts | {SLAM: slam}
-    cloud, keyframes = saved.parts['cloud'], slam['keyframe_stamp_ns']
+    cloud, latest_ns = saved.parts['cloud'], np.intersect1d(latest_ns, slam['keyframe_stamp_ns'])
     parts['cloud'] = take(cloud, np.isin(cloud['point_id'], slam['point_stable_id']), {})
     for name, lengths in (('grid', LENGTHS), (LABELS, SEEN_LENGTHS)):
         arrays = saved.parts.get(name, {})
         of_keyframes = {column: array for column, array in arrays.items() if column != 'names'}
         if arrays:
-            stays = np.isin(arrays['stamp_ns'], keyframes)
+            stays = np.isin(arrays['stamp_ns'], latest_ns)
             parts[name] = arrays | take(of_keyframes, stays, lengths)
     return MapFile(saved.header, parts)
+
+
+def prune_file(path: Path) -> str:
+    """Prune the map in a file; returns its name and size in words. Raises InputError."""
+    saved = read_map_file(path)
+    with parts_that_fit(str(path)):
+        pruned = prune(saved)
+    write_map_file(path, pruned)
+    before, after = (len(file.parts[SLAM]['keyframe_stamp_ns']) for file in (saved, pruned))
+    return f'{path}, {before} keyframes before, {after} now'
 
 
 class Pipeline:

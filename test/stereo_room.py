@@ -33,9 +33,9 @@ class StereoRoom:
         noise: float = 1.0,
         floor: np.ndarray | None = None,
     ) -> None:
-        self._textures, state = _textures(seed, contrast)
+        self.textures, state = _textures(seed, contrast)
         if floor is not None:
-            self._textures = [*self._textures[:4], floor.astype(np.float32), self._textures[5]]
+            self.textures = [*self.textures[:4], floor.astype(np.float32), self.textures[5]]
         self._rng = np.random.default_rng()
         self._rng.bit_generator.state = state
         self._noise = noise
@@ -65,7 +65,7 @@ class StereoRoom:
                 (origin[k] - ROOM_MIN[k] + directions[k, at] * distance[at]) * TEXELS_PER_M
                 for k in across
             )
-            image[at] = drawn(self._textures[face], s, t, cv2.BORDER_REFLECT)
+            image[at] = drawn(self.textures[face], s, t, cv2.BORDER_REFLECT)
         image += self._rng.normal(scale=self._noise, size=image.shape)
         image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
         return image.reshape(camera.height, camera.width)

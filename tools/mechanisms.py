@@ -92,6 +92,7 @@ SLAM: dict[str, Mechanism] = {
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
     'keyframes where few points are found': Mechanism({'slam.places.views.MAJORITY': 0.0}),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
+    'places by their floor': Mechanism({'slam.places.loops.PlaceMatcher.look_at_floor': _none}),
     'relocalisation by several frames': Mechanism({'slam.places.place_recognition.PROOF': 1}),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
     'two motions distinguished': Mechanism(

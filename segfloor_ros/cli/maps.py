@@ -5,8 +5,7 @@ look at them, compare them, make one of two, leave out what is old.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,7 +33,7 @@ from segfloor_ros.grid.map_file import (
     save_map,
 )
 from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.pipeline import prune
+from segfloor_ros.pipeline import prune_file
 from segfloor_ros.semantics.label_map import (
     LABELS,
     LabelMap,
@@ -52,6 +51,7 @@ from segfloor_ros.slam.saved_slam import (
     gap_ns,
     loaded_map,
     mount_of,
+    parts_that_fit,
     saved_camera,
     sessions_of,
 )
@@ -162,12 +162,7 @@ def prune_map(
     \b
     segfloor map prune building.map
     """
-    saved = open_map(path)
-    with _parts_that_fit(saved.name):
-        pruned = prune(saved.file)
-    write_map_file(path, pruned)
-    before, after = (len(file.parts[PART]['keyframe_stamp_ns']) for file in (saved.file, pruned))
-    typer.echo(f'map: {path}, {before} keyframes before, {after} now')
+    typer.echo(f'map: {prune_file(path)}')
 
 
 @app.command('diff')
@@ -285,18 +280,9 @@ class SavedMap:
 def open_map(path: Path) -> SavedMap:
     """Read a saved map with all its parts. Raises InputError."""
     saved = SavedMap(str(path), read_map_file(path))
-    with _parts_that_fit(saved.name):
+    with parts_that_fit(saved.name):
         saved.facts()
     return saved
-
-
-@contextmanager
-def _parts_that_fit(name: str) -> Iterator[None]:
-    """Raise InputError, by the name of a file, where its parts turn out to be damaged."""
-    try:
-        yield
-    except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
-        raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
 
 
 def merge(first: SavedMap, second: SavedMap) -> SavedMap:
@@ -307,7 +293,7 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     _check_mounts(first, second)
     added = _after(first, second)
     camera = saved_camera(first.file, first.name)
-    with _parts_that_fit(f'{first.name} or {second.name}'):
+    with parts_that_fit(f'{first.name} or {second.name}'):
         slam = merge_slam(first.slam, added.parts[PART], Rig(camera, mount_of(first.file)))
     if slam is None:
         raise MapError(
@@ -320,7 +306,7 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     merged.parts['cloud'] = _labels(loaded_map(merged, 0).cloud, both)
     merged.parts['grid'] = _evidence(loaded_map(merged, 0).path, both)
     known = LabelMap(camera)
-    with _parts_that_fit(f'{first.name} or {second.name}'):
+    with parts_that_fit(f'{first.name} or {second.name}'):
         if LABELS in first.file.parts:
             known.from_arrays(first.file.parts[LABELS])
         if LABELS in second.file.parts:

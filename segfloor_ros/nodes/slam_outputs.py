@@ -52,6 +52,7 @@ from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import CameraWatch
+from segfloor_ros.pipeline import prune_file
 from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.results import FrameResult, Keyframe
 from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
@@ -200,6 +201,7 @@ class SlamResults:
         self.topics.reset(map_start_ns, is_loaded)
         self._unsent.clear()
         self._lost_since_ns: int | None = None
+        self._in_map_since_ns: int | None = None
         self.mount: Mount | None = None
 
     def add(self, results: Sequence[FrameResult], slam: StereoSlam, milliseconds: float) -> None:
@@ -250,6 +252,7 @@ class SlamResults:
             matches=result.num_matches,
             reference_keyframe_ns=result.reference_keyframe_ns,
             **self._lost_time(result.stamp_ns, result.tracked),
+            **self._place_in_map(result),
             moving=len(result.moving.xyz_map) if result.moving is not None else 0,
             blind=int(result.blind),
             submap=int(result.in_submap),
@@ -279,6 +282,23 @@ class SlamResults:
         self._node.get_logger().info(f'tracking again, after {lost_s:.2f} s')
         return {'recovered_after_s': f'{lost_s:.2f}'}
 
+    def _place_in_map(self, result: FrameResult) -> dict[str, str]:
+        """Return values for the status of a frame: how well its place in the map is known, one
+        sigma, and for how long it has been known.
+        """
+        if not result.tracked or result.outside:
+            self._in_map_since_ns = None
+            return {}
+        # Frames before it was certain come later.
+        since_ns = min(self._in_map_since_ns or result.stamp_ns, result.stamp_ns)
+        self._in_map_since_ns = since_ns
+        sigmas = np.sqrt(np.diag(poses.never_certain(result.covariance_in_map)))
+        return {
+            'in_map_s': f'{1e-9 * (result.stamp_ns - since_ns):.2f}',
+            'place_sigma_m': f'{sigmas[:3].max():.4f}',
+            'place_sigma_rad': f'{sigmas[3:].max():.5f}',
+        }
+
     def _announce_mount(self, stamp_ns: int, mount: Mount) -> None:
         self.mount = mount
         self._node.get_logger().info(
@@ -297,8 +317,8 @@ def _faults_json(slam: StereoSlam) -> str:
 
 
 class SlamMaps:
-    """The services `~/save_map` and `~/load_map`, and what SLAM and the nodes behind it tell each
-    other about maps of files.
+    """The services `~/save_map`, `~/load_map`, `~/prune_map` and `~/map_info`, and what SLAM and
+    the nodes behind it tell each other about maps of files.
 
     slam: returns what could be saved, of the map that `topics` are about.
     """
@@ -317,6 +337,8 @@ class SlamMaps:
         node.inputs.subscribe(MAP_PART, self._take_part)
         node.outputs.trigger('~/save_map', self._save)
         node.outputs.trigger('~/load_map', self._load)
+        node.outputs.trigger('~/prune_map', self._prune)
+        node.outputs.trigger('~/map_info', self._info)
 
     @property
     def _own(self) -> StereoSlamNodeSettings:
@@ -369,14 +391,33 @@ class SlamMaps:
         self._node.reset('by ~/load_map')
         return self._own.load_map
 
-    async def _save(self) -> str:
-        """Gather the map and write it beside tracking, which goes on meanwhile."""
-        name = self._own.save_map
-        if not name:
+    def _info(self) -> str:
+        """Return what the map holds, as JSON."""
+        saved = self._slam_part()
+        slam, sessions = saved.parts['slam'], saved.header['sessions']
+        columns = {
+            'keyframes': 'keyframe_stamp_ns', 'points': 'point_stable_id', 'loops': 'loop_ends',
+        }  # fmt: skip
+        sizes = {name: len(slam[column]) for name, column in columns.items()}
+        return json.dumps(sizes | {'sessions': sessions})
+
+    def _file_to_save(self) -> Path:
+        if not self._own.save_map:
             raise SettingsError('save_map is empty; set it to the name of a file, e.g. home.map')
         if self._arrived is not None:
             raise MapError('a map is being saved already')
-        path = Path(name).expanduser().absolute()
+        return Path(self._own.save_map).expanduser().absolute()
+
+    async def _prune(self) -> str:
+        """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
+        said: list[str] = []
+        path = self._file_to_save()
+        await _in_background(lambda: said.append(prune_file(path)))
+        return said[0]
+
+    async def _save(self) -> str:
+        """Gather the map and write it beside tracking, which goes on meanwhile."""
+        path = self._file_to_save()
         self._refuse_to_overwrite(path)
         saved = self._slam_part()
         start_ns = saved.header.pop('start_ns')

@@ -7,12 +7,14 @@ lost that tracking, relocalisation or the closing of loops need.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from segfloor_ros.camera.model import Mount, StereoCamera, WheelPose
 from segfloor_ros.errors import CalibrationError, InputError, MapError
@@ -23,7 +25,9 @@ from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCl
 from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.slam.sparse_map import (
+    NOTHING,
     OF_KEYFRAMES,
+    GroundView,
     KeyframeRecord,
     LoopEdge,
     Retirement,
@@ -39,7 +43,7 @@ BEFORE_ALL_NS = -MOMENT_NS
 """Where the stamps of a loaded map end: a new drive comes after it, whatever its clock says."""
 
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
-OF_KEYFRAME = 'keyframe_', 'feature_', 'word'
+OF_KEYFRAME = 'keyframe_', 'feature_', 'corner_', 'word'
 """How the names of arrays begin that hold something for each keyframe."""
 LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
 
@@ -88,7 +92,7 @@ def load_slam(
 
     Raises InputError for a map that is damaged or of another camera.
     """
-    try:
+    with parts_that_fit(name):
         check_camera(saved, camera, name)
         mount, arrays = mount_of(saved), saved.parts[PART]
         if not all(np.isfinite(arrays[column]).all() for column in PLACES):
@@ -103,7 +107,14 @@ def load_slam(
         slam.load(moved, mount, localize, last)
         slam.sessions = sessions_of(saved)
         return loaded_map(saved, shift_ns)
-    except (ArithmeticError, LookupError, ValueError, TypeError):
+
+
+@contextmanager
+def parts_that_fit(name: str) -> Iterator[None]:
+    """Raise InputError, by the name of a file, where its parts turn out to be damaged."""
+    try:
+        yield
+    except (ArithmeticError, LookupError, ValueError, TypeError, AttributeError):
         raise InputError(f'{name}: parts of the map do not fit; save it anew') from None
 
 
@@ -191,6 +202,8 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
         [np.array(k.links, np.int32) for k in keyframes], np.zeros(0, np.int32)
     )
     retired = [_followed(sparse_map, k) for k in keyframes]
+    corners, corner_count = joined([k.ground.xy_m for k in keyframes], NOTHING.xy_m)
+    looks, _ = joined([k.ground.descriptor for k in keyframes], NOTHING.descriptor)
     loops = sparse_map.loops
     return sparse_map.points.to_arrays(alive) | {
         'keyframe_frame_index': np.array([k.frame_index for k in keyframes], np.int64),
@@ -205,6 +218,9 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
         'feature_sigma_px': sigma.astype(np.float16),
         'feature_octave': octave,
         'feature_point': point,
+        'keyframe_corners': corner_count,
+        'corner_xy_m': corners.astype(np.float16),
+        'corner_descriptor': looks,
         'loop_ends': np.array([(e.i, e.j) for e in loops], np.int32).reshape(-1, 2),
         'loop_T_i_j': _stack([e.T_i_j for e in loops]),
         'loop_by_floor': np.array([e.by_floor for e in loops], bool),
@@ -229,24 +245,26 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
     sparse_map.loops += [LoopEdge(i, j, T, by) for (i, j), T, by in of_loops]
 
 
-def prune_slam(arrays: Arrays) -> Arrays:
-    """Return a map without the keyframes whose views later ones show again (`views_to_keep`), nor
-    the points that no other keyframe observes: what was taken away goes with the views that showed
-    it, and so does what looks different in today's light. Raises KeyError, IndexError or ValueError
-    for arrays that are no map.
+def prune_slam(arrays: Arrays) -> tuple[Arrays, NDArray[np.int64]]:
+    """Return a map without the keyframes whose views later ones show again in the same light
+    (`views_to_keep`), nor the points that no other keyframe observes; and the stamps of keyframes
+    whose views no later ones show again in any light: what was taken away goes with what the others
+    have seen of the floor. Raises KeyError, IndexError or ValueError for arrays that are no map.
     """
     poses, follows = arrays['keyframe_T_camera_world'], arrays['keyframe_follows']
     numbers = np.arange(len(poses))
     root = np.where(follows == NO_POINT, numbers, follows)
-    stands_in = views_to_keep(poses, _depth_m(arrays)[root], follows == NO_POINT)
+    views = poses, _depth_m(arrays)[root], follows == NO_POINT
+    stands_in = views_to_keep(*views, _shared(arrays)[root])
+    latest_ns = arrays['keyframe_stamp_ns'][views_to_keep(*views) == numbers]
     stays = stands_in == numbers
     number = (np.cumsum(stays) - 1)[stands_in].astype(np.int32)
     by_keyframe = {n: a for n, a in arrays.items() if n.startswith(OF_KEYFRAME)}
-    of_features = dict.fromkeys(
-        (n for n in arrays if n.startswith('feature_')), 'keyframe_features'
-    )
-    links_and_words = {'keyframe_links': 'keyframe_link_count', 'words': 'word_count'}
-    pruned = arrays | take(by_keyframe, stays, of_features | links_and_words)
+    lengths = {'keyframe_links': 'keyframe_link_count', 'words': 'word_count'}
+    for kind in ('feature', 'corner'):
+        columns = (n for n in arrays if n.startswith(f'{kind}_'))
+        lengths |= dict.fromkeys(columns, f'keyframe_{kind}s')
+    pruned = arrays | take(by_keyframe, stays, lengths)
 
     alive, point = np.unique(pruned['feature_point'], return_inverse=True)
     pruned['feature_point'] = point.astype(np.int32)
@@ -272,7 +290,17 @@ def prune_slam(arrays: Arrays) -> Arrays:
     pruned['loop_T_i_j'] = (to_i @ arrays['loop_T_i_j'] @ from_j)[loops]
     if 'loop_by_floor' in arrays:
         pruned['loop_by_floor'] = arrays['loop_by_floor'][loops]
-    return pruned
+    return pruned, latest_ns
+
+
+def _shared(arrays: Arrays) -> sparse.csr_array:
+    """Return the share (K, K) of the points of each keyframe of a map that another observes."""
+    length, point = arrays['keyframe_features'], arrays['feature_point']
+    ends = np.append(0, np.cumsum(length))
+    shape = len(length), len(arrays['point_stable_id'])
+    observes = sparse.csr_array((np.ones(len(point)), point, ends), shape)
+    shared = observes @ observes.T
+    return sparse.csr_array(shared.multiply(1.0 / np.maximum(length, 1)[:, None]))
 
 
 def _depth_m(arrays: Arrays) -> Array:
@@ -301,6 +329,15 @@ def _keyframes(
         for name in ('uvd_px', 'sigma_px', 'octave', 'point')
     )
     links = split(arrays['keyframe_links'], arrays['keyframe_link_count'])
+    grounds = [NOTHING] * len(length)
+    if 'keyframe_corners' in arrays:  # not in maps of earlier releases
+        corners = (
+            split(arrays[name], arrays['keyframe_corners'])
+            for name in ('corner_xy_m', 'corner_descriptor')
+        )
+        grounds = [
+            GroundView(xy_m.astype(np.float32), look) for xy_m, look in zip(*corners, strict=True)
+        ]
     records = []
     for k, stamp_ns in enumerate(arrays['keyframe_stamp_ns'].tolist()):
         # Points carry the look of their features.
@@ -319,6 +356,7 @@ def _keyframes(
                 (first_row + point[k]).astype(np.int32),
                 retired=retired if follows != NO_POINT else None,
                 links=tuple((first + links[k]).tolist()),
+                ground=grounds[k],
             )
         )
     return records

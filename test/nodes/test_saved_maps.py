@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -140,6 +141,29 @@ def test_the_nodes_save_one_file_with_all_parts(saved) -> None:
     assert set(parts) == {'slam', 'cloud', 'grid'}
     assert len(parts['grid']['stamp_ns']) == len(parts['slam']['keyframe_stamp_ns'])
     assert len(parts['slam']['point_stable_id']) > 100
+
+
+def test_a_saved_map_is_pruned_and_looked_at_on_the_robot(loaded, drive, tmp_path) -> None:
+    chain = loaded()
+    frames = drive[0][4:]
+    answers = [a for a in chain.drive(frames, shift_ns=10**12) if a.values['tracked'] == '1']
+    since_ns = frames[0].stamp_ns + 10**12  # it saw the place before that was certain
+    in_map_s = [float(a.values['in_map_s']) for a in answers]
+    assert in_map_s == pytest.approx([1e-9 * (a.stamp_ns - since_ns) for a in answers])
+    assert all(0 < float(a.values['place_sigma_m']) < 0.01 for a in answers)
+    assert all(0 < float(a.values['place_sigma_rad']) < 0.01 for a in answers)
+    missing = chain.graph.call(Trigger, 'stereo_slam/prune_map', Trigger.Request())
+    assert (missing.success, 'save_map is empty' in missing.message) == (False, True)
+    file = tmp_path / 'again.map'
+    assert chain.save(file).success
+    before = len(read_map_file(file).parts['slam']['keyframe_stamp_ns'])
+    said = chain.graph.call(Trigger, 'stereo_slam/prune_map', Trigger.Request())
+    after = len(read_map_file(file).parts['slam']['keyframe_stamp_ns'])
+    expected = f'{file}, {before} keyframes before, {after} now'
+    assert (said.success, said.message) == (True, expected) and after <= before
+    facts = json.loads(chain.graph.call(Trigger, 'stereo_slam/map_info', Trigger.Request()).message)
+    assert facts['keyframes'] == sum(s['keyframes'] for s in facts['sessions']) == before
+    assert facts['points'] > 500
 
 
 def error_m(message, T_map_base) -> float:

@@ -35,7 +35,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
 )
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.loops import LoopDetector, PlaceMatcher, drift
-from segfloor_ros.slam.places.place_recognition import PlaceRecognition, Relocaliser
+from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
@@ -247,6 +247,7 @@ class KnownMap:
         self._places.from_arrays(arrays)
         self._relocaliser = Relocaliser(self._map, self._places)
         self._matcher = PlaceMatcher(own, self._map, self._places, TIMES_SURE * PROOF)
+        self._floors = FloorIndex(self._map.keyframes)
 
     @property
     def num_keyframes(self) -> int:
@@ -257,8 +258,12 @@ class KnownMap:
         """Whether enough keyframes in a row see the known map, this one the last of them."""
         anywhere = np.ones(len(self._map.keyframes), bool)
         match = self._matcher.look(keyframe, images, anywhere, ~anywhere)
+        match = match or self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
         is_possible = match is not None and self._is_possible(keyframe, match)
-        return self._matcher.add(match if is_possible else None)
+        if not self._matcher.add(match if is_possible else None):
+            return False
+        matches = self._matcher.matches
+        return all(len(m.rows) for m in matches) or self._matcher.stands_alike(matches[-1])
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
         if self._of_drive and not self._matcher.is_within_reach(match):

@@ -16,6 +16,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from segfloor_ros.camera.model import Mount
 from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.place_recognition import (
     PlaceRecognition,
@@ -113,30 +114,17 @@ class LoopDetector:
     def _from_above(
         self, keyframe: KeyframeRecord, others: NDArray[np.bool_], reach_m: Array
     ) -> Match | None:
-        """Look for the floor of other keyframes (K,), within reach (K,), that look another way;
-        None where they do not agree.
-        """
+        """Look for the floor of other keyframes (K,), within reach (K,), that look another way."""
         mount, keyframes = self._map.rig.mount, self._map.keyframes
         if mount is None or not len(keyframe.ground.xy_m):
             return None
-        T_left_base = invert(mount.T_base_left)
-        middle = T_left_base @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
+        middle = invert(mount.T_base_left) @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
         poses = invert(np.stack([k.T_camera_world for k in keyframes]))
         distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
         turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= MIN_VIEW_COSINE
         shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
         near = np.flatnonzero(others & turned & shown & (distance < reach_m + seen_ahead_m(mount)))
-        found: list[Match] = []
-        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
-        for place in near[np.argsort(distance[near])][:PROOF].tolist():
-            ground = keyframes[place].ground
-            T_base_place = motion_between(keyframe.ground, ground, mount.height_m)
-            if T_base_place is not None:
-                T_camera_place = T_left_base @ T_base_place @ mount.T_base_left
-                pose = T_camera_place @ keyframes[place].T_camera_world
-                found.append(Match(keyframe.index, place, pose, *nothing))
-        agree = found and all(self._matcher.agree(match, found[0]) for match in found[1:])
-        return found[0] if agree else None
+        return self._matcher.look_at_floor(keyframe, near[np.argsort(distance[near])])
 
 
 def path_lengths(sparse_map: SparseMap, index: int) -> Array:
@@ -219,6 +207,24 @@ class PlaceMatcher:
         stable_ids = self._known.stable_id[ids]
         return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids)
 
+    def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> Match | None:
+        """Look for the floor of the first of known keyframes (N,), by index, from whatever side;
+        None where they do not agree.
+        """
+        mount, found = self._map.rig.mount, list[Match]()
+        if mount is None:
+            return None
+        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
+        for place in places[:PROOF].tolist():
+            known = self._known.keyframes[place]
+            T_base_place = motion_between(keyframe.ground, known.ground, mount.height_m)
+            if T_base_place is not None:
+                T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
+                pose = T_camera_place @ known.T_camera_world
+                found.append(Match(keyframe.index, place, pose, *nothing))
+        agree = found and all(self.agree(match, found[0]) for match in found[1:])
+        return found[0] if agree else None
+
     def add(self, match: Match | None) -> bool:
         """Take in what the next keyframe sees of the place; returns whether enough of them agree,
         two of them so far apart that each of so many views on the way is new.
@@ -269,6 +275,25 @@ class PlaceMatcher:
         up_m = abs(T[2, 3]) - MAX_SLOPE * float(np.linalg.norm(T[:2, 3]))
         tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
         return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_SLOPE)
+
+    def stands_alike(self, match: Match) -> bool:
+        """Whether what stands around the keyframe stands where the known map has it, and not as
+        well in a place beside: floors repeat themselves.
+        """
+        mount = self._map.rig.mount
+        assert mount is not None
+        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
+        own = upright(self._map, mount, self._map.points_of(recent))
+        known = cKDTree(upright(self._known, mount, np.flatnonzero(self._known.alive)))
+        own = transform_points(invert(drift(self._map, match)), own)
+        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
+        along, aside, _ = mount.T_base_left[:3, :3]
+        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
+        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
+        gaps_m, _ = known.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        here, *beside = np.isfinite(gaps_m).sum(axis=0)
+        return bool(here >= ENOUGH and here - np.sqrt(here) > max(beside) + np.sqrt(max(beside)))
 
     def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
         """Whether the keyframe's own points lie where the place's keyframe sees what they match."""
@@ -327,6 +352,12 @@ def drift(sparse_map: SparseMap, match: Match) -> Array:
     """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
     own = sparse_map.keyframes[match.keyframe].T_camera_world
     return invert(own) @ match.T_camera_world
+
+
+def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
+    """Return those of points (N,), (M, 3), that stand higher than a step above the floor."""
+    xyz = sparse_map.xyz_world[ids]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > MAX_STEP_UP_M]
 
 
 def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:

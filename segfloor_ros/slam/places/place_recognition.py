@@ -33,7 +33,7 @@ from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import GroundView, KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.images import Features, hamming
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 
@@ -289,6 +289,21 @@ class Vocabulary:
             distance = hamming(descriptor[:, None], children[node])
             node = node * BRANCHES + distance.argmin(axis=1)
         return node.astype(np.int32)
+
+
+class FloorIndex:
+    """Keyframes of a map by the look of their floor."""
+
+    def __init__(self, keyframes: Sequence[KeyframeRecord]) -> None:
+        self._vocabulary, self._index = Vocabulary.load(), PlaceIndex()
+        for keyframe in keyframes:
+            self._index.add(keyframe.index, self._vocabulary.words(keyframe.ground.descriptor))
+
+    def like(self, ground: GroundView) -> NDArray[np.intp]:
+        """Return the keyframes, by index, whose floor looks like a view of it, most alike first."""
+        score = self._index.score(self._vocabulary.words(ground.descriptor), len(self._index))
+        best = np.argsort(-score, kind='stable')
+        return best[score[best] > 0]
 
 
 def greatest_speed_mps(keyframes: Sequence[KeyframeRecord]) -> float:

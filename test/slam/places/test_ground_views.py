@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import stereo_room
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.files.results import from_bytes, to_bytes
 from segfloor_ros.geometry import invert
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.places.views import GroundViews, motion_between
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Rig
@@ -16,6 +19,7 @@ from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)
 RNG = np.random.default_rng(5)
+SETTINGS = StereoSlamSettings(num_features=600)
 TILE = np.kron(RNG.integers(60, 200, (8, 8)), np.ones((5, 5)))
 """0.4 m wide."""
 
@@ -60,7 +64,7 @@ def driven_back():
     room = StereoRoom(0)
     room.reset_noise()
     camera = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)
-    slam, results = StereoSlam(camera, StereoSlamSettings(num_features=600), MOUNT), []
+    slam, results = StereoSlam(camera, SETTINGS, MOUNT), []
     for k, pose in enumerate(THERE + TURN + BACK):
         results += slam.process(room.frame(k, pose))
     return slam, results
@@ -83,3 +87,54 @@ def test_a_saved_map_keeps_what_the_floor_ties_together(driven_back):
     again = StereoSlam(slam.rig.camera, StereoSlamSettings())
     load_slam(again, slam.rig.camera, save_slam(slam, slam.rig.camera), 'x')
     assert [loop.by_floor for loop in again.map.loops] == [True] * len(slam.map.loops)
+
+
+IN_CORRIDOR = [planar_pose(-2.4 + 0.15 * k, 0.0, 0.0) for k in range(34)]
+BEGIN = [planar_pose(3.5, 0.05, np.pi)] * 16
+"""So long it is looked for in the map."""
+
+TO_IT = BEGIN + [planar_pose(3.5 - 0.15 * k, 0.05, np.pi) for k in range(1, 18)]
+
+
+@pytest.fixture(scope='module')
+def there():
+    """The map of a corridor that is driven in one direction."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stereo_room, 'ROOM_MIN', np.array([-3.0, -1.0, 0.0]))
+        patch.setattr(stereo_room, 'ROOM_MAX', np.array([6.0, 1.0, 2.4]))
+        room, slam = StereoRoom(0), StereoSlam(CAMERA, SETTINGS, MOUNT)
+        for k, pose in enumerate(IN_CORRIDOR):
+            slam.process(room.frame(k, pose))
+        yield slam, from_bytes(to_bytes(save_slam(slam, CAMERA)), 'there.map')
+
+
+def test_views_of_the_floor_are_saved(there):
+    slam, saved = there
+    other = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    load_slam(other, CAMERA, saved, 'there.map')
+    for before, after in zip(slam.map.keyframes, other.map.keyframes, strict=True):
+        np.testing.assert_array_equal(after.ground.descriptor, before.ground.descriptor)
+        np.testing.assert_allclose(after.ground.xy_m, before.ground.xy_m, atol=0.001)
+    assert sum(len(k.ground.xy_m) for k in other.map.keyframes) > 1000
+
+
+def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
+    slam, corners = StereoSlam(CAMERA, SETTINGS, MOUNT), ('keyframe_corners', 'corner_')
+    arrays = {n: a for n, a in there[1].parts['slam'].items() if not n.startswith(corners)}
+    load_slam(slam, CAMERA, replace(there[1], parts={'slam': arrays}), 'x')
+    assert all(k.ground is NOTHING for k in slam.map.keyframes)
+
+
+@pytest.mark.parametrize(
+    ('seed', 'is_known'), [(0, True), (2, False)], ids=['there', 'same floor, other walls']
+)
+def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(there, seed, is_known):
+    slam, results = StereoSlam(CAMERA, SETTINGS, MOUNT), []
+    load_slam(slam, CAMERA, there[1], 'there.map')
+    room = StereoRoom(seed, floor=StereoRoom(0).textures[4])
+    for k, pose in enumerate(TO_IT):
+        results += slam.process(room.frame(k, pose))
+    assert (slam.back_end.submap is Submap.KNOWN) == is_known
+    found = results[-1].T_map_odom @ results[-1].T_odom_base
+    off_m = np.linalg.norm((invert(invert(IN_CORRIDOR[0]) @ TO_IT[-1]) @ found)[:3, 3])
+    assert (off_m < 0.02) == is_known

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hand_made_maps import WALL, row_of_views
+from scipy import sparse
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import se3_exp
@@ -52,13 +53,14 @@ def test_near_views_come_nearest_first_and_not_beyond_reach():
     assert len(views_near(sparse_map, turned(2.0), 2.0, 99)) == 0
 
 
-def kept_of(x_m, is_alive=True):
+def kept_of(x_m, is_alive=True, shared=None):
     """Return which of the views at some places of a corridor, one after the other, stay, and what
     stands for each. What they see is 2 m away: a view is new after 8 cm.
     """
     poses = np.array([camera_at(x) for x in x_m])
     alive = np.broadcast_to(is_alive, len(poses))
-    stands_in = views_to_keep(poses, np.full(len(poses), 2.0), alive)
+    shared = None if shared is None else sparse.csr_array(shared)
+    stands_in = views_to_keep(poses, np.full(len(poses), 2.0), alive, shared)
     return np.flatnonzero(stands_in == np.arange(len(poses))).tolist(), stands_in
 
 
@@ -79,6 +81,31 @@ def test_views_do_not_grow_with_the_visits():
     counts = [len(kept_of(np.concatenate(laps[:k]))[0]) for k in (1, 2, 6)]
     assert counts[2] < 1.15 * counts[0]
     assert counts[2] - counts[1] <= 2
+
+
+@pytest.mark.parametrize(
+    ('share', 'visits', 'expected'),
+    [(0.3, 3, [0, 1, 2]), (0.3, 9, [6, 7, 8]), (0.6, 5, [2, 3, 4]), (0.6, 4, [1, 2, 3])],
+    ids=['three lights', 'day after day', 'much the same', 'once more'],
+)
+def test_the_views_of_each_light_stay(share, visits, expected):
+    """The light is that of every third visit, in which views share so many of their points."""
+    there = np.arange(0.0, 3.0, 0.1)
+    light = np.repeat(np.arange(visits) % 3, len(there))
+    shared = np.where(light[:, None] == light, share, 0.1)
+    kept, _ = kept_of(np.tile(there, visits), shared=shared)
+    of_visit = np.bincount(np.array(kept) // len(there), minlength=visits)
+    # The first view of all always stays.
+    assert np.flatnonzero(of_visit > 1).tolist() == expected
+    assert (of_visit[expected] > 25).all()
+
+
+def test_a_rare_light_stays_when_the_usual_one_comes_again():
+    there = np.arange(0.0, 3.0, 0.1)
+    is_rare = np.repeat(np.arange(7) == 1, len(there))
+    shared = np.where(is_rare[:, None] == is_rare, 0.3, 0.05)
+    kept, _ = kept_of(np.tile(there, 7), shared=shared)
+    assert np.bincount(np.array(kept) // len(there))[[1, 5, 6]].min() > 25
 
 
 def test_a_view_without_points_stands_for_none():
