@@ -32,6 +32,14 @@ def test_what_was_taken_for_floor_does_not_hide_itself():
     assert odd[63:77, 103:127].all()
 
 
+def test_what_is_nearly_a_quarter_as_wide_as_the_image_does_not_hide_itself():
+    image = floor_image(np.random.default_rng(2), 4.0)
+    image[60:130, 120:190] = 40
+    odd = unlike_floor(image, np.ones(image.shape, bool))
+    assert odd[65:125, 125:185].mean() > 0.98
+    assert odd[:, :115].mean() < 0.08
+
+
 def test_where_no_floor_is_known_nothing_is_odd():
     image = floor_image(np.random.default_rng(3), 4.0)
     assert not unlike_floor(image, np.zeros(image.shape, bool)).any()
