@@ -13,8 +13,8 @@ STAMP := $(VENV)/.installed
 TF := $(VENV)/.tf2_msgs
 NOBLE := .venv-noble
 NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
-# What processes and links do to each other does not depend on the four libraries.
-APART_FROM := nodes suite tools test_package.py
+# What processes and links do to each other, and who only develops, does not depend on the four libraries.
+APART_FROM := nodes simulation suite tools test_package.py
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 # Tests of one module stay together where they can: its fixtures are made once.
 PARALLEL := -n 2 --dist worksteal
