@@ -13,8 +13,11 @@ STAMP := $(VENV)/.installed
 TF := $(VENV)/.tf2_msgs
 NOBLE := .venv-noble
 NOBLE_CANDIDATES := $(PYTHON312) python3.12 $(wildcard $(HOME)/.pyenv/versions/3.12.*/bin/python)
-# What processes and links do to each other, and who only develops, does not depend on the four libraries.
-APART_FROM := nodes simulation suite tools test_package.py
+# What processes and links do to each other does not depend on the four libraries.
+APART_FROM := nodes/test_faults nodes/test_restarts nodes/test_two_hosts nodes/test_tf nodes/test_reset \
+  nodes/test_lifecycle nodes/test_on_demand nodes/test_diagnoses nodes/test_pipeline test_package \
+  nodes/test_launched nodes/test_losses nodes/test_lossless nodes/test_middleware \
+  nodes/test_ros2_commands
 IS_312 := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 12))
 # Tests of one module stay together where they can: its fixtures are made once.
 PARALLEL := -n 2 --dist worksteal
@@ -59,7 +62,7 @@ test-slow: $(STAMP) $(TF)
 	$(BIN)/python -m pytest $(PARALLEL) -m slow
 
 test-noble: $(NOBLE)/.installed
-	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(APART_FROM:%=--ignore=test/%)
+	$(NOBLE)/bin/python -m pytest $(PARALLEL) -m 'not slow' $(APART_FROM:%=--ignore=test/%.py)
 
 noble-python:
 	@for python in $(NOBLE_CANDIDATES); do \
