@@ -43,7 +43,7 @@ def invert(T_a_b: Array) -> Array:
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     T_b_a = np.zeros_like(T_a_b)
     T_b_a[..., :3, :3] = R_b_a
-    T_b_a[..., :3, 3] = -np.einsum('...ij,...j->...i', R_b_a, T_a_b[..., :3, 3])
+    T_b_a[..., :3, 3] = -(R_b_a @ T_a_b[..., :3, 3, None])[..., 0]
     T_b_a[..., 3, 3] = 1.0
     return T_b_a
 
@@ -113,18 +113,7 @@ def se3_log(T: Array) -> Array:
     """Return the twist (6,) = (rho, phi) of one (4, 4) transform; the inverse of `se3_exp` for
     |phi| < pi.
     """
-    from scipy.spatial.transform import Rotation
-
-    phi = Rotation.from_matrix(T[:3, :3].copy()).as_rotvec()
-    theta = float(np.linalg.norm(phi))
-    K = skew(phi)
-    if theta < 1e-7:
-        inverse_left_jacobian = np.eye(3) - 0.5 * K + K @ K / 12
-    else:
-        half = theta / 2
-        factor = (1 - half / np.tan(half)) / theta**2
-        inverse_left_jacobian = np.eye(3) - 0.5 * K + factor * (K @ K)
-    return np.concatenate([inverse_left_jacobian @ T[:3, 3], phi])
+    return se3_logs(T[None])[0]
 
 
 def adjoint(T: Array) -> Array:
@@ -140,17 +129,24 @@ def adjoint(T: Array) -> Array:
 
 def se3_logs(T: Array) -> Array:
     """Return the twists (N, 6) of transforms (N, 4, 4), as `se3_log` of each."""
-    from scipy.spatial.transform import Rotation
-
-    phi = Rotation.from_matrix(T[:, :3, :3].copy()).as_rotvec()
-    theta = np.linalg.norm(phi, axis=1)
+    phi = rotation_vectors(T[:, :3, :3])
+    theta = np.sqrt((phi**2).sum(axis=1))
     small = theta < 1e-4
     safe = np.where(small, 1.0, theta)
     factor = np.where(small, 1 / 12, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
     K = skew(phi)
     inverse_left_jacobian = np.eye(3) - 0.5 * K + factor[:, None, None] * (K @ K)
-    rho = np.einsum('nij,nj->ni', inverse_left_jacobian, T[:, :3, 3])
+    rho = (inverse_left_jacobian @ T[:, :3, 3:])[:, :, 0]
     return np.concatenate([rho, phi], axis=1)
+
+
+def rotation_vectors(rotations: Array) -> Array:
+    """Return axis times angle (N, 3), in radians up to pi, of rotations (N, 3, 3)."""
+    quat_xyzw = quaternions_of(rotations)
+    sine = np.sqrt((quat_xyzw[:, :3] ** 2).sum(axis=1))
+    angle = 2 * np.arctan2(sine, quat_xyzw[:, 3])
+    ratio = np.divide(angle, sine, out=np.full(len(sine), 2.0), where=sine > 0)
+    return quat_xyzw[:, :3] * ratio[:, None]
 
 
 def quaternion_xyzw(R: Array) -> Array:
@@ -330,8 +326,6 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the pose (4, 4) at a share of the way from one pose to another: the position on the
     straight line, the rotation on the shortest turn.
     """
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(T_a[:3, :3].T @ T_b[:3, :3]).as_rotvec()
-    rotation = T_a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    turn = rotation_vectors((T_a[:3, :3].T @ T_b[:3, :3])[None])[0]
+    rotation = T_a[:3, :3] @ se3_exp(np.append(np.zeros(3), share * turn))[:3, :3]
     return make_transform(rotation, (1 - share) * T_a[:3, 3] + share * T_b[:3, 3])

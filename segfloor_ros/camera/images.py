@@ -410,7 +410,7 @@ def noise_grey(image: NDArray[np.uint8]) -> float:
     """
     part = image[::2]
     kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
-    response = cv2.filter2D(part, cv2.CV_32F, kernel)
+    response = cv2.filter2D(part, cv2.CV_16S, kernel)
     return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / float(np.linalg.norm(kernel))
 
 

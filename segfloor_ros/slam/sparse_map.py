@@ -251,6 +251,10 @@ class GroundView:
 NOTHING = GroundView(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
 
 
+Covisible = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Keyframes that observe any of some points, most shared first, and the numbers shared."""
+
+
 @dataclass
 class KeyframeRecord:
     """One keyframe of the map.
@@ -492,10 +496,8 @@ class SparseMap:
         lonely = (self.points['born'] < settled_before) & (self.observer_count < 2)
         return np.flatnonzero(self.alive & (seldom | lonely))
 
-    def covisible(self, ids: NDArray[np.integer]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the keyframes that observe any of the points, most shared first, and the
-        numbers shared.
-        """
+    def covisible(self, ids: NDArray[np.integer]) -> Covisible:
+        """Return the keyframes that observe any of the points (N,)."""
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
         shared = np.bincount(

@@ -35,7 +35,7 @@ from segfloor_ros.slam.results import (
     PROOF,
 )
 from segfloor_ros.slam.rig import FITTING, NEIGHBOURS, SAME_PX, Rig, in_view
-from segfloor_ros.slam.sparse_map import NOTHING, GroundView, SparseMap
+from segfloor_ros.slam.sparse_map import NOTHING, Covisible, GroundView, KeyframeRecord, SparseMap
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
@@ -82,7 +82,8 @@ def views_near(
     """Return up to `limit` keyframes that a camera which sees things at about `depth_m` stands
     near to and looks the same way as, the nearest first.
     """
-    return _nearest(sparse_map, _from_views(sparse_map, T_camera_world), depth_m)[:limit]
+    T_views_now = _from_views(sparse_map.keyframes, T_camera_world)
+    return _nearest(sparse_map, T_views_now, depth_m)[:limit]
 
 
 def _nearest(sparse_map: SparseMap, T_views_now: Array, depth_m: float) -> NDArray[np.intp]:
@@ -96,10 +97,14 @@ def _nearest(sparse_map: SparseMap, T_views_now: Array, depth_m: float) -> NDArr
 
 
 def view_novelty(
-    sparse_map: SparseMap, ids: NDArray[np.int32], T_camera_world: Array, depth_m: float
+    sparse_map: SparseMap,
+    ids: NDArray[np.int32],
+    T_camera_world: Array,
+    depth_m: float,
+    covisible: Covisible | None = None,
 ) -> float:
     """Return how new the view of a camera is that tracks points `ids` (N,) at about `depth_m`: 1 is
-    just new.
+    just new. covisible: what the map has of these points, if that is known.
 
     It is measured from the nearest of the latest keyframes that saw much of the same. Those of an
     earlier visit count from further away, if together they saw what is tracked and no part of the
@@ -108,13 +113,14 @@ def view_novelty(
     of its visits.
     """
     latest = len(sparse_map.keyframes) - 1
-    recent, shared = sparse_map.covisible(ids)
+    recent, shared = sparse_map.covisible(ids) if covisible is None else covisible
     recent = recent[(recent > latest - NEIGHBOURS) & (shared >= ALIKE_SHARE * len(ids))]
-    T_views_now = _from_views(sparse_map, T_camera_world)
-    new = novelty(T_views_now, depth_m)
-    nearest = float(new[np.append(recent, latest)].min())
+    just_seen = [sparse_map.keyframes[k] for k in (*recent, latest)]
+    nearest = float(novelty(_from_views(just_seen, T_camera_world), depth_m).min())
     if nearest <= 1:
         return nearest
+    T_views_now = _from_views(sparse_map.keyframes, T_camera_world)
+    new = novelty(T_views_now, depth_m)
     around = _nearest(sparse_map, T_views_now, depth_m)
     earlier = around[(around <= latest - NEIGHBOURS) & (new[around] < SECOND_VISIT)]
     if len(earlier) == 0:
@@ -130,9 +136,9 @@ def view_novelty(
     return max(float(new[earlier].min()) / SECOND_VISIT, again)
 
 
-def _from_views(sparse_map: SparseMap, T_camera_world: Array) -> Array:
-    """Return the motions (K, 4, 4) to a camera from all keyframes, in their axes."""
-    return np.stack([k.T_camera_world for k in sparse_map.keyframes]) @ invert(T_camera_world)
+def _from_views(keyframes: Sequence[KeyframeRecord], T_camera_world: Array) -> Array:
+    """Return the motions (K, 4, 4) to a camera from keyframes, in their axes."""
+    return np.array([k.T_camera_world for k in keyframes]) @ invert(T_camera_world)
 
 
 def covered_share(

@@ -24,7 +24,7 @@ from segfloor_ros.geometry import Array, invert, transform_points
 from segfloor_ros.slam.places.views import View, is_keyframe, novelty, view_novelty, views_near
 from segfloor_ros.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, MIN_DEPTH_M, NEIGHBOURS, Observations, in_view
-from segfloor_ros.slam.sparse_map import SparseMap
+from segfloor_ros.slam.sparse_map import Covisible, SparseMap
 from segfloor_ros.slam.tracking.images import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
@@ -273,6 +273,7 @@ class LocalMap:
         self._max_frames = max_frames
         self._map = sparse_map
         self._depth_m = MIN_DEPTH_M
+        self._asked: tuple[NDArray[np.int32], Covisible] | None = None
 
     @timed
     def move_to(self, ids: NDArray[np.int32], T_camera_world: Array) -> None:
@@ -283,7 +284,7 @@ class LocalMap:
         """Return the points of keyframes that share points `ids` (N,) with a view, or stand where
         it is.
         """
-        order, _ = self._map.covisible(ids)
+        order, _ = self._covisible(ids)
         depth_m = self._median_depth(ids, T_camera_world)
         here = views_near(self._map, T_camera_world, depth_m, LOCAL_KEYFRAMES)
         local = self._map.points_of(np.append(order[:NEIGHBOURS], here))
@@ -297,12 +298,12 @@ class LocalMap:
     @timed
     def wants_keyframe(self, track: Track, frames_since: int, mapper_idle: bool) -> bool:
         """Whether a frame shows enough that is new. frames_since: since the last keyframe."""
-        order, _ = self._map.covisible(track.point_ids)
-        reference = self._map.keyframes[order[0]]
+        covisible = self._covisible(track.point_ids)
+        reference = self._map.keyframes[covisible[0][0]]
         known = reference.point_id[reference.point_id != NO_POINT]
         reliable = known[self._map.observer_count[known] > 1]
         depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
-        novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m)
+        novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m, covisible)
         num_reliable = min(len(reliable), TRACKED_POINTS)
         found = len(track.point_ids)
         share = found / max(1, len(track.visible_ids))
@@ -313,6 +314,12 @@ class LocalMap:
         """Whether a camera that sees no point has come to where the last keyframe was not."""
         T_last_now = self._map.keyframes[-1].T_camera_world @ invert(T_camera_world)
         return bool(novelty(T_last_now, self._depth_m) > 1)
+
+    def _covisible(self, ids: NDArray[np.int32]) -> Covisible:
+        """Return what `covisible` of the map does, once for the points of a frame."""
+        if self._asked is None or self._asked[0] is not ids:
+            self._asked = ids, self._map.covisible(ids)
+        return self._asked[1]
 
     def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
         """Return the depth of points `ids` (N,); without any, that of those seen last."""

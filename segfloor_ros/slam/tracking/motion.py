@@ -22,9 +22,11 @@ from segfloor_ros.geometry import (
     invert,
     is_within,
     make_transform,
+    quaternion_xyzw,
     rotation_angle,
     se3_exp,
     se3_log,
+    transform_from_quaternion,
 )
 from segfloor_ros.slam.results import SAME, LastPose
 from segfloor_ros.slam.rig import is_gated
@@ -345,7 +347,7 @@ def _without_drift(T: Array) -> Array:
     """Return a product of poses (4, 4) with its rotation orthonormal again: `invert` transposes,
     so the rounding errors of repeated products would grow threefold each time.
     """
-    return make_transform(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+    return transform_from_quaternion(T[:3, 3], quaternion_xyzw(T[:3, :3]))
 
 
 class ImageRotation:
