@@ -149,6 +149,11 @@ def rotation_vectors(rotations: Array) -> Array:
     return quat_xyzw[:, :3] * ratio[:, None]
 
 
+def rotations_by(vectors: Array) -> Array:
+    """Return the rotations (N, 3, 3) whose axis times angle are vectors (N, 3)."""
+    return np.asarray(se3_exp(np.concatenate([np.zeros_like(vectors), vectors], 1))[:, :3, :3])
+
+
 def quaternion_xyzw(R: Array) -> Array:
     """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
     return quaternions_of(R[None])[0]
@@ -327,5 +332,5 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     straight line, the rotation on the shortest turn.
     """
     turn = rotation_vectors((T_a[:3, :3].T @ T_b[:3, :3])[None])[0]
-    rotation = T_a[:3, :3] @ se3_exp(np.append(np.zeros(3), share * turn))[:3, :3]
+    rotation = T_a[:3, :3] @ rotations_by(share * turn[None])[0]
     return make_transform(rotation, (1 - share) * T_a[:3, 3] + share * T_b[:3, 3])

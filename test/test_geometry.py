@@ -14,6 +14,8 @@ from segfloor_ros.geometry import (
     quaternion_xyzw,
     rotation_angle,
     rotation_from_angles,
+    rotation_vectors,
+    rotations_by,
     se3_exp,
     se3_log,
     transform_from_quaternion,
@@ -62,6 +64,17 @@ def test_quaternion_round_trip_and_sign():
     q = quaternion_xyzw(R)
     assert q[3] >= 0
     np.testing.assert_allclose(transform_from_quaternion(np.zeros(3), q)[:3, :3], R, atol=1e-12)
+
+
+def test_rotation_vectors_are_those_of_scipy_up_to_half_a_turn():
+    vectors = np.random.default_rng(2).normal(size=(40, 3))
+    angles = np.concatenate([[0.0, 1e-12, 1e-7, np.pi], np.linspace(0.1, 3.14, 36)])
+    vectors *= (angles / np.linalg.norm(vectors, axis=1))[:, None]
+    rotations = Rotation.from_rotvec(vectors).as_matrix()
+    np.testing.assert_allclose(rotations_by(vectors), rotations, atol=1e-14)
+    found = rotation_vectors(rotations)
+    np.testing.assert_allclose(found[angles < np.pi], vectors[angles < np.pi], atol=1e-12)
+    np.testing.assert_allclose(rotations_by(found), rotations, atol=1e-12)
 
 
 def test_rotation_angle():

@@ -9,10 +9,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Measurement, WheelPose, is_sound
-from segfloor_ros.geometry import Array, adjoint, invert, is_within, make_transform
+from segfloor_ros.geometry import (
+    Array,
+    adjoint,
+    invert,
+    is_within,
+    make_transform,
+    rotation_from_angles,
+)
 from segfloor_ros.slam.results import ENOUGH
 from segfloor_ros.slam.sensors.gyroscope import MOMENT_NS, Gyroscope
 from segfloor_ros.slam.sensors.inertial_odometry import SPEED_SIGMA, Gravity, InertialOdometry
@@ -141,12 +147,12 @@ class BodyMotion:
         R_base_left = self.T_base_left[:3, :3]
         seconds = (now_ns - before_ns) * 1e-9
         turn = self.gyroscope.turn(before_ns, now_ns)
-        R = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
+        R: Array | None = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
         way_m, turn_rad = self._calibrator.current.base_motion(
             measured.T_before_now, None if R is None else yaw_of(R)
         )
         if R is None:
-            R = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+            R = rotation_from_angles(turn_rad, 0.0, 0.0)
         T_before_now = make_transform(R, np.append(way_m, 0.0))
         variance = self._variance(measured, None if turn is None else turn[1])
         if self._slipped_ns is not None and before_ns < self._slipped_ns + MOMENT_NS:

@@ -12,10 +12,9 @@ from itertools import pairwise
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import MAX_LAG_S, ImuSample
-from segfloor_ros.geometry import Array, rotation_angle
+from segfloor_ros.geometry import Array, rotation_angle, rotation_vectors, rotations_by
 from segfloor_ros.slam.rig import is_gated
 
 LATE_NS = 100_000_000
@@ -229,7 +228,7 @@ class Gyroscope:
         rates = at_nodes[:, :3] - self.bias_rad_s
         steps = (rates[1:] + rates[:-1]) / 2 * np.diff(nodes)[:, None]
         turns = [np.eye(3)]
-        for R in Rotation.from_rotvec(steps).as_matrix():
+        for R in rotations_by(steps):
             turns.append(turns[-1] @ R)
         return _Path(nodes, np.stack(turns), rates, at_nodes[:, 3:], samples[-1].place_m)
 
@@ -241,7 +240,7 @@ class Gyroscope:
         if path is None or now_ns <= before_ns:
             return
         seconds = float(path.seconds[-1])
-        excess = Rotation.from_matrix(seen.T @ path.turns[-1]).as_rotvec()
+        excess = rotation_vectors((seen.T @ path.turns[-1])[None])[0]
         noise = sigma_seen_rad + SIGMA_ROOT_S * np.sqrt(seconds) + SIGMA_SHARE * path.angle_rad
         # What is measured is late by what is left of the lag: by its rate of the turn at either
         # end.

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import WheelPose
-from segfloor_ros.geometry import Array, between, invert, make_transform
+from segfloor_ros.geometry import Array, between, invert, make_transform, rotation_from_angles
 from segfloor_ros.slam.rig import GATE, chi2_limit
 from segfloor_ros.slam.sensors.gyroscope import LATE_NS, STEP_NS, TimedSeries, is_late, lag_in_words
 
@@ -73,7 +72,7 @@ class Stretch:
         """Return what was measured had the stamps not been late."""
         turn = yaw_of(self.T_before_now) + lag_s * self.turning_up_rad_s
         way = self.T_before_now[:2, 3] + lag_s * self.speeding_up_m_s
-        R = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+        R = rotation_from_angles(turn, 0.0, 0.0)
         return replace(self, T_before_now=make_transform(R, np.append(way, 0.0)))
 
 

@@ -13,7 +13,6 @@ from enum import Enum
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import (
@@ -24,6 +23,7 @@ from segfloor_ros.geometry import (
     make_transform,
     quaternion_xyzw,
     rotation_angle,
+    rotation_from_angles,
     se3_exp,
     se3_log,
     transform_from_quaternion,
@@ -379,5 +379,5 @@ class ImageRotation:
         if response < MIN_RESPONSE:
             return np.eye(4)
         # A scene point that moves right by du lies further to the right now: it turned about +y.
-        angles = [-np.arctan2(dv, self._focal[1]), np.arctan2(du, self._focal[0]), 0.0]
-        return make_transform(Rotation.from_euler('xyz', angles).as_matrix(), np.zeros(3))
+        turned_down, turned_left = np.arctan2((-dv, du), self._focal[::-1])
+        return make_transform(rotation_from_angles(0.0, turned_left, turned_down), np.zeros(3))

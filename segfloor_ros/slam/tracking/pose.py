@@ -15,7 +15,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.geometry import Array, invert, make_transform, se3_exp, se3_log, transform_points
@@ -108,7 +107,7 @@ def solve_pnp(
         return None
     inliers = np.zeros(len(points_world), bool)
     inliers[np.asarray(rows).ravel()] = True
-    R = Rotation.from_rotvec(np.asarray(rotation_vector).ravel()).as_matrix()
+    R = np.asarray(cv2.Rodrigues(rotation_vector)[0])
     return make_transform(R, np.asarray(translation, np.float64).ravel()), inliers
 
 
