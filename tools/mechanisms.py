@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.mask.filling import fill_regions, fill_to_contact
+from segfloor_ros.floor.mask.filling import fill_regions, upright_above
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
@@ -56,24 +56,22 @@ def _nowhere(like: Any, *_: object) -> Any:
     return np.zeros(like.shape, np.bool_)
 
 
-def _with_any_contact(
-    view: Any, mask: Any, alike: Any, disparity: Any, compared: Any, textured: Any
-) -> Any:
-    return fill_to_contact(view, mask, alike, disparity, compared, np.ones_like(textured))
+def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> Any:
+    return upright_above(view, disparity, compared, np.ones_like(textured))
 
 
 def _filled_whatever_stands(
     view: Any,
     mask: Any,
-    image: Any,
-    disparity: Any,
+    slope: Any,
+    upright_px: Any,
     compared: Any,
     textured: Any,
     standing: Any,
     barred: Any,
 ) -> Any:
     return fill_regions(
-        view, mask, image, disparity, compared, textured, _nowhere(standing), barred
+        view, mask, slope, upright_px, compared, textured, _nowhere(standing), barred
     )
 
 
@@ -125,7 +123,7 @@ FLOOR: dict[str, Mechanism] = {
         {'floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
     ),
     'contacts with what has texture alone': Mechanism(
-        {'floor.mask.filling.fill_to_contact': _with_any_contact}
+        {'floor.segmentation.upright_above': _above_anything}
     ),
     'feet of blank faces': Mechanism(
         {'floor.segmentation.blank_feet': lambda *_: (np.zeros(0, np.float32), _no_rows())}

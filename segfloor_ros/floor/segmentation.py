@@ -42,7 +42,9 @@ from segfloor_ros.floor.mask.filling import (
     drop_islands,
     fill_gaps,
     fill_regions,
+    image_slope,
     trim_to_edges,
+    upright_above,
     with_floor,
 )
 from segfloor_ros.floor.mask.pixel_evidence import (
@@ -297,10 +299,12 @@ class FloorSegmentation:
         mask, odd = evidence.mask, evidence.odd
         beside = beside_something(view, mask)
         left = np.ascontiguousarray(left_rows[:, :: view.step])
+        slope = image_slope(left_rows)
+        upright_px = upright_above(view, disparity, compared, textured)
         for _ in range(2):
             barred = beside | odd
             mask = fill_regions(
-                view, mask, left_rows, disparity, compared, textured, evidence.standing, barred
+                view, mask, slope, upright_px, compared, textured, evidence.standing, barred
             )
             may_be = compared.consistent & ~compared.denied & ~barred
             mask = fill_gaps(view, profile, mask, may_be)

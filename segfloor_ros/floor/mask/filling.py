@@ -68,8 +68,8 @@ measured."""
 def fill_regions(
     view: FloorView,
     mask: NDArray[np.uint8],
-    image: NDArray[np.uint8],
-    disparity: NDArray[np.float32],
+    slope: NDArray[np.float32],
+    upright_px: NDArray[np.float32],
     compared: Comparison,
     textured: NDArray[np.bool_],
     standing: NDArray[np.bool_],
@@ -78,18 +78,18 @@ def fill_regions(
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
-    image: whole image rows (R, image width). standing: (R, W), what is measured above the floor.
-    barred: (R, W), where no region goes on. A region is bounded by edges of the image stronger than
-    most of the floor's own; floor by evidence must be in a share of its columns. In it a pixel
-    becomes floor below floor, the next evidence up its column; or between floor on its left and
-    right; or, if it is not blank and not measured above the floor, nearer than any of its floor.
+    slope: `image_slope`; upright_px: `upright_above`. standing: (R, W), what is measured above the
+    floor. barred: (R, W), where no region goes on. A region is bounded by edges of the image
+    stronger than most of the floor's own; floor by evidence must be in a share of its columns. In
+    it a pixel becomes floor below floor, the next evidence up its column; or between floor on its
+    left and right; or, if it is not blank and not measured above the floor, nearer than any of its
+    floor.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
     floor = small == FLOOR
     if np.count_nonzero(floor) < _MIN_REGION_PX:
         return mask
-    slope = _slope(image)
     own = slope.take(np.flatnonzero(floor)[::7])
     limit = max(_MIN_SLOPE, float(np.percentile(own, 90)))
     agreed = compared.consistent[part] & ~compared.denied[part]
@@ -109,11 +109,14 @@ def fill_regions(
     mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
-    to_contact = fill_to_contact(view, mask, no_border, disparity, compared, textured)
+    to_contact = fill_to_contact(view, mask, no_border, upright_px, compared)
     return with_floor(mask, _enlarged(to_contact, mask))
 
 
-def _slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+def image_slope(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return how grey levels change from pixel to pixel of whole image rows (R, image width) at
+    half the resolution in both directions.
+    """
     smooth = cv2.blur(image, (5, 5))[::STEP_PX, ::STEP_PX]
     return cv2.magnitude(
         cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8),
@@ -248,23 +251,19 @@ def fill_to_contact(
     view: FloorView,
     mask: NDArray[np.uint8],
     alike: NDArray[np.bool_],
-    disparity: NDArray[np.float32],
+    upright_px: NDArray[np.float32],
     compared: Comparison,
-    textured: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Return where plain floor goes on up to the foot of something upright.
 
-    mask, disparity, textured: (R, W); where nothing has texture, disparities are of noise. alike:
-    what looks like floor at half the resolution in both directions of the image, the shape of the
-    result.
+    mask: (R, W). alike, upright_px (`upright_above`): what looks like floor, and what stands, at
+    half the resolution in both directions of the image, the shape of the result.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
     open_ = alike & (small == NO_EVIDENCE)
     if not open_.any():
         return open_
-    contrary = ~compared.consistent[part] | compared.denied[part]
-    upright_px = _upright_above(disparity[part], contrary & textured[part])
     floor_px = compared.floor_px
     nearest, farthest = floor_px + np.float32(SAME_PX), np.float32(_BEHIND) * floor_px
     contact = (upright_px < nearest) & (upright_px > farthest - np.float32(SAME_PX))
@@ -277,12 +276,20 @@ def fill_to_contact(
     return open_ & starts & np.take_along_axis(contact, above, axis=0)
 
 
-def _upright_above(
-    disparity: NDArray[np.float32], contrary: NDArray[np.bool_]
+def upright_above(
+    view: FloorView,
+    disparity: NDArray[np.float32],
+    compared: Comparison,
+    textured: NDArray[np.bool_],
 ) -> NDArray[np.float32]:
-    """Return the disparity of the upright surface right above each pixel, NaN where none is."""
-    counted = (contrary & (disparity > 0)).astype(np.float32)
-    average, variance, share = surface_above(disparity, counted, (_COLUMNS, _ROWS), _GAP_ROWS)
+    """Return the disparity of the upright surface right above each pixel, NaN where none is, at
+    half the resolution in both directions of the image. disparity, textured: (R, W); where nothing
+    has texture, disparities are of noise.
+    """
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    contrary = ~compared.consistent[part] | compared.denied[part]
+    counted = (contrary & textured[part] & (disparity[part] > 0)).astype(np.float32)
+    average, variance, share = surface_above(disparity[part], counted, (_COLUMNS, _ROWS), _GAP_ROWS)
     good = (share >= _MIN_SHARE) & (variance < _MAX_SPREAD_PX**2)
     return np.where(good, average, np.float32(np.nan))
 

@@ -5,7 +5,7 @@ import pytest
 from floor_scenes import CAMERA, MOUNT
 
 from segfloor_ros.floor.disparity.profile import FloorLine, FloorProfile, FloorView
-from segfloor_ros.floor.mask.filling import fill_to_contact
+from segfloor_ros.floor.mask.filling import fill_to_contact, upright_above
 from segfloor_ros.floor.mask.pixel_evidence import Comparison
 from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
@@ -34,7 +34,8 @@ def filled(
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
     compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
-    result = fill_to_contact(view, mask, plain, disparity, compared, wall & has_texture)
+    upright_px = upright_above(view, disparity, compared, wall & has_texture)
+    result = fill_to_contact(view, mask, plain, upright_px, compared)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 
