@@ -260,10 +260,7 @@ class KnownMap:
         match = self._matcher.look(keyframe, images, anywhere, ~anywhere)
         match = match or self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
         is_possible = match is not None and self._is_possible(keyframe, match)
-        if not self._matcher.add(match if is_possible else None):
-            return False
-        matches = self._matcher.matches
-        return all(len(m.rows) for m in matches) or self._matcher.stands_alike(matches[-1])
+        return self._matcher.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
         if self._of_drive and not self._matcher.is_within_reach(match):
