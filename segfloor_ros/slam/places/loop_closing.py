@@ -39,14 +39,7 @@ from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognit
 from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
-from segfloor_ros.slam.sparse_map import (
-    LINK_SIGMA,
-    LOOP_FACTOR,
-    KeyframeRecord,
-    LoopEdge,
-    Match,
-    SparseMap,
-)
+from segfloor_ros.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
 from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
@@ -79,8 +72,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     new = [_edge(sparse_map, match) for match in matches]
     loops = [*sparse_map.loops, *new]
     T_loops = np.stack([loop.T_i_j for loop in loops])
-    factor = np.repeat([1.0, LOOP_FACTOR], [len(i), len(loops)])
-    sigma = factor[:, None] * np.repeat(LINK_SIGMA, 3)
+    of_links = np.tile(np.repeat(LINK_SIGMA, 3), (len(i), 1))
+    sigma = np.concatenate([of_links, [loop.sigma for loop in loops]])
     fixed = np.zeros(len(keyframes), bool)
     fixed[0] = True
     graph = PoseGraph(

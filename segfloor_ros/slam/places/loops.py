@@ -41,7 +41,14 @@ from segfloor_ros.slam.rig import (
     chi2_limit,
     in_view,
 )
-from segfloor_ros.slam.sparse_map import LINK_SIGMA, LOOP_FACTOR, KeyframeRecord, Match, SparseMap
+from segfloor_ros.slam.sparse_map import (
+    LINK_SIGMA,
+    LOOP_FACTOR,
+    KeyframeRecord,
+    Match,
+    SparseMap,
+    loop_sigma,
+)
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 
 DRIFT_PER_M = 0.04, 0.01
@@ -155,7 +162,7 @@ def objection_to_drift(keyframe: KeyframeRecord, match: Match, reach: tuple[floa
     and rad, or has not drifted; '' for nothing.
     """
     moved = match.T_camera_world @ keyframe.T_world_camera
-    if is_within(moved, (LOOP_FACTOR * LINK_SIGMA[0], LOOP_FACTOR * LINK_SIGMA[1])):
+    if is_within(moved, loop_sigma(by_floor=not len(match.rows))):
         return 'no drift'
     return '' if is_within(moved, reach) else 'more than drift'
 

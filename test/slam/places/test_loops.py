@@ -10,7 +10,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import plan_closing
-from segfloor_ros.slam.places.loops import PlaceMatcher
+from segfloor_ros.slam.places.loops import PlaceMatcher, objection_to_drift
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import PROOF, StereoSlamSettings
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
@@ -111,6 +111,21 @@ def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
     assert (graph.sigma[links:] > graph.sigma[:links].max(axis=0)).all()
     assert (graph.i[-1], graph.j[-1]) == (keyframes[-1].index, 0)
     np.testing.assert_allclose(graph.T_i_j[-1], relative, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('points', 'objection'), [(0, 'no drift'), (3, '')], ids=['by the floor', 'by points']
+)
+def test_a_turn_that_the_floor_cannot_measure_is_no_drift(closed, points, objection):
+    slam, _ = closed
+    keyframe = slam.map.keyframes[-1]
+    turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.3), 0.0]))
+    rows = np.arange(points)
+    pose = turn @ keyframe.T_camera_world
+    match = Match(keyframe.index, 0, pose, rows, rows.astype(np.int32), rows.astype(np.int32))
+    assert objection_to_drift(keyframe, match, (1.0, 1.0)) == objection
+    sigma_rad = plan_closing(slam.map, [match]).graph.sigma[-1, 3:]
+    assert ((sigma_rad > np.radians(0.3)) == (objection != '')).all()
 
 
 @pytest.mark.parametrize('is_bounded', [False, True])
