@@ -4,7 +4,7 @@
 
 Ten kinds of buildings, as many seeds as asked for. Sizes, furniture, textures and light follow from
 the seed; floors take turns. The robot drives there, turns on the spot and drives back. Measured of
-each drive, and kept in FOLDER/paths.jsonl and FOLDER/maps.jsonl:
+each drive, and kept beside it in paths.json and maps.json:
 
     path      error and loops; again at a focal length 1 % too long, with and without the floor
     session   the way back, in the map of the way there
@@ -46,6 +46,12 @@ from tools.driving import open_recording
 from tools.mechanisms import NOTHING, SLAM
 from tools.places import FALSE_M, Followed, is_false, tracked_poses, worse
 
+COLUMNS = (
+    'drive | floor | stretches driven back, known, loop closed | false loops | path, mm | '
+    '1 % off without, with | way back found from, s | frames | kidnaps within 2 s | facing back: '
+    'within 2 s, found | wrong | merged, mm | merged there and back, mm'
+)
+
 FLOOR = 'places by their floor'
 EVERY = slice(None)
 STRETCH_M, BESIDE_M = 1.5, 0.6
@@ -61,7 +67,7 @@ FOCAL_FACTOR = 1.01
 Maps = tuple[Followed, dict[int, MapFile]]
 """SLAM after the last frame, and the map as it was after some frames, by index."""
 
-Found = Iterator[tuple[int, float]]
+Found = Iterator[tuple[int, int, float]]
 Rows = NDArray[np.bool_] | slice
 
 
@@ -134,7 +140,8 @@ def measure_path(drive: Drive, followed: Followed, focal: float) -> dict[str, An
         if not wrong and frame in drive.back:
             stretch = int(drive.stretch[frame])
             seen['known'] += [stretch] * (candidate.verdict in ('seen', 'closed', 'no drift'))
-            seen['closed'] += [stretch] * (candidate.verdict == 'closed')
+            is_closed = any(edge.i == candidate.keyframe for edge in slam.map.loops)
+            seen['closed'] += [stretch] * is_closed
     driven = sorted({int(k) for k in drive.stretch[drive.back] if k >= 0})
     return {
         'rmse_m': _path_error_m(followed, drive, focal),
@@ -167,7 +174,7 @@ def _aligned_error_m(estimate: Array, truth: Array, by: Rows = EVERY, of: Rows =
 def measure_session(drive: Drive, saved: MapFile) -> dict[str, Any]:
     """Return how the way back is found in a map that begins with the first frame of the drive."""
     found = list(_found(drive, saved, [drive.frames[k] for k in drive.back]))
-    errors = np.array([error for _, error in found])
+    errors = np.array([error for *_, error in found])
     first = found[0][0] if found else -1
     return {
         'first_frame': first - drive.back[0] if found else -1,
@@ -178,14 +185,15 @@ def measure_session(drive: Drive, saved: MapFile) -> dict[str, Any]:
 
 
 def _found(drive: Drive, saved: MapFile, frames: list[StereoFrame]) -> Found:
-    """Yield frames, by index, that are found in a map, and how far off."""
+    """Yield frames that are found in a map: after which frame, which one, and how far off."""
     slam = make_slam(drive.camera, resolve().stereo_slam)
     load_slam(slam, drive.camera, saved, 'map')
     for frame in frames:
         for result in slam.process(frame):
             if result.tracked and not result.outside:
                 assert slam.mount is not None
-                yield result.index, _error_m(slam.mount.T_base_left, result, drive.truth)
+                error_m = _error_m(slam.mount.T_base_left, result, drive.truth)
+                yield frame.index, result.index, error_m
 
 
 def _error_m(T_base_left: Array, result: FrameResult, truth: Array) -> float:
@@ -194,14 +202,15 @@ def _error_m(T_base_left: Array, result: FrameResult, truth: Array) -> float:
 
 
 def measure_kidnaps(drive: Drive, saved: MapFile, rows: range) -> dict[str, Any]:
-    """Return how soon a camera is found that begins somewhere in a known map."""
-    last = rows[-1] - int(PATIENCE_S / 2 * _rate_hz(drive))
-    took_s, wrong = [], 0
+    """Return how soon a camera is found that begins somewhere in a known map: not in the last
+    third of the frames, where the way back leaves what was seen on the way there.
+    """
+    took_s, wrong, last = [], 0, rows[2 * len(rows) // 3]
     for number, start in enumerate(np.linspace(rows[0], last, KIDNAPS).astype(int)):
         end = min(rows[-1] + 1, start + int(PATIENCE_S * _rate_hz(drive)))
         frames = list(worse(drive.frames[start:end], 1, NOISE, number))
         found = _found(drive, saved, frames)
-        index, error = next(found, (None, 0.0))
+        index, _, error = next(found, (None, None, 0.0))
         took_s.append((index - start) / _rate_hz(drive) if index is not None else float('inf'))
         wrong += error > FALSE_M
     return {'took_s': np.round(took_s, 2).tolist(), 'wrong': wrong}
@@ -270,6 +279,33 @@ def measure_maps(drive: Drive, folder: Path) -> dict[str, Any]:
     }
 
 
+def row(values: dict[str, Any]) -> str:
+    """Return a row of the table."""
+    path, focal, session = values['path'], values['focal'], values['session']
+    same, back = (np.array(values[name]['took_s']) for name in ('kidnaps', 'kidnaps_back'))
+    false = sum(
+        count
+        for name in ('path', 'focal')
+        for verdict, count in values[name]['verdicts'].items()
+        if verdict == 'closed: FALSE'
+    )
+    merges = (
+        f'{1e3 * merge["rmse_m"]:.0f}' if merge['merged'] else '–'
+        for merge in (values['merge'], values['merge_back'])
+    )
+    known = ', '.join(str(focal[name]) for name in ('stretches', 'known', 'closed_in'))
+    errors = (1e3 * run['rmse_m'] for run in (path, values['focal_without'], focal))
+    path_mm, without_mm, with_mm = (f'{error:.0f}' for error in errors)
+    wrong = session['wrong'] + values['kidnaps']['wrong'] + values['kidnaps_back']['wrong']
+    first = f'{session["first_frame"] / 5:.1f}' if session['first_frame'] >= 0 else '–'
+    return (
+        f'{values["drive"]} | {values["floor"]} | {known} | {false} | {path_mm} | {without_mm}, '
+        f'{with_mm} | {first} | {100 * session["found_share"]:.0f} % | {(same <= 2).sum()} of '
+        f'{len(same)} | {(back <= 2).sum()}, {np.isfinite(back).sum()} of {len(back)} | {wrong} | '
+        + ' | '.join(merges)
+    )
+
+
 PARTS = {'paths': measure_paths, 'maps': measure_maps}
 
 
@@ -281,21 +317,20 @@ def main(
     """Render the drives and measure what is not in the results yet."""
     cv2.setNumThreads(1)
     folder.mkdir(parents=True, exist_ok=True)
+    print(COLUMNS)
     for seed in range(1, seeds + 1):
         for kind in only or KINDS:
             name, drive = f'{kind}_{seed}', None
             scene, way = make_building(kind, seed)
+            values = {'drive': name, 'floor': scene['floor']['texture']}
             for part, measure in PARTS.items():
-                kept = folder / f'{part}.jsonl'
-                if kept.exists() and f'"{name}"' in kept.read_text():
-                    continue
-                render_once(scene_from_mapping(scene, name), folder / name)
-                drive = drive or open_drive(folder / name, np.array(way))
-                values = {'drive': name, 'floor': scene['floor']['texture']}
-                line = json.dumps(values | measure(drive, folder / name))
-                with kept.open('a') as file:
-                    file.write(line + '\n')
-                print(line, flush=True)
+                kept = folder / name / f'{part}.json'
+                if not kept.exists():
+                    render_once(scene_from_mapping(scene, name), folder / name)
+                    drive = drive or open_drive(folder / name, np.array(way))
+                    kept.write_text(json.dumps(measure(drive, folder / name)))
+                values |= json.loads(kept.read_text())
+            print(row(values), flush=True)
 
 
 if __name__ == '__main__':
