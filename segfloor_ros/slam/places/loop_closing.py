@@ -102,10 +102,13 @@ def solve_closing(closing: Closing) -> tuple[Array, Array]:
 
 def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, Array]) -> bool:
     """Bring a closed loop into the map, which has had no new keyframe since. False, and nothing
-    moves, where the loop contradicts the rest of the map: it switches an earlier one off.
+    moves, where the loop contradicts the rest of the map: it switches an earlier one off that was
+    on so far.
     """
     poses, weight = result
-    if weight.min() < _robust_share(chi2_limit(6)) ** 2:
+    graph, least = closing.graph, _robust_share(chi2_limit(6)) ** 2
+    so_far, _ = _robust(graph, _errors(graph, graph.T_camera_world), graph.T_camera_world)
+    if ((weight < least) & (so_far >= least)).any():
         return False
     move_keyframes(sparse_map, poses)
     sparse_map.loops += closing.edges
