@@ -53,7 +53,6 @@ COLUMNS = (
 )
 
 FLOOR = 'places by their floor'
-EVERY = slice(None)
 STRETCH_M, BESIDE_M = 1.5, 0.6
 """The shortest straight part of a way that counts, and how far beside it the robot may be."""
 
@@ -68,7 +67,6 @@ Maps = tuple[Followed, dict[int, MapFile]]
 """SLAM after the last frame, and the map as it was after some frames, by index."""
 
 Found = Iterator[tuple[int, int, float]]
-Rows = NDArray[np.bool_] | slice
 
 
 @dataclass(frozen=True)
@@ -165,10 +163,10 @@ def _path_error_m(followed: Followed, drive: Drive, focal: float) -> float:
     return _aligned_error_m(path.poses[:, :3, 3] / focal, truth)
 
 
-def _aligned_error_m(estimate: Array, truth: Array, by: Rows = EVERY, of: Rows = EVERY) -> float:
-    """Return the RMSE of some of places (N, 3) once others of them are laid on the truth."""
-    off = transform_points(rigid_alignment(estimate[by], truth[by]), estimate) - truth
-    return float(np.sqrt((off[of] ** 2).sum(axis=1).mean()))
+def _aligned_error_m(estimate: Array, truth: Array) -> float:
+    """Return the RMSE of places (N, 3) once they are laid on the truth."""
+    off = transform_points(rigid_alignment(estimate, truth), estimate) - truth
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 def measure_session(drive: Drive, saved: MapFile) -> dict[str, Any]:
@@ -221,9 +219,7 @@ def _rate_hz(drive: Drive) -> float:
 
 
 def measure_merge(drive: Drive, first: MapFile, second: MapFile) -> dict[str, Any]:
-    """Return the error of a map that was made of two, and that of the second where the first is
-    laid on the truth; none where they stay two.
-    """
+    """Return the error of a map that was made of two; none where they stay two."""
     a, b = first.parts[PART], second.parts[PART]
     stamps = np.concatenate([a['keyframe_stamp_ns'], b['keyframe_stamp_ns']]).tolist()
     later = {
@@ -238,12 +234,7 @@ def measure_merge(drive: Drive, first: MapFile, second: MapFile) -> dict[str, An
         return {'merged': False}
     estimate = invert(merged['keyframe_T_camera_world'].astype(float))[:, :3, 3]
     truth = drive.truth[[drive.index[ns] for ns in stamps], :3, 3]
-    of_first = np.arange(len(truth)) < len(a['keyframe_stamp_ns'])
-    return {
-        'merged': True,
-        'rmse_m': _aligned_error_m(estimate, truth),
-        'second_m': _aligned_error_m(estimate, truth, of_first, ~of_first),
-    }
+    return {'merged': True, 'rmse_m': _aligned_error_m(estimate, truth)}
 
 
 def measure_paths(drive: Drive, folder: Path) -> dict[str, Any]:
