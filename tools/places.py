@@ -32,6 +32,7 @@ from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_tra
 from segfloor_ros.files.results import from_bytes, to_bytes
 from segfloor_ros.geometry import Array, invert, rotation_angle
 from segfloor_ros.pipeline import make_slam
+from segfloor_ros.slam.places.loops import Candidate
 from segfloor_ros.slam.results import FrameResult, KeyframePath
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
 from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -80,16 +81,31 @@ class Followed:
     def score(self, recording: Path) -> TrajectoryScore:
         """Return the error of the camera's path, every frame carried along by its keyframe."""
         assert self.path is not None and self.slam.mount is not None
-        poses = [
-            TrackedPose(r.stamp_ns, r.T_odom_base, r.reference_keyframe_ns)
-            for r in self.results
-            if r.tracked
-        ]
-        path = corrected_trajectory(poses, self.path).seen_from(self.slam.mount.T_base_left)
+        path = corrected_trajectory(tracked_poses(self.results), self.path).seen_from(
+            self.slam.mount.T_base_left
+        )
         estimate = 1e-9 * path.stamp_ns, path.poses
         return score_trajectory(
             match(estimate, read_trajectory(recording / 'poses.txt'), len(self.results))
         )
+
+
+def tracked_poses(results: Iterable[FrameResult]) -> list[TrackedPose]:
+    """Return the poses of the frames that were tracked."""
+    return [
+        TrackedPose(r.stamp_ns, r.T_odom_base, r.reference_keyframe_ns)
+        for r in results
+        if r.tracked
+    ]
+
+
+def is_false(slam: StereoSlam, truth: Array, candidate: Candidate) -> bool:
+    """Whether a keyframe that saw a place truly (N, 4, 4) stood somewhere else."""
+    now, then = (
+        truth[slam.map.keyframes[k].frame_index] for k in (candidate.keyframe, candidate.place)
+    )
+    error = invert(invert(now) @ then) @ candidate.T_keyframe_place
+    return bool(np.linalg.norm(error[:3, 3]) > FALSE_M or rotation_angle(error[:3, :3]) > FALSE_RAD)
 
 
 def worse(
@@ -126,14 +142,7 @@ def loops(
         _, truth = read_trajectory(drive / 'poses.txt')
         verdicts: Counter[str] = Counter()
         for candidate in slam.back_end.loops.candidates:
-            now, then = (
-                truth[slam.map.keyframes[k].frame_index]
-                for k in (candidate.keyframe, candidate.place)
-            )
-            error = invert(invert(now) @ then) @ candidate.T_keyframe_place
-            wrong = (
-                np.linalg.norm(error[:3, 3]) > FALSE_M or rotation_angle(error[:3, :3]) > FALSE_RAD
-            )
+            wrong = is_false(slam, truth, candidate)
             verdicts[f'{candidate.verdict}: {"FALSE" if wrong else "true"}'] += 1
         score = followed.score(drive)
         print(

@@ -212,6 +212,15 @@ LINK_SIGMA, LOOP_FACTOR = (0.01, 0.002), 2.0
 units of it; how far from each other they stand does not matter. What is no larger than that of a
 loop is no drift."""
 
+FLOOR_SIGMA = 0.02, 0.006
+"""That of a loop by the floor alone: some tens of corners within a metre say less of how far the
+camera has turned, and what the mount is off tilts views from opposite sides by twice as much."""
+
+
+def loop_sigma(by_floor: bool) -> tuple[float, float]:
+    """Return the error of a loop, m and rad."""
+    return FLOOR_SIGMA if by_floor else (LOOP_FACTOR * LINK_SIGMA[0], LOOP_FACTOR * LINK_SIGMA[1])
+
 
 @dataclass(frozen=True)
 class LoopEdge:
@@ -223,6 +232,11 @@ class LoopEdge:
     j: int
     T_i_j: Array
     by_floor: bool = False
+
+    @property
+    def sigma(self) -> Array:
+        """Its error (6,), m and rad."""
+        return np.repeat(loop_sigma(self.by_floor), 3)
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from segfloor_ros.slam.rig import (
     with_moment,
 )
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
-from segfloor_ros.slam.sparse_map import LINK_SIGMA, LOOP_FACTOR, KeyframeRecord, LoopEdge
+from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
@@ -356,10 +356,11 @@ def factors_of(
 
 def loop_factors(loops: Sequence[LoopEdge], slot: NDArray[np.intp]) -> tuple[Factor, ...]:
     """Return the loops that were closed by the floor alone: no points hold them together."""
-    covariance = np.diag((LOOP_FACTOR * np.repeat(LINK_SIGMA, 3)) ** 2)
     ends = ((int(slot[loop.j]), int(slot[loop.i]), loop) for loop in loops if loop.by_floor)
     return tuple(
-        Link(j, i, RelativeMotion(loop.T_i_j, covariance)) for j, i, loop in ends if min(i, j) >= 0
+        Link(j, i, RelativeMotion(loop.T_i_j, np.diag(loop.sigma**2)))
+        for j, i, loop in ends
+        if min(i, j) >= 0
     )
 
 

@@ -39,14 +39,7 @@ from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognit
 from segfloor_ros.slam.results import NO_POINT, PROOF
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
-from segfloor_ros.slam.sparse_map import (
-    LINK_SIGMA,
-    LOOP_FACTOR,
-    KeyframeRecord,
-    LoopEdge,
-    Match,
-    SparseMap,
-)
+from segfloor_ros.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
 from segfloor_ros.slam.tracking.images import Features
 from segfloor_ros.slam.tracking.map_tracking import Pixels
 from segfloor_ros.slam.tracking.pose import CONVERGED
@@ -79,8 +72,8 @@ def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
     new = [_edge(sparse_map, match) for match in matches]
     loops = [*sparse_map.loops, *new]
     T_loops = np.stack([loop.T_i_j for loop in loops])
-    factor = np.repeat([1.0, LOOP_FACTOR], [len(i), len(loops)])
-    sigma = factor[:, None] * np.repeat(LINK_SIGMA, 3)
+    of_links = np.tile(np.repeat(LINK_SIGMA, 3), (len(i), 1))
+    sigma = np.concatenate([of_links, [loop.sigma for loop in loops]])
     fixed = np.zeros(len(keyframes), bool)
     fixed[0] = True
     graph = PoseGraph(
@@ -109,10 +102,13 @@ def solve_closing(closing: Closing) -> tuple[Array, Array]:
 
 def apply_closing(sparse_map: SparseMap, closing: Closing, result: tuple[Array, Array]) -> bool:
     """Bring a closed loop into the map, which has had no new keyframe since. False, and nothing
-    moves, where the loop contradicts the rest of the map: it switches an earlier one off.
+    moves, where the loop contradicts the rest of the map: it switches an earlier one off that was
+    on so far.
     """
     poses, weight = result
-    if weight.min() < _robust_share(chi2_limit(6)) ** 2:
+    graph, least = closing.graph, _robust_share(chi2_limit(6)) ** 2
+    so_far, _ = _robust(graph, _errors(graph, graph.T_camera_world), graph.T_camera_world)
+    if ((weight < least) & (so_far >= least)).any():
         return False
     move_keyframes(sparse_map, poses)
     sparse_map.loops += closing.edges
@@ -260,10 +256,7 @@ class KnownMap:
         match = self._matcher.look(keyframe, images, anywhere, ~anywhere)
         match = match or self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
         is_possible = match is not None and self._is_possible(keyframe, match)
-        if not self._matcher.add(match if is_possible else None):
-            return False
-        matches = self._matcher.matches
-        return all(len(m.rows) for m in matches) or self._matcher.stands_alike(matches[-1])
+        return self._matcher.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
         if self._of_drive and not self._matcher.is_within_reach(match):

@@ -9,6 +9,7 @@ on drift and floor, and see the same space from both sides.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,23 @@ from segfloor_ros.slam.places.views import (
     views_near,
 )
 from segfloor_ros.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME
-from segfloor_ros.slam.rig import GATE, MIN_DEPTH_M, NEIGHBOURS, SAME_PX, chi2_limit, in_view
-from segfloor_ros.slam.sparse_map import LINK_SIGMA, LOOP_FACTOR, KeyframeRecord, Match, SparseMap
+from segfloor_ros.slam.rig import (
+    GATE,
+    LOCAL_KEYFRAMES,
+    MIN_DEPTH_M,
+    NEIGHBOURS,
+    SAME_PX,
+    chi2_limit,
+    in_view,
+)
+from segfloor_ros.slam.sparse_map import (
+    LINK_SIGMA,
+    LOOP_FACTOR,
+    KeyframeRecord,
+    Match,
+    SparseMap,
+    loop_sigma,
+)
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 
 DRIFT_PER_M = 0.04, 0.01
@@ -146,7 +162,7 @@ def objection_to_drift(keyframe: KeyframeRecord, match: Match, reach: tuple[floa
     and rad, or has not drifted; '' for nothing.
     """
     moved = match.T_camera_world @ keyframe.T_world_camera
-    if is_within(moved, (LOOP_FACTOR * LINK_SIGMA[0], LOOP_FACTOR * LINK_SIGMA[1])):
+    if is_within(moved, loop_sigma(by_floor=not len(match.rows))):
         return 'no drift'
     return '' if is_within(moved, reach) else 'more than drift'
 
@@ -209,19 +225,25 @@ class PlaceMatcher:
 
     def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> Match | None:
         """Look for the floor of the first of known keyframes (N,), by index, from whatever side;
-        None where they do not agree.
+        None where they do not agree. Floors repeat themselves: where no drift limits where the
+        place is, more of them are tried, and those count where what stands around the keyframe
+        stands, too.
         """
         mount, found = self._map.rig.mount, list[Match]()
         if mount is None:
             return None
+        is_bounded = self._known is self._map
         nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
-        for place in places[:PROOF].tolist():
+        for place in places[: PROOF if is_bounded else LOCAL_KEYFRAMES].tolist():
             known = self._known.keyframes[place]
             T_base_place = motion_between(keyframe.ground, known.ground, mount.height_m)
-            if T_base_place is not None:
-                T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
-                pose = T_camera_place @ known.T_camera_world
-                found.append(Match(keyframe.index, place, pose, *nothing))
+            if T_base_place is None:
+                continue
+            T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
+            pose = T_camera_place @ known.T_camera_world
+            match = Match(keyframe.index, place, pose, *nothing)
+            if is_bounded or self.stands_alike(match):
+                found.append(match)
         agree = found and all(self.agree(match, found[0]) for match in found[1:])
         return found[0] if agree else None
 
@@ -284,16 +306,22 @@ class PlaceMatcher:
         assert mount is not None
         recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
         own = upright(self._map, mount, self._map.points_of(recent))
-        known = cKDTree(upright(self._known, mount, np.flatnonzero(self._known.alive)))
         own = transform_points(invert(drift(self._map, match)), own)
         reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
         along, aside, _ = mount.T_base_left[:3, :3]
         angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
         ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
         shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
-        gaps_m, _ = known.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
         here, *beside = np.isfinite(gaps_m).sum(axis=0)
         return bool(here >= ENOUGH and here - np.sqrt(here) > max(beside) + np.sqrt(max(beside)))
+
+    @cached_property
+    def _upright(self) -> cKDTree:
+        """What stands in the known map, once it does not change any more."""
+        assert self._map.rig.mount is not None
+        alive = np.flatnonzero(self._known.alive)
+        return cKDTree(upright(self._known, self._map.rig.mount, alive))
 
     def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
         """Whether the keyframe's own points lie where the place's keyframe sees what they match."""

@@ -96,16 +96,36 @@ BEGIN = [planar_pose(3.5, 0.05, np.pi)] * 16
 TO_IT = BEGIN + [planar_pose(3.5 - 0.15 * k, 0.05, np.pi) for k in range(1, 18)]
 
 
+FLOOR = StereoRoom(0).textures[4]
+REPEATED = np.tile(FLOOR[:200, :200], (5, 5))
+"""Every 2 m, as tiles of a carpet do."""
+
+
 @pytest.fixture(scope='module')
-def there():
-    """The map of a corridor that is driven in one direction."""
+def corridor():
+    """A room that is 9 m long and 2 m wide."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stereo_room, 'ROOM_MIN', np.array([-3.0, -1.0, 0.0]))
         patch.setattr(stereo_room, 'ROOM_MAX', np.array([6.0, 1.0, 2.4]))
-        room, slam = StereoRoom(0), StereoSlam(CAMERA, SETTINGS, MOUNT)
-        for k, pose in enumerate(IN_CORRIDOR):
-            slam.process(room.frame(k, pose))
-        yield slam, from_bytes(to_bytes(save_slam(slam, CAMERA)), 'there.map')
+        yield
+
+
+def driven_there(floor):
+    slam, room = StereoSlam(CAMERA, SETTINGS, MOUNT), StereoRoom(0, floor=floor)
+    for k, pose in enumerate(IN_CORRIDOR):
+        slam.process(room.frame(k, pose))
+    return slam, from_bytes(to_bytes(save_slam(slam, CAMERA)), 'there.map')
+
+
+@pytest.fixture(scope='module')
+def there(corridor):
+    """The map of a corridor that is driven in one direction."""
+    return driven_there(FLOOR)
+
+
+@pytest.fixture(scope='module')
+def there_on_tiles(corridor):
+    return driven_there(REPEATED)
 
 
 def test_views_of_the_floor_are_saved(there):
@@ -128,10 +148,15 @@ def test_maps_of_earlier_releases_have_no_views_of_the_floor(there):
 @pytest.mark.parametrize(
     ('seed', 'is_known'), [(0, True), (2, False)], ids=['there', 'same floor, other walls']
 )
-def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(there, seed, is_known):
+@pytest.mark.parametrize(
+    ('name', 'floor'), [('there', FLOOR), ('there_on_tiles', REPEATED)], ids=['', 'repeated']
+)
+def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(
+    request, name, floor, seed, is_known
+):
     slam, results = StereoSlam(CAMERA, SETTINGS, MOUNT), []
-    load_slam(slam, CAMERA, there[1], 'there.map')
-    room = StereoRoom(seed, floor=StereoRoom(0).textures[4])
+    load_slam(slam, CAMERA, request.getfixturevalue(name)[1], 'there.map')
+    room = StereoRoom(seed, floor=floor)
     for k, pose in enumerate(TO_IT):
         results += slam.process(room.frame(k, pose))
     assert (slam.back_end.submap is Submap.KNOWN) == is_known

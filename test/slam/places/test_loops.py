@@ -9,12 +9,12 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
-from segfloor_ros.slam.places.loop_closing import plan_closing
-from segfloor_ros.slam.places.loops import PlaceMatcher
+from segfloor_ros.slam.places.loop_closing import apply_closing, plan_closing, solve_closing
+from segfloor_ros.slam.places.loops import PlaceMatcher, objection_to_drift
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import PROOF, StereoSlamSettings
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
-from segfloor_ros.slam.sparse_map import Match, SparseMap
+from segfloor_ros.slam.sparse_map import LoopEdge, Match, SparseMap
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)
@@ -111,6 +111,43 @@ def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
     assert (graph.sigma[links:] > graph.sigma[:links].max(axis=0)).all()
     assert (graph.i[-1], graph.j[-1]) == (keyframes[-1].index, 0)
     np.testing.assert_allclose(graph.T_i_j[-1], relative, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('off_m', 'correction_m', 'is_closed'),
+    [(0.0, 0.05, True), (0.0, 0.6, False), (1.0, 0.05, True)],
+    ids=['fits', 'switches a loop off', 'that was off before'],
+)
+def test_a_loop_that_switches_an_earlier_one_off_is_not_closed(
+    closed, off_m, correction_m, is_closed
+):
+    sparse_map = SparseMap(closed[0].rig)
+    fill_map(sparse_map, map_to_arrays(closed[0].map))
+    last, none = sparse_map.keyframes[-1], np.zeros(0, np.int32)
+
+    def moved_by(x_m):
+        return se3_exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ last.T_camera_world
+
+    first = sparse_map.keyframes[0].T_world_camera
+    sparse_map.loops = [LoopEdge(last.index, 0, moved_by(off_m) @ first)]
+    match = Match(last.index, 0, moved_by(correction_m), none.astype(np.intp), none, none)
+    closing = plan_closing(sparse_map, [match])
+    assert apply_closing(sparse_map, closing, solve_closing(closing)) == is_closed
+
+
+@pytest.mark.parametrize(
+    ('points', 'objection'), [(0, 'no drift'), (3, '')], ids=['by the floor', 'by points']
+)
+def test_a_turn_that_the_floor_cannot_measure_is_no_drift(closed, points, objection):
+    slam, _ = closed
+    keyframe = slam.map.keyframes[-1]
+    turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.3), 0.0]))
+    rows = np.arange(points)
+    pose = turn @ keyframe.T_camera_world
+    match = Match(keyframe.index, 0, pose, rows, rows.astype(np.int32), rows.astype(np.int32))
+    assert objection_to_drift(keyframe, match, (1.0, 1.0)) == objection
+    sigma_rad = plan_closing(slam.map, [match]).graph.sigma[-1, 3:]
+    assert ((sigma_rad > np.radians(0.3)) == (objection != '')).all()
 
 
 @pytest.mark.parametrize('is_bounded', [False, True])
