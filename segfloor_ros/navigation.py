@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -100,8 +101,8 @@ class Costmap:
 
     obstacles: points (N, 2) in the map that are in the way, too. driven: points (M, 2) where the
     robot has been, the last one now: floor unless the map says otherwise. blind_m: around the
-    first of them it cannot see the floor. comfort_m: nearer to an obstacle than this a way counts
-    more, up to three times.
+    first of them it cannot see the floor until it has been further away. comfort_m: nearer to an
+    obstacle than this a way counts more, up to three times.
     """
 
     def __init__(
@@ -114,7 +115,9 @@ class Costmap:
         blind_m: float,
     ) -> None:
         self.grid = grid
-        trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
+        trodden = self._discs(driven, radius_m)
+        if np.hypot(*(driven - driven[0]).T).max() <= blind_m:
+            trodden |= self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
         standing = (grid.cells >= OCCUPIED) | marked
@@ -154,6 +157,11 @@ class Costmap:
         away_m = np.hypot(*(self.grid.centres_of(self._cells) - point).T)
         nearest = int(np.argmin(away_m))
         return nearest, float(away_m[nearest])
+
+    def cost_to(self, ways: Ways, point: Array) -> float:
+        """Return the cost of the way to a point (2,), inf where there is none."""
+        number, away_m = self.nearest_place(point)
+        return float(ways.cost[number]) if away_m < self._radius_m else np.inf
 
     def least_room_m(self, pose: Array, point: Array) -> float:
         """Return how near what may be in the way comes to the arc that leads from a pose x, y, yaw
@@ -247,7 +255,7 @@ STOP = (0.0, 0.0)
 @dataclass
 class Explorer:
     """Decides how to drive, from what is known of map, obstacles and free floor. goals: how
-    many to draw at random once everything is explored, or which.
+    many to draw at random once everything is explored, the nearest of them first, or which.
     """
 
     body: Body
@@ -359,13 +367,16 @@ class Explorer:
             if self._target is None and self._tries >= MOST_TRIES:
                 self._begin_goals(driven)
         if self.phase == 'driving':
+            if self._target is None and isinstance(self.goals, int) and ways is not None:
+                cost = partial(costmap.cost_to, ways)
+                self._ahead.sort(key=lambda goal: (goal.was_blocked, cost(goal.point)))
             self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
             self.phase = 'driving' if self._ahead else 'done'
         self.path = np.zeros((0, 2))
         if ways is None or self._target is None:
             return
-        number, away_m = costmap.nearest_place(self._target)
-        if np.isfinite(ways.cost[number]) and away_m < radius_m:
+        number, _ = costmap.nearest_place(self._target)
+        if np.isfinite(costmap.cost_to(ways, self._target)):
             way = self.grid.centres_of(ways.cells[ways.to(number)])
             self.path = np.vstack([way, self._target])
 

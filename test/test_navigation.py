@@ -99,6 +99,16 @@ def test_where_the_robot_stands_is_free_and_what_it_cannot_see_before_it() -> No
     assert not costmap.places[5, 8]
 
 
+def test_what_it_could_not_see_at_its_start_is_unknown_once_it_has_been_further_away() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[1:10, 1:10] = UNKNOWN
+    start = (0.55, 0.55)
+    for driven, is_free in (([start, (0.95, 0.55)], True), ([start, (1.15, 0.55), start], False)):
+        costmap = Costmap(grid, 0.15, 0.3, NOTHING, np.array(driven), 0.45)
+        assert costmap.free[5, 1] == is_free
+        assert is_free or costmap.frontiers()
+
+
 def test_frontiers_are_places_a_radius_away_from_unknown_floor_but_not_from_slits() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[1:4, 1] = UNKNOWN
@@ -307,6 +317,23 @@ def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way(
     drive.go_on(20.0)
     assert explorer.phase == 'driving'
     assert any(goal.point[0] > 1.5 for goal in explorer._ahead)
+
+
+def test_of_drawn_goals_the_nearest_is_next_and_one_without_a_way_waits_for_the_others() -> None:
+    explorer = Explorer(BODY, 20, seed=1)
+    drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)
+    while explorer.phase == 'exploring':
+        drive.go_on(drive.time_s + 0.2)
+    nearest = min(explorer._ahead, key=lambda g: np.hypot(*(g.point - drive.pose[:2])))
+    assert explorer.goal is nearest
+    shut = drive.truth.cells[3:7, 13]
+    shut[:] = OCCUPIED
+    while any(goal.point[0] < 1.3 for goal in explorer._ahead):
+        drive.go_on(drive.time_s + 0.2)
+    assert all(goal.is_reached and goal.point[0] < 1.3 for goal in explorer.ended)
+    shut[:] = FREE
+    drive.go_on(drive.time_s + 100)
+    assert [goal.is_reached for goal in explorer.ended] == [True] * 20
 
 
 def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:
