@@ -36,6 +36,9 @@ free."""
 
 ARRIVED_M = 0.15
 
+FAR_M = 1e6
+"""What nothing leads to is further than anything else."""
+
 LOOK_S = 3.0
 """So long the robot stands and looks where it does not know where it is; then it turns back to
 where it came from, where the map is."""
@@ -163,6 +166,16 @@ class Costmap:
         number, away_m = self.nearest_place(point)
         return float(ways.cost[number]) if away_m < self._radius_m else np.inf
 
+    def nearest_in_reach(self, ways: Ways, point: Array) -> tuple[int, bool]:
+        """Return the number of the place in reach that is nearest to a point (2,), and whether it
+        is the place of that point.
+        """
+        if np.isfinite(self.cost_to(ways, point)):
+            return self.nearest_place(point)[0], True
+        in_reach = np.flatnonzero(np.isfinite(ways.cost))
+        away_m = np.hypot(*(self.grid.centres_of(self._cells[in_reach]) - point).T)
+        return int(in_reach[np.argmin(away_m)]), False
+
     def least_room_m(self, pose: Array, point: Array) -> float:
         """Return how near what may be in the way comes to the arc that leads from a pose x, y, yaw
         to a point (2,).
@@ -273,9 +286,11 @@ class Explorer:
         self._rng = np.random.default_rng(self.seed)
         self._ahead: list[Goal] = [] if isinstance(self.goals, int) else list(self.goals)
         self._driven: list[Array] = []
-        self._given_up: list[Array] = []
+        self._explores, self._is_drawn = self.phase == 'exploring', False
+        self._given_up: list[tuple[Array, float]] = []
         self._target: Array | None = None
         self._facing: Array = np.zeros(2)
+        self._is_in_reach = True
         self._planned_s = -np.inf
         self._faced_s: float | None = None
         self._progress_s = 0.0
@@ -362,23 +377,32 @@ class Explorer:
         driven = np.array([*self._driven, pose[:2]])
         self._costmap = costmap = Costmap.around(self.body, self.grid, self.obstacles, driven)
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
-        if ways is not None and self.phase == 'exploring':
-            self._aim_at(time_s, self._frontier(costmap, ways, pose))
-            if self._target is None and self._tries >= MOST_TRIES:
-                self._begin_goals(driven)
+        if ways is not None and self._explores and (self.goal is None or self._target is None):
+            self._explore(time_s, self._frontier(costmap, ways, pose), driven)
         if self.phase == 'driving':
             if self._target is None and isinstance(self.goals, int) and ways is not None:
                 cost = partial(costmap.cost_to, ways)
                 self._ahead.sort(key=lambda goal: (goal.was_blocked, cost(goal.point)))
             self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
             self.phase = 'driving' if self._ahead else 'done'
-        self.path = np.zeros((0, 2))
+        self.path, self._is_in_reach = np.zeros((0, 2)), True
         if ways is None or self._target is None:
             return
-        number, _ = costmap.nearest_place(self._target)
-        if np.isfinite(costmap.cost_to(ways, self._target)):
-            way = self.grid.centres_of(ways.cells[ways.to(number)])
-            self.path = np.vstack([way, self._target])
+        number, self._is_in_reach = costmap.nearest_in_reach(ways, self._target)
+        way = self.grid.centres_of(ways.cells[ways.to(number)])
+        self.path = np.vstack([way, self._target]) if self._is_in_reach else way
+
+    def _explore(self, time_s: float, frontier: Array | None, driven: Array) -> None:
+        """Drive to a frontier; without any turn to see more, then drive to goals. Before each of
+        them whatever has become a frontier since is next.
+        """
+        if frontier is not None or not self._is_drawn:
+            self.phase = 'exploring'
+            self._aim_at(time_s, frontier)
+            if frontier is None and self._tries >= MOST_TRIES:
+                self._begin_goals(driven)
+        elif self.phase == 'exploring':
+            self._begin_goals(driven)
 
     def _turning_m(self, points: Array, pose: Array) -> Array:
         """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
@@ -391,8 +415,11 @@ class Explorer:
         for cells in costmap.frontiers():
             points = costmap.grid.centres_of(cells)
             cost = ways.cost[costmap.numbers_of(cells)] + self._turning_m(points, pose)
-            for given_up in self._given_up:
-                cost = np.where(np.hypot(*(points - given_up).T) < 2 * least, np.inf, cost)
+            beyond = ~np.isfinite(cost)  # those come last
+            cost[beyond] = FAR_M + np.hypot(*(points[beyond] - pose[:2]).T)
+            for given_up, goals in self._given_up:
+                is_near = np.hypot(*(points - given_up).T) < 2 * least
+                cost = np.where(is_near & (len(self.ended) <= goals), np.inf, cost)
             if self._target is not None:
                 is_same = np.hypot(*(points - self._target).T) < 2 * least
                 cost = np.where(is_same, cost - 1.0, cost)
@@ -409,16 +436,20 @@ class Explorer:
         """Everything is explored: draw the goals, wherever the map leads; what stands in the way
         now may go.
         """
-        self.phase, self._tries = 'driving', 0
+        self.phase, self._tries, self._is_drawn, self._target = 'driving', 0, True, None
         if isinstance(self.goals, int):
             assert self.grid is not None
             costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
             ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
-            drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
+            known = [*self.ended, *(goal for goal in self._ahead if goal.was_blocked)]
+            count = min(self.goals - len(known), len(places))
+            drawn = self._rng.choice(len(places), count, replace=False)
             points = costmap.grid.centres_of(places[drawn])
-            self._ahead = [Goal(point, f'goal_{i + 1}') for i, point in enumerate(points)]
+            names = (f'goal_{number}' for number in range(len(known) + 1, self.goals + 1))
+            self._ahead = [goal for goal in self._ahead if goal.was_blocked]
+            self._ahead += map(Goal, points, names)
 
     def _aim_at(self, time_s: float, target: Array | None) -> None:
         is_same = (
@@ -444,6 +475,8 @@ class Explorer:
         way_out = self._costmap.way_out(pose)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
+        if not self._is_in_reach and not (np.hypot(*(self.path[-1:] - pose[:2]).T) > ARRIVED_M).any():
+            return self._look_at(self._target, LOOK_S, time_s, pose)
         return self._pursue(pose) if len(self.path) else STOP
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
@@ -452,13 +485,19 @@ class Explorer:
         if self.phase == 'driving':
             self._end_goal(True)
             return STOP
-        off = float(_bearings(self._facing, pose))
-        if abs(off) < FACED_RAD:
-            self._faced_s = time_s if self._faced_s is None else self._faced_s
-            if time_s >= self._faced_s + REPLAN_S:
-                self._give_up()
-            return STOP
-        return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
+        return self._look_at(self._facing, REPLAN_S, time_s, pose)
+
+    def _look_at(
+        self, point: Array, for_s: float, time_s: float, pose: Array
+    ) -> tuple[float, float]:
+        """Turn to a point (2,); a frontier that stays one is given up after some time."""
+        off = float(_bearings(point, pose))
+        if abs(off) > FACED_RAD:
+            return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
+        self._faced_s = time_s if self._faced_s is None else self._faced_s
+        if self.phase == 'exploring' and time_s >= self._faced_s + for_s:
+            self._give_up(is_seen=self._is_in_reach)
+        return STOP
 
     def _recover(self, time_s: float) -> tuple[float, float]:
         """Turn to see more; what cannot be reached after some tries is given up, a goal when that
@@ -470,7 +509,7 @@ class Explorer:
         if self._tries >= MOST_TRIES and self._target is not None:
             self._tries = 0
             if self.phase == 'exploring':
-                self._give_up()
+                self._give_up(is_seen=False)
             elif self._ahead[0].was_blocked:
                 self._end_goal(False)
             else:
@@ -478,9 +517,14 @@ class Explorer:
                 self._ahead.append(self._ahead.pop(0))
         return STOP
 
-    def _give_up(self) -> None:
+    def _give_up(self, is_seen: bool) -> None:
+        """Give up a frontier that was looked at, or cannot be reached: the first time until after
+        the next goal.
+        """
         assert self._target is not None
-        self._given_up.append(self._target)
+        off_m = [np.hypot(*(self._target - point)) for point, _ in self._given_up]
+        is_final = is_seen or min(off_m, default=np.inf) < 2 * self.body.radius_m
+        self._given_up.append((self._target, np.inf if is_final else len(self.ended)))
         self._target, self._planned_s = None, -np.inf
 
     def _end_goal(self, is_reached: bool) -> None:
