@@ -51,6 +51,9 @@ BRAKING_S = 0.2
 PATIENCE_S, MOST_TRIES = 8.0, 3
 """Without getting on for so long the robot turns, to see more; after so many tries it gives up."""
 
+GOAL_TRIES = 6
+"""A goal may lie where people come and go."""
+
 OBSTACLE_REACH_M = 3.0
 """As `raytrace_max_range` of params/nav2.yaml."""
 
@@ -201,7 +204,7 @@ class Costmap:
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
         near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
-        return float(way_m[np.argmax(near)]) if near.any() else reach_m
+        return float(way_m[max(np.argmax(near) - 1, 0)]) if near.any() else reach_m
 
     def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
@@ -252,14 +255,14 @@ class Body:
 
 @dataclass
 class Goal:
-    """A place (2,) in the map to drive to. is_reached: None while it lies ahead. was_blocked: once;
-    it is driven to again after the others.
+    """A place (2,) in the map to drive to. is_reached: None while it lies ahead. blocked: how many
+    times nothing led to it; it is driven to again after the others.
     """
 
     point: Array
     name: str = ''
     is_reached: bool | None = None
-    was_blocked: bool = False
+    blocked: int = 0
 
 
 STOP = (0.0, 0.0)
@@ -291,6 +294,8 @@ class Explorer:
         self._target: Array | None = None
         self._facing: Array = np.zeros(2)
         self._is_in_reach = True
+        self._in_reach: Array = np.zeros((0, 2))
+        self._aside: Array | None = None
         self._planned_s = -np.inf
         self._faced_s: float | None = None
         self._progress_s = 0.0
@@ -313,19 +318,22 @@ class Explorer:
         return self._ahead[0] if self.phase == 'driving' and self._ahead else None
 
     def take_obstacles(self, points: Array, scan: FloorScan | None, T_map_base: Array) -> None:
-        """Take in points (N, 3) of obstacles in the map and, as Nav2's local costmap does, drop
-        those on floor that a scan from a pose has seen to be free since.
+        """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
+        drop those on floor that a scan from a pose has seen to be free since.
         """
-        base = transform_points(invert(T_map_base), points)
-        away_m = np.hypot(base[:, 0], base[:, 1])
+        known = np.vstack([self.obstacles, points[:, :2]])
+        cells = np.floor(known / CELL_M).astype(np.int64)
+        known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+        in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
+        away_m = np.hypot(in_base[:, 0], in_base[:, 1])
         kept = away_m < OBSTACLE_REACH_M
         if scan is not None and len(scan.ranges_m):
-            bearing = np.arctan2(base[:, 1], base[:, 0])
+            bearing = np.arctan2(in_base[:, 1], in_base[:, 0])
             ray = np.round((bearing - scan.angle_min_rad) / scan.angle_increment_rad).astype(int)
             seen = (ray >= 0) & (ray < len(scan.ranges_m))
             free_m = np.nan_to_num(scan.ranges_m[np.clip(ray, 0, len(scan.ranges_m) - 1)])
             kept &= ~(seen & (away_m < free_m))
-        self.obstacles = points[kept, :2]
+        self.obstacles = known[kept]
 
     def step(self, time_s: float, T_map_base: Array | None) -> tuple[float, float]:
         """Return how to drive from now on, m/s and rad/s, by the pose (4, 4) of the base, None
@@ -382,12 +390,14 @@ class Explorer:
         if self.phase == 'driving':
             if self._target is None and isinstance(self.goals, int) and ways is not None:
                 cost = partial(costmap.cost_to, ways)
-                self._ahead.sort(key=lambda goal: (goal.was_blocked, cost(goal.point)))
-            self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
+                self._ahead.sort(key=lambda goal: (goal.blocked, cost(goal.point)))
+            goal = self._ahead[0].point if self._ahead else None
+            self._aim_at(time_s, goal if self._aside is None else self._aside)
             self.phase = 'driving' if self._ahead else 'done'
         self.path, self._is_in_reach = np.zeros((0, 2)), True
         if ways is None or self._target is None:
             return
+        self._in_reach = costmap.grid.centres_of(ways.cells[np.isfinite(ways.cost)])
         number, self._is_in_reach = costmap.nearest_in_reach(ways, self._target)
         way = self.grid.centres_of(ways.cells[ways.to(number)])
         self.path = np.vstack([way, self._target]) if self._is_in_reach else way
@@ -443,12 +453,12 @@ class Explorer:
             ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
-            known = [*self.ended, *(goal for goal in self._ahead if goal.was_blocked)]
+            known = [*self.ended, *(goal for goal in self._ahead if goal.blocked)]
             count = min(self.goals - len(known), len(places))
             drawn = self._rng.choice(len(places), count, replace=False)
             points = costmap.grid.centres_of(places[drawn])
             names = (f'goal_{number}' for number in range(len(known) + 1, self.goals + 1))
-            self._ahead = [goal for goal in self._ahead if goal.was_blocked]
+            self._ahead = [goal for goal in self._ahead if goal.blocked]
             self._ahead += map(Goal, points, names)
 
     def _aim_at(self, time_s: float, target: Array | None) -> None:
@@ -476,14 +486,17 @@ class Explorer:
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
         if not self._is_in_reach and not (np.hypot(*(self.path[-1:] - pose[:2]).T) > ARRIVED_M).any():
-            return self._look_at(self._target, LOOK_S, time_s, pose)
+            for_s = LOOK_S if self.phase == 'exploring' else PATIENCE_S
+            return self._look_at(self._target, for_s, time_s, pose)
         return self._pursue(pose) if len(self.path) else STOP
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
         """Tick off a goal; look at what is unknown behind a frontier, and give up what stays so."""
         self._progress_s = time_s
         if self.phase == 'driving':
-            self._end_goal(True)
+            if self._aside is None:
+                self._end_goal(True)
+            self._aside, self._target, self._planned_s = None, None, -np.inf
             return STOP
         return self._look_at(self._facing, REPLAN_S, time_s, pose)
 
@@ -494,38 +507,49 @@ class Explorer:
         off = float(_bearings(point, pose))
         if abs(off) > FACED_RAD:
             return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
+        self._progress_s = time_s
         self._faced_s = time_s if self._faced_s is None else self._faced_s
-        if self.phase == 'exploring' and time_s >= self._faced_s + for_s:
+        if time_s >= self._faced_s + for_s:
             self._give_up(is_seen=self._is_in_reach)
         return STOP
 
     def _recover(self, time_s: float) -> tuple[float, float]:
-        """Turn to see more; what cannot be reached after some tries is given up, a goal when that
-        was so once before.
-        """
+        """Turn to see more; what cannot be reached after some tries is given up."""
         self._tries += 1
         self._progress_s = time_s
         self._turn_until_s = time_s + np.pi / 2 / self.body.turn_rad_s
         if self._tries >= MOST_TRIES and self._target is not None:
             self._tries = 0
-            if self.phase == 'exploring':
-                self._give_up(is_seen=False)
-            elif self._ahead[0].was_blocked:
-                self._end_goal(False)
-            else:
-                self._ahead[0].was_blocked = True
-                self._ahead.append(self._ahead.pop(0))
+            self._give_up(is_seen=False)
         return STOP
 
     def _give_up(self, is_seen: bool) -> None:
-        """Give up a frontier that was looked at, or cannot be reached: the first time until after
-        the next goal.
+        """Give up what is driven to: a frontier that was looked at for good, one that cannot be
+        reached the first time until after the next goal, a goal until after the others.
         """
         assert self._target is not None
-        off_m = [np.hypot(*(self._target - point)) for point, _ in self._given_up]
-        is_final = is_seen or min(off_m, default=np.inf) < 2 * self.body.radius_m
-        self._given_up.append((self._target, np.inf if is_final else len(self.ended)))
+        if self._aside is not None:
+            self._aside = None
+        elif self.phase == 'driving':
+            self._postpone_goal()
+        else:
+            off_m = [np.hypot(*(self._target - point)) for point, _ in self._given_up]
+            is_final = is_seen or min(off_m, default=np.inf) < 2 * self.body.radius_m
+            self._given_up.append((self._target, np.inf if is_final else len(self.ended)))
         self._target, self._planned_s = None, -np.inf
+
+    def _postpone_goal(self) -> None:
+        """Drive to the other goals first or, where nothing led to them either, make way: to a place
+        drawn at random.
+        """
+        goal = self._ahead[0]
+        goal.blocked += 1
+        if goal.blocked >= GOAL_TRIES:
+            self._end_goal(False)
+            return
+        self._ahead.append(self._ahead.pop(0))
+        if all(goal.blocked for goal in self._ahead) and len(self._in_reach):
+            self._aside = self._rng.choice(self._in_reach)
 
     def _end_goal(self, is_reached: bool) -> None:
         goal = self._ahead.pop(0)
@@ -548,11 +572,11 @@ class Explorer:
         off = float(_bearings(self.path[ahead], pose))
         is_free = self._costmap.least_room_m(pose, self.path[ahead]) > body.radius_m
         stop_s = self._period_s + BRAKING_S
-        if abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
-            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
-        turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         most_m = body.speed_m_s * stop_s
         stop_m = min(self._costmap.free_ahead_m(pose, most_m), away_m[-1])
+        if not stop_m or abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
+            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
+        turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
 
