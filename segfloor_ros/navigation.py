@@ -485,7 +485,10 @@ class Explorer:
         way_out = self._costmap.way_out(pose)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
-        if not self._is_in_reach and not (np.hypot(*(self.path[-1:] - pose[:2]).T) > ARRIVED_M).any():
+        if (
+            not self._is_in_reach
+            and not (np.hypot(*(self.path[-1:] - pose[:2]).T) > ARRIVED_M).any()
+        ):
             for_s = LOOK_S if self.phase == 'exploring' else PATIENCE_S
             return self._look_at(self._target, for_s, time_s, pose)
         return self._pursue(pose) if len(self.path) else STOP

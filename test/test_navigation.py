@@ -151,6 +151,17 @@ def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None
     np.testing.assert_allclose(explorer.obstacles, in_map[1:, :2])
 
 
+def test_obstacles_that_are_out_of_view_are_remembered_until_their_floor_is_seen_free() -> None:
+    explorer = Explorer(BODY, 0)
+    beside = np.array([(0.0, 1.0, 0.1), (0.0, 1.01, 0.1)])
+    explorer.take_obstacles(beside, None, np.eye(4))
+    scan = FloorScan(-0.5, 0.1, np.full(11, 2.0, np.float32), None, 4.0)
+    explorer.take_obstacles(np.zeros((0, 3)), scan, np.eye(4))
+    assert explorer.obstacles.tolist() == [[0.0, 1.0]], 'one a cell'
+    explorer.take_obstacles(np.zeros((0, 3)), scan, pose_of(0.0, 0.0, np.pi / 2))
+    assert not len(explorer.obstacles)
+
+
 class Drive:
     """A robot on a true map, of which it sees what lies before it within some metres.
     is_known: all of it was seen before.
@@ -269,6 +280,46 @@ def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_op
     assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
 
 
+def test_what_was_behind_shut_doors_is_explored_once_they_are_open_and_goals_lie_there_too() -> (
+    None
+):
+    truth = grid_of(DOORS)
+    for rows in (LOWER, UPPER):
+        shut(truth, rows)
+    drive = Drive(truth, Explorer(BODY, 4, seed=3), START)
+    while drive.explorer.phase == 'exploring':
+        drive.go_on(drive.time_s + 0.2)
+    assert drive.share < 0.6
+    for rows in (LOWER, UPPER):
+        shut(truth, rows, False)
+    drive.go_on(drive.time_s + 300.0)
+    assert drive.share > 0.97
+    assert [goal.is_reached for goal in drive.explorer.ended] == [True] * 4
+    assert any(goal.point[0] > 1.4 for goal in drive.explorer.ended)
+
+
+def test_where_nothing_leads_to_the_goal_it_goes_near_looks_and_then_makes_way() -> None:
+    truth = grid_of(DOORS)
+    for rows in (LOWER, UPPER):
+        shut(truth, rows)
+    goal = Goal(np.array([2.2, 0.4]))
+    drive = Drive(truth, Explorer(BODY, [goal], phase='driving'), START, is_known=True)
+    drive.go_on(10.0)
+    near = drive.pose.copy()
+    assert near[0] > 0.9
+    bearing = np.arctan2(*(goal.point - near[:2])[::-1])
+    assert abs(bearing - near[2]) < np.radians(11)
+    away_m = []
+    while drive.time_s < 25.0:
+        drive.go_on(drive.time_s + 0.2)
+        away_m.append(np.hypot(*(drive.pose - near)[:2]))
+    assert max(away_m) > 0.3
+    for rows in (LOWER, UPPER):
+        shut(truth, rows, False)
+    drive.go_on(60.0)
+    assert goal.is_reached
+
+
 @pytest.mark.parametrize(('post', 'sign'), [((0.95, 0.55), -1), ((0.35, 0.55), 1)])
 def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) -> None:
     body = dataclasses.replace(BODY, radius_m=0.35)
@@ -288,6 +339,12 @@ def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw)
     explorer.grid = grid_of('#' * 26 + 20 * ('\n' + 26 * '.') + '\n' + '#' * 26)
     forward, turn = explorer.step(0.0, pose_of(1.3, 0.35, yaw))
     assert forward == 0 and turn != 0
+
+
+def test_what_stands_within_its_radius_it_does_not_creep_towards() -> None:
+    costmap = costmap_of(grid_of(TWO_ROOMS), [(0.85, 0.55)])
+    assert costmap.free_ahead_m(np.array([0.72, 0.55, 0.0]), 1.0) == 0
+    assert costmap.free_ahead_m(np.array([0.72, 0.55, np.pi]), 0.3) == 0.3
 
 
 def test_it_would_stop_a_radius_and_what_a_map_is_off_from_a_wall() -> None:
