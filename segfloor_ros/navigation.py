@@ -204,7 +204,7 @@ class Costmap:
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
         near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
-        return float(way_m[max(np.argmax(near) - 1, 0)]) if near.any() else reach_m
+        return float(way_m[max(int(np.argmax(near)) - 1, 0)]) if near.any() else reach_m
 
     def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
@@ -485,10 +485,8 @@ class Explorer:
         way_out = self._costmap.way_out(pose)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
-        if (
-            not self._is_in_reach
-            and not (np.hypot(*(self.path[-1:] - pose[:2]).T) > ARRIVED_M).any()
-        ):
+        left_m = np.hypot(*(self.path[-1:] - pose[:2]).T)
+        if not self._is_in_reach and left_m.max(initial=0) < ARRIVED_M:
             for_s = LOOK_S if self.phase == 'exploring' else PATIENCE_S
             return self._look_at(self._target, for_s, time_s, pose)
         return self._pursue(pose) if len(self.path) else STOP
