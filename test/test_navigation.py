@@ -332,6 +332,12 @@ def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) 
     assert forward == 0 and turn > 0
 
 
+def test_from_what_stands_beside_it_it_drives_on_the_way_on_which_it_has_begun() -> None:
+    costmap = costmap_of(grid_of(13 * (14 * '.' + '\n')), [(0.75, 0.65)], [(0.65, 0.55)])
+    for x, before, sign in ((0.74, 0.0, -1), (0.76, 0.0, 1), (0.76, -1.0, -1), (0.74, 1.0, 1)):
+        assert costmap.way_out(np.array([x, 0.55, 0.0]), before) == sign
+
+
 @pytest.mark.parametrize('yaw', [0.0, np.pi])
 def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw) -> None:
     body = dataclasses.replace(BODY, radius_m=0.35)
