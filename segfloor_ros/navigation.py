@@ -254,6 +254,12 @@ class Body:
     speed_m_s: float
     turn_rad_s: float
 
+    def turning_m(self, points: Array, pose: Array) -> Array:
+        """Return how far (N,) it drives in the time in which it turns from a pose x, y, yaw to
+        points (N, 2).
+        """
+        return np.abs(_bearings(points, pose)) / self.turn_rad_s * self.speed_m_s
+
 
 @dataclass
 class Goal:
@@ -416,17 +422,13 @@ class Explorer:
         elif self.phase == 'exploring':
             self._begin_goals(driven)
 
-    def _turning_m(self, points: Array, pose: Array) -> Array:
-        """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
-        return np.abs(_bearings(points, pose)) / self.body.turn_rad_s * self.body.speed_m_s
-
     def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
         """Return the frontier to drive to: the soonest, or the present one while it is one."""
         least = self.body.radius_m
         best, best_cost = None, np.inf
         for cells in costmap.frontiers():
             points = costmap.grid.centres_of(cells)
-            cost = ways.cost[costmap.numbers_of(cells)] + self._turning_m(points, pose)
+            cost = ways.cost[costmap.numbers_of(cells)] + self.body.turning_m(points, pose)
             beyond = ~np.isfinite(cost)  # those come last
             cost[beyond] = FAR_M + np.hypot(*(points[beyond] - pose[:2]).T)
             for given_up, goals in self._given_up:
