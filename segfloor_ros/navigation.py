@@ -122,7 +122,7 @@ class Costmap:
     ) -> None:
         self.grid = grid
         trodden = self._discs(driven, radius_m)
-        if np.hypot(*(driven - driven[0]).T).max() <= blind_m:
+        if np.hypot(*(driven - driven[:1]).T).max(initial=0) <= blind_m:
             trodden |= self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
@@ -206,17 +206,21 @@ class Costmap:
         near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
         return float(way_m[max(int(np.argmax(near)) - 1, 0)]) if near.any() else reach_m
 
-    def way_out(self, pose: Array, before: float = 0.0) -> float:
+    def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
-        at a pose x, y, yaw, which might touch it in a turn; 0 where nothing does, or neither leads
-        away from it. before: what it was before, which it stays while that leads away.
+        at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
+        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there.
         """
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
-        room_m = {s: self.standing_m(pose[:2] + s * self._radius_m * ahead) for s in (1.0, -1.0)}
-        here_m = self.standing_m(pose[:2])
-        best = max(room_m, key=lambda s: room_m[s])
-        sign = before if before and room_m[before] > here_m else best
-        return 0.0 if here_m >= min(self._radius_m, room_m[sign]) else sign
+        ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
+        best, soonest = 0.0, len(ways_m)
+        for sign in (1.0, -1.0):
+            room_m = np.array([self.standing_m(pose[:2] + sign * m * ahead) for m in ways_m])
+            ends = (room_m >= self._radius_m) | (room_m < room_m[0] - self.grid.resolution_m)
+            first = int(np.argmax(ends))
+            if 0 < first < soonest and room_m[first] >= self._radius_m:
+                best, soonest = sign, first
+        return best
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -301,7 +305,7 @@ class Explorer:
         self._given_up: list[tuple[Array, float]] = []
         self._target: Array | None = None
         self._facing: Array = np.zeros(2)
-        self._is_in_reach, self._way_out = True, 0.0
+        self._is_in_reach = True
         self._in_reach: Array = np.zeros((0, 2))
         self._aside: Array | None = None
         self._planned_s = -np.inf
@@ -486,9 +490,9 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
-        self._way_out = self._costmap.way_out(pose, self._way_out)
-        if self._way_out:
-            return self._way_out * self.body.speed_m_s / 2, 0.0
+        way_out = self._costmap.way_out(pose)
+        if way_out:
+            return way_out * self.body.speed_m_s / 2, 0.0
         left_m = np.hypot(*(self.path[-1:] - pose[:2]).T)
         if not self._is_in_reach and left_m.max(initial=0) < ARRIVED_M:
             for_s = LOOK_S if self.phase == 'exploring' else PATIENCE_S

@@ -332,10 +332,16 @@ def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) 
     assert forward == 0 and turn > 0
 
 
-def test_from_what_stands_beside_it_it_drives_on_the_way_on_which_it_has_begun() -> None:
-    costmap = costmap_of(grid_of(13 * (14 * '.' + '\n')), [(0.75, 0.65)], [(0.65, 0.55)])
-    for x, before, sign in ((0.74, 0.0, -1), (0.76, 0.0, 1), (0.76, -1.0, -1), (0.74, 1.0, 1)):
-        assert costmap.way_out(np.array([x, 0.55, 0.0]), before) == sign
+@pytest.mark.parametrize('x', np.arange(0.31, 1.1, 0.13))
+def test_from_what_stands_beside_it_it_drives_on_one_way_until_it_may_turn(x) -> None:
+    posts = [(0.65, 0.75), (1.05, 0.35)]
+    costmap = Costmap(grid_of(13 * (20 * '.' + '\n')), 0.3, 0.6, np.array(posts), NOTHING, 0.0)
+    signs = [costmap.way_out(np.array([x, 0.55, 0.0]))]
+    while signs[-1] and len(signs) < 20:
+        x += 0.05 * signs[-1]
+        signs.append(costmap.way_out(np.array([x, 0.55, 0.0])))
+    assert signs[-1] == 0 and abs(sum(signs)) == len(signs) - 1
+    assert costmap.standing_m(np.array([x, 0.55])) >= 0.3
 
 
 @pytest.mark.parametrize('yaw', [0.0, np.pi])
