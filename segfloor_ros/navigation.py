@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -35,6 +36,9 @@ free."""
 
 ARRIVED_M = 0.15
 
+FAR_M = 1e6
+"""What nothing leads to is further than anything else."""
+
 LOOK_S = 3.0
 """So long the robot stands and looks where it does not know where it is; then it turns back to
 where it came from, where the map is."""
@@ -46,6 +50,9 @@ BRAKING_S = 0.2
 
 PATIENCE_S, MOST_TRIES = 8.0, 3
 """Without getting on for so long the robot turns, to see more; after so many tries it gives up."""
+
+GOAL_TRIES = 6
+"""A goal may lie where people come and go."""
 
 OBSTACLE_REACH_M = 3.0
 """As `raytrace_max_range` of params/nav2.yaml."""
@@ -100,8 +107,8 @@ class Costmap:
 
     obstacles: points (N, 2) in the map that are in the way, too. driven: points (M, 2) where the
     robot has been, the last one now: floor unless the map says otherwise. blind_m: around the
-    first of them it cannot see the floor. comfort_m: nearer to an obstacle than this a way counts
-    more, up to three times.
+    first of them it cannot see the floor until it has been further away. comfort_m: nearer to an
+    obstacle than this a way counts more, up to three times.
     """
 
     def __init__(
@@ -114,7 +121,9 @@ class Costmap:
         blind_m: float,
     ) -> None:
         self.grid = grid
-        trodden = self._discs(driven, radius_m) | self._discs(driven[:1], blind_m)
+        trodden = self._discs(driven, radius_m)
+        if np.hypot(*(driven - driven[:1]).T).max(initial=0) <= blind_m:
+            trodden |= self._discs(driven[:1], blind_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
         standing = (grid.cells >= OCCUPIED) | marked
@@ -155,6 +164,21 @@ class Costmap:
         nearest = int(np.argmin(away_m))
         return nearest, float(away_m[nearest])
 
+    def cost_to(self, ways: Ways, point: Array) -> float:
+        """Return the cost of the way to a point (2,), inf where there is none."""
+        number, away_m = self.nearest_place(point)
+        return float(ways.cost[number]) if away_m < self._radius_m else np.inf
+
+    def nearest_in_reach(self, ways: Ways, point: Array) -> tuple[int, bool]:
+        """Return the number of the place in reach that is nearest to a point (2,), and whether it
+        is the place of that point.
+        """
+        if np.isfinite(self.cost_to(ways, point)):
+            return self.nearest_place(point)[0], True
+        in_reach = np.flatnonzero(np.isfinite(ways.cost))
+        away_m = np.hypot(*(self.grid.centres_of(self._cells[in_reach]) - point).T)
+        return int(in_reach[np.argmin(away_m)]), False
+
     def least_room_m(self, pose: Array, point: Array) -> float:
         """Return how near what may be in the way comes to the arc that leads from a pose x, y, yaw
         to a point (2,).
@@ -180,17 +204,23 @@ class Costmap:
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         room_m = self._standing_m[tuple(self._on_map(pose[:2] + way_m[:, None] * ahead).T)]
         near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
-        return float(way_m[np.argmax(near)]) if near.any() else reach_m
+        return float(way_m[max(int(np.argmax(near)) - 1, 0)]) if near.any() else reach_m
 
     def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
-        at a pose x, y, yaw, which might touch it in a turn; 0 where nothing does, or neither leads
-        away from it.
+        at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
+        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there.
         """
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
-        places = ((s, pose[:2] + s * self._radius_m * ahead) for s in (1.0, -1.0))
-        room_m, sign = max((self.standing_m(place), s) for s, place in places)
-        return 0.0 if self.standing_m(pose[:2]) >= min(self._radius_m, room_m) else sign
+        ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
+        best, soonest = 0.0, len(ways_m)
+        for sign in (1.0, -1.0):
+            room_m = np.array([self.standing_m(pose[:2] + sign * m * ahead) for m in ways_m])
+            ends = (room_m >= self._radius_m) | (room_m < room_m[0] - self.grid.resolution_m)
+            first = int(np.argmax(ends))
+            if 0 < first < soonest and room_m[first] >= self._radius_m:
+                best, soonest = sign, first
+        return best
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
@@ -228,17 +258,23 @@ class Body:
     speed_m_s: float
     turn_rad_s: float
 
+    def turning_m(self, points: Array, pose: Array) -> Array:
+        """Return how far (N,) it drives in the time in which it turns from a pose x, y, yaw to
+        points (N, 2).
+        """
+        return np.abs(_bearings(points, pose)) / self.turn_rad_s * self.speed_m_s
+
 
 @dataclass
 class Goal:
-    """A place (2,) in the map to drive to. is_reached: None while it lies ahead. was_blocked: once;
-    it is driven to again after the others.
+    """A place (2,) in the map to drive to. is_reached: None while it lies ahead. blocked: how many
+    times nothing led to it; it is driven to again after the others.
     """
 
     point: Array
     name: str = ''
     is_reached: bool | None = None
-    was_blocked: bool = False
+    blocked: int = 0
 
 
 STOP = (0.0, 0.0)
@@ -247,7 +283,7 @@ STOP = (0.0, 0.0)
 @dataclass
 class Explorer:
     """Decides how to drive, from what is known of map, obstacles and free floor. goals: how
-    many to draw at random once everything is explored, or which.
+    many to draw at random once everything is explored, the nearest of them first, or which.
     """
 
     body: Body
@@ -265,9 +301,13 @@ class Explorer:
         self._rng = np.random.default_rng(self.seed)
         self._ahead: list[Goal] = [] if isinstance(self.goals, int) else list(self.goals)
         self._driven: list[Array] = []
-        self._given_up: list[Array] = []
+        self._explores, self._is_drawn = self.phase == 'exploring', False
+        self._given_up: list[tuple[Array, float]] = []
         self._target: Array | None = None
         self._facing: Array = np.zeros(2)
+        self._is_in_reach = True
+        self._in_reach: Array = np.zeros((0, 2))
+        self._aside: Array | None = None
         self._planned_s = -np.inf
         self._faced_s: float | None = None
         self._progress_s = 0.0
@@ -290,19 +330,22 @@ class Explorer:
         return self._ahead[0] if self.phase == 'driving' and self._ahead else None
 
     def take_obstacles(self, points: Array, scan: FloorScan | None, T_map_base: Array) -> None:
-        """Take in points (N, 3) of obstacles in the map and, as Nav2's local costmap does, drop
-        those on floor that a scan from a pose has seen to be free since.
+        """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
+        drop those on floor that a scan from a pose has seen to be free since.
         """
-        base = transform_points(invert(T_map_base), points)
-        away_m = np.hypot(base[:, 0], base[:, 1])
+        known = np.vstack([self.obstacles, points[:, :2]])
+        cells = np.floor(known / CELL_M).astype(np.int64)
+        known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+        in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
+        away_m = np.hypot(in_base[:, 0], in_base[:, 1])
         kept = away_m < OBSTACLE_REACH_M
         if scan is not None and len(scan.ranges_m):
-            bearing = np.arctan2(base[:, 1], base[:, 0])
+            bearing = np.arctan2(in_base[:, 1], in_base[:, 0])
             ray = np.round((bearing - scan.angle_min_rad) / scan.angle_increment_rad).astype(int)
             seen = (ray >= 0) & (ray < len(scan.ranges_m))
             free_m = np.nan_to_num(scan.ranges_m[np.clip(ray, 0, len(scan.ranges_m) - 1)])
             kept &= ~(seen & (away_m < free_m))
-        self.obstacles = points[kept, :2]
+        self.obstacles = known[kept]
 
     def step(self, time_s: float, T_map_base: Array | None) -> tuple[float, float]:
         """Return how to drive from now on, m/s and rad/s, by the pose (4, 4) of the base, None
@@ -354,24 +397,34 @@ class Explorer:
         driven = np.array([*self._driven, pose[:2]])
         self._costmap = costmap = Costmap.around(self.body, self.grid, self.obstacles, driven)
         ways = costmap.ways_from(pose[:2], 2 * radius_m)
-        if ways is not None and self.phase == 'exploring':
-            self._aim_at(time_s, self._frontier(costmap, ways, pose))
-            if self._target is None and self._tries >= MOST_TRIES:
-                self._begin_goals(driven)
+        if ways is not None and self._explores and (self.goal is None or self._target is None):
+            self._explore(time_s, self._frontier(costmap, ways, pose), driven)
         if self.phase == 'driving':
-            self._aim_at(time_s, self._ahead[0].point if self._ahead else None)
+            if self._target is None and isinstance(self.goals, int) and ways is not None:
+                cost = partial(costmap.cost_to, ways)
+                self._ahead.sort(key=lambda goal: (goal.blocked, cost(goal.point)))
+            goal = self._ahead[0].point if self._ahead else None
+            self._aim_at(time_s, goal if self._aside is None else self._aside)
             self.phase = 'driving' if self._ahead else 'done'
-        self.path = np.zeros((0, 2))
+        self.path, self._is_in_reach = np.zeros((0, 2)), True
         if ways is None or self._target is None:
             return
-        number, away_m = costmap.nearest_place(self._target)
-        if np.isfinite(ways.cost[number]) and away_m < radius_m:
-            way = self.grid.centres_of(ways.cells[ways.to(number)])
-            self.path = np.vstack([way, self._target])
+        self._in_reach = costmap.grid.centres_of(ways.cells[np.isfinite(ways.cost)])
+        number, self._is_in_reach = costmap.nearest_in_reach(ways, self._target)
+        way = self.grid.centres_of(ways.cells[ways.to(number)])
+        self.path = np.vstack([way, self._target]) if self._is_in_reach else way
 
-    def _turning_m(self, points: Array, pose: Array) -> Array:
-        """Return how far (N,) the robot drives in the time in which it turns to points (N, 2)."""
-        return np.abs(_bearings(points, pose)) / self.body.turn_rad_s * self.body.speed_m_s
+    def _explore(self, time_s: float, frontier: Array | None, driven: Array) -> None:
+        """Drive to a frontier; without any turn to see more, then drive to goals. Before each of
+        them whatever has become a frontier since is next.
+        """
+        if frontier is not None or not self._is_drawn:
+            self.phase = 'exploring'
+            self._aim_at(time_s, frontier)
+            if frontier is None and self._tries >= MOST_TRIES:
+                self._begin_goals(driven)
+        elif self.phase == 'exploring':
+            self._begin_goals(driven)
 
     def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
         """Return the frontier to drive to: the soonest, or the present one while it is one."""
@@ -379,9 +432,12 @@ class Explorer:
         best, best_cost = None, np.inf
         for cells in costmap.frontiers():
             points = costmap.grid.centres_of(cells)
-            cost = ways.cost[costmap.numbers_of(cells)] + self._turning_m(points, pose)
-            for given_up in self._given_up:
-                cost = np.where(np.hypot(*(points - given_up).T) < 2 * least, np.inf, cost)
+            cost = ways.cost[costmap.numbers_of(cells)] + self.body.turning_m(points, pose)
+            beyond = ~np.isfinite(cost)  # those come last
+            cost[beyond] = FAR_M + np.hypot(*(points[beyond] - pose[:2]).T)
+            for given_up, goals in self._given_up:
+                is_near = np.hypot(*(points - given_up).T) < 2 * least
+                cost = np.where(is_near & (len(self.ended) <= goals), np.inf, cost)
             if self._target is not None:
                 is_same = np.hypot(*(points - self._target).T) < 2 * least
                 cost = np.where(is_same, cost - 1.0, cost)
@@ -398,16 +454,20 @@ class Explorer:
         """Everything is explored: draw the goals, wherever the map leads; what stands in the way
         now may go.
         """
-        self.phase, self._tries = 'driving', 0
+        self.phase, self._tries, self._is_drawn, self._target = 'driving', 0, True, None
         if isinstance(self.goals, int):
             assert self.grid is not None
             costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
             ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
-            drawn = self._rng.choice(len(places), min(self.goals, len(places)), replace=False)
+            known = [*self.ended, *(goal for goal in self._ahead if goal.blocked)]
+            count = min(self.goals - len(known), len(places))
+            drawn = self._rng.choice(len(places), count, replace=False)
             points = costmap.grid.centres_of(places[drawn])
-            self._ahead = [Goal(point, f'goal_{i + 1}') for i, point in enumerate(points)]
+            names = (f'goal_{number}' for number in range(len(known) + 1, self.goals + 1))
+            self._ahead = [goal for goal in self._ahead if goal.blocked]
+            self._ahead += map(Goal, points, names)
 
     def _aim_at(self, time_s: float, target: Array | None) -> None:
         is_same = (
@@ -433,44 +493,72 @@ class Explorer:
         way_out = self._costmap.way_out(pose)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
+        left_m = np.hypot(*(self.path[-1:] - pose[:2]).T)
+        if not self._is_in_reach and left_m.max(initial=0) < ARRIVED_M:
+            for_s = LOOK_S if self.phase == 'exploring' else PATIENCE_S
+            return self._look_at(self._target, for_s, time_s, pose)
         return self._pursue(pose) if len(self.path) else STOP
 
     def _arrive(self, time_s: float, pose: Array) -> tuple[float, float]:
         """Tick off a goal; look at what is unknown behind a frontier, and give up what stays so."""
         self._progress_s = time_s
         if self.phase == 'driving':
-            self._end_goal(True)
+            if self._aside is None:
+                self._end_goal(True)
+            self._aside, self._target, self._planned_s = None, None, -np.inf
             return STOP
-        off = float(_bearings(self._facing, pose))
-        if abs(off) < FACED_RAD:
-            self._faced_s = time_s if self._faced_s is None else self._faced_s
-            if time_s >= self._faced_s + REPLAN_S:
-                self._give_up()
-            return STOP
-        return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
+        return self._look_at(self._facing, REPLAN_S, time_s, pose)
+
+    def _look_at(
+        self, point: Array, for_s: float, time_s: float, pose: Array
+    ) -> tuple[float, float]:
+        """Turn to a point (2,); a frontier that stays one is given up after some time."""
+        off = float(_bearings(point, pose))
+        if abs(off) > FACED_RAD:
+            return 0.0, float(np.clip(2 * off, -1, 1)) * self.body.turn_rad_s
+        self._progress_s = time_s
+        self._faced_s = time_s if self._faced_s is None else self._faced_s
+        if time_s >= self._faced_s + for_s:
+            self._give_up(is_seen=self._is_in_reach)
+        return STOP
 
     def _recover(self, time_s: float) -> tuple[float, float]:
-        """Turn to see more; what cannot be reached after some tries is given up, a goal when that
-        was so once before.
-        """
+        """Turn to see more; what cannot be reached after some tries is given up."""
         self._tries += 1
         self._progress_s = time_s
         self._turn_until_s = time_s + np.pi / 2 / self.body.turn_rad_s
         if self._tries >= MOST_TRIES and self._target is not None:
             self._tries = 0
-            if self.phase == 'exploring':
-                self._give_up()
-            elif self._ahead[0].was_blocked:
-                self._end_goal(False)
-            else:
-                self._ahead[0].was_blocked = True
-                self._ahead.append(self._ahead.pop(0))
+            self._give_up(is_seen=False)
         return STOP
 
-    def _give_up(self) -> None:
+    def _give_up(self, is_seen: bool) -> None:
+        """Give up what is driven to: a frontier that was looked at for good, one that cannot be
+        reached the first time until after the next goal, a goal until after the others.
+        """
         assert self._target is not None
-        self._given_up.append(self._target)
+        if self._aside is not None:
+            self._aside = None
+        elif self.phase == 'driving':
+            self._postpone_goal()
+        else:
+            off_m = [np.hypot(*(self._target - point)) for point, _ in self._given_up]
+            is_final = is_seen or min(off_m, default=np.inf) < 2 * self.body.radius_m
+            self._given_up.append((self._target, np.inf if is_final else len(self.ended)))
         self._target, self._planned_s = None, -np.inf
+
+    def _postpone_goal(self) -> None:
+        """Drive to the other goals first or, where nothing led to them either, make way: to a place
+        drawn at random.
+        """
+        goal = self._ahead[0]
+        goal.blocked += 1
+        if goal.blocked >= GOAL_TRIES:
+            self._end_goal(False)
+            return
+        self._ahead.append(self._ahead.pop(0))
+        if all(goal.blocked for goal in self._ahead) and len(self._in_reach):
+            self._aside = self._rng.choice(self._in_reach)
 
     def _end_goal(self, is_reached: bool) -> None:
         goal = self._ahead.pop(0)
@@ -493,11 +581,11 @@ class Explorer:
         off = float(_bearings(self.path[ahead], pose))
         is_free = self._costmap.least_room_m(pose, self.path[ahead]) > body.radius_m
         stop_s = self._period_s + BRAKING_S
-        if abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
-            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
-        turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         most_m = body.speed_m_s * stop_s
         stop_m = min(self._costmap.free_ahead_m(pose, most_m), away_m[-1])
+        if not stop_m or abs(off) > (TURN_ON_SPOT_RAD if is_free else FACED_RAD):
+            return 0.0, float(np.sign(off)) * min(body.turn_rad_s, abs(off) / stop_s)
+        turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
 

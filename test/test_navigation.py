@@ -99,6 +99,16 @@ def test_where_the_robot_stands_is_free_and_what_it_cannot_see_before_it() -> No
     assert not costmap.places[5, 8]
 
 
+def test_what_it_could_not_see_at_its_start_is_unknown_once_it_has_been_further_away() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[1:10, 1:10] = UNKNOWN
+    start = (0.55, 0.55)
+    for driven, is_free in (([start, (0.95, 0.55)], True), ([start, (1.15, 0.55), start], False)):
+        costmap = Costmap(grid, 0.15, 0.3, NOTHING, np.array(driven), 0.45)
+        assert costmap.free[5, 1] == is_free
+        assert is_free or costmap.frontiers()
+
+
 def test_frontiers_are_places_a_radius_away_from_unknown_floor_but_not_from_slits() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[1:4, 1] = UNKNOWN
@@ -139,6 +149,17 @@ def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None
     in_map = np.array([T_map_base[:3, :3] @ p + T_map_base[:3, 3] for p in (left, right)])
     explorer.take_obstacles(in_map, scan, T_map_base)
     np.testing.assert_allclose(explorer.obstacles, in_map[1:, :2])
+
+
+def test_obstacles_that_are_out_of_view_are_remembered_until_their_floor_is_seen_free() -> None:
+    explorer = Explorer(BODY, 0)
+    beside = np.array([(0.0, 1.0, 0.1), (0.0, 1.01, 0.1)])
+    explorer.take_obstacles(beside, None, np.eye(4))
+    scan = FloorScan(-0.5, 0.1, np.full(11, 2.0, np.float32), None, 4.0)
+    explorer.take_obstacles(np.zeros((0, 3)), scan, np.eye(4))
+    assert explorer.obstacles.tolist() == [[0.0, 1.0]], 'one a cell'
+    explorer.take_obstacles(np.zeros((0, 3)), scan, pose_of(0.0, 0.0, np.pi / 2))
+    assert not len(explorer.obstacles)
 
 
 class Drive:
@@ -259,6 +280,46 @@ def test_a_goal_behind_a_shut_door_is_driven_to_after_the_others_once_that_is_op
     assert [goal.name for goal in drive.explorer.ended if goal.is_reached] == ['here', 'behind']
 
 
+def test_what_was_behind_shut_doors_is_explored_once_they_are_open_and_goals_lie_there_too() -> (
+    None
+):
+    truth = grid_of(DOORS)
+    for rows in (LOWER, UPPER):
+        shut(truth, rows)
+    drive = Drive(truth, Explorer(BODY, 4, seed=3), START)
+    while drive.explorer.phase == 'exploring':
+        drive.go_on(drive.time_s + 0.2)
+    assert drive.share < 0.6
+    for rows in (LOWER, UPPER):
+        shut(truth, rows, False)
+    drive.go_on(drive.time_s + 300.0)
+    assert drive.share > 0.97
+    assert [goal.is_reached for goal in drive.explorer.ended] == [True] * 4
+    assert any(goal.point[0] > 1.4 for goal in drive.explorer.ended)
+
+
+def test_where_nothing_leads_to_the_goal_it_goes_near_looks_and_then_makes_way() -> None:
+    truth = grid_of(DOORS)
+    for rows in (LOWER, UPPER):
+        shut(truth, rows)
+    goal = Goal(np.array([2.2, 0.4]))
+    drive = Drive(truth, Explorer(BODY, [goal], phase='driving'), START, is_known=True)
+    drive.go_on(10.0)
+    near = drive.pose.copy()
+    assert near[0] > 0.9
+    bearing = np.arctan2(*(goal.point - near[:2])[::-1])
+    assert abs(bearing - near[2]) < np.radians(11)
+    away_m = []
+    while drive.time_s < 25.0:
+        drive.go_on(drive.time_s + 0.2)
+        away_m.append(np.hypot(*(drive.pose - near)[:2]))
+    assert max(away_m) > 0.3
+    for rows in (LOWER, UPPER):
+        shut(truth, rows, False)
+    drive.go_on(60.0)
+    assert goal.is_reached
+
+
 @pytest.mark.parametrize(('post', 'sign'), [((0.95, 0.55), -1), ((0.35, 0.55), 1)])
 def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) -> None:
     body = dataclasses.replace(BODY, radius_m=0.35)
@@ -271,6 +332,18 @@ def test_it_drives_straight_away_from_what_it_would_touch_in_a_turn(post, sign) 
     assert forward == 0 and turn > 0
 
 
+@pytest.mark.parametrize('x', np.arange(0.31, 1.1, 0.13))
+def test_from_what_stands_beside_it_it_drives_on_one_way_until_it_may_turn(x) -> None:
+    posts = [(0.65, 0.75), (1.05, 0.35)]
+    costmap = Costmap(grid_of(13 * (20 * '.' + '\n')), 0.3, 0.6, np.array(posts), NOTHING, 0.0)
+    signs = [costmap.way_out(np.array([x, 0.55, 0.0]))]
+    while signs[-1] and len(signs) < 20:
+        x += 0.05 * signs[-1]
+        signs.append(costmap.way_out(np.array([x, 0.55, 0.0])))
+    assert signs[-1] == 0 and abs(sum(signs)) == len(signs) - 1
+    assert costmap.standing_m(np.array([x, 0.55])) >= 0.3
+
+
 @pytest.mark.parametrize('yaw', [0.0, np.pi])
 def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw) -> None:
     body = dataclasses.replace(BODY, radius_m=0.35)
@@ -278,6 +351,12 @@ def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw)
     explorer.grid = grid_of('#' * 26 + 20 * ('\n' + 26 * '.') + '\n' + '#' * 26)
     forward, turn = explorer.step(0.0, pose_of(1.3, 0.35, yaw))
     assert forward == 0 and turn != 0
+
+
+def test_what_stands_within_its_radius_it_does_not_creep_towards() -> None:
+    costmap = costmap_of(grid_of(TWO_ROOMS), [(0.85, 0.55)])
+    assert costmap.free_ahead_m(np.array([0.72, 0.55, 0.0]), 1.0) == 0
+    assert costmap.free_ahead_m(np.array([0.72, 0.55, np.pi]), 0.3) == 0.3
 
 
 def test_it_would_stop_a_radius_and_what_a_map_is_off_from_a_wall() -> None:
@@ -307,6 +386,23 @@ def test_goals_are_drawn_wherever_the_map_leads_also_behind_somebody_in_the_way(
     drive.go_on(20.0)
     assert explorer.phase == 'driving'
     assert any(goal.point[0] > 1.5 for goal in explorer._ahead)
+
+
+def test_of_drawn_goals_the_nearest_is_next_and_one_without_a_way_waits_for_the_others() -> None:
+    explorer = Explorer(BODY, 20, seed=1)
+    drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)
+    while explorer.phase == 'exploring':
+        drive.go_on(drive.time_s + 0.2)
+    nearest = min(explorer._ahead, key=lambda g: np.hypot(*(g.point - drive.pose[:2])))
+    assert explorer.goal is nearest
+    shut = drive.truth.cells[3:7, 13]
+    shut[:] = OCCUPIED
+    while any(goal.point[0] < 1.3 for goal in explorer._ahead):
+        drive.go_on(drive.time_s + 0.2)
+    assert all(goal.is_reached and goal.point[0] < 1.3 for goal in explorer.ended)
+    shut[:] = FREE
+    drive.go_on(drive.time_s + 100)
+    assert [goal.is_reached for goal in explorer.ended] == [True] * 20
 
 
 def test_without_a_pose_it_stops_at_once_and_later_turns_back() -> None:

@@ -87,14 +87,15 @@ OnMap = Callable[[float, OccupancyGrid, str], None]
 @dataclass(frozen=True)
 class ExploreSession:
     """One exploration. robot: values of the node `simulated_robot`. slam: values of `stereo_slam`,
-    e.g. where the camera sits. found: what it comes to. most_s: of the robot's time. save: where
-    the whole map goes at the end.
+    e.g. where the camera sits. half_width_m: of the robot. found: what it comes to. most_s: of the
+    robot's time. save: where the whole map goes at the end.
     """
 
     configuration: Configuration
     params_file: Path | None
     robot: dict[str, Any]
     slam: dict[str, Any]
+    half_width_m: float
     explorer: Explorer
     found: Exploration
     most_s: float
@@ -131,7 +132,7 @@ class ExploreSession:
         nodes = {
             ROBOT: {**self.robot, 'rate': 0.0, 'start_paused': True},
             SLAM: {**self.slam, **slam},
-            GRID: {'publish_period_s': 0.0},
+            GRID: {'publish_period_s': 0.0, 'footprint_radius_m': self.half_width_m},
         }
         return self.configuration.as_ros_parameters(**nodes)
 
@@ -319,8 +320,8 @@ def explore_scene(options: ExploreOptions) -> None:
         }
         configuration, most_s = resolve(options.params, ()), 60 * options.minutes
         ExploreSession(
-            configuration, options.params, robot, task.slam, explorer, found, most_s, made / SAVED,
-            show, interrupt,
+            configuration, options.params, robot, task.slam, task.robot.size_m[1] / 2, explorer,
+            found, most_s, made / SAVED, show, interrupt,
         ).execute()  # fmt: skip
         if not found.maps:
             raise MapError(f'{options.scene}: no map came of {len(found.true_poses)} frames')

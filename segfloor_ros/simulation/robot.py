@@ -55,6 +55,9 @@ PERSON_RADIUS_M = 0.25
 PERSONAL_M = 0.45
 """People come no nearer to where the robot turns: personal space begins there (Hall, 1966)."""
 
+WAITING_S = 5.0
+"""So long somebody waits for the robot, then turns round."""
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -130,6 +133,7 @@ class DrivenRobot:
         self._rims_m_s: Array = np.zeros(2)
         self._places: deque[Array] = deque(maxlen=round(REMEMBERED_S * STEPS_PER_S))
         self._mover_steps = [0] * len(scene.movers)
+        self._mover_signs, self._waited = [1] * len(scene.movers), [0] * len(scene.movers)
         self._mover_times: deque[list[float]] = deque(maxlen=self._places.maxlen)
         self._steps = -round(SETTLING_S * STEPS_PER_S)
         self._felt: list[Array] = []
@@ -209,24 +213,36 @@ class DrivenRobot:
     def _place_movers(self) -> None:
         for index, mover in enumerate(self._scene.movers):
             if self._steps >= 0:
-                self._mover_steps[index] += self._stride(mover, self._mover_steps[index])
+                self._mover_steps[index] += self._stride(mover, index)
             x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
             self._data.mocap_pos[index, :2] = x, y
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
-    def _stride(self, mover: Mover, steps: int) -> int:
+    def _stride(self, mover: Mover, index: int) -> int:
         """Return by how much the time of a mover goes on. Somebody waits where the next step would
-        lead too near to the robot, and goes back before a robot that comes too near.
+        lead too near to the robot, and then turns round; he goes back before a robot that comes
+        too near.
         """
-        stride = STEPS_A_MEASUREMENT
         if not isinstance(mover, Person):
-            return stride
+            return STEPS_A_MEASUREMENT
+        steps = self._mover_steps[index]
+        if steps < STEPS_A_MEASUREMENT:
+            self._mover_signs[index] = 1
+        stride = self._mover_signs[index] * STEPS_A_MEASUREMENT
         ways = [place(mover, (steps + by) / STEPS_PER_S)[:2] for by in (0, stride, -stride)]
         now_m, ahead_m, back_m = np.hypot(*(np.array(ways) - self._data.qpos[:2]).T)
         near_m = self._robot.radius_m + PERSON_RADIUS_M + PERSONAL_M
         if ahead_m >= min(now_m, near_m):
+            self._waited[index] = 0
             return stride
-        return -stride if steps and back_m > now_m and now_m < near_m else 0
+        if steps >= stride and back_m > now_m and now_m < near_m:
+            self._waited[index] = 0
+            return -stride
+        self._waited[index] += STEPS_A_MEASUREMENT
+        if self._waited[index] > WAITING_S * STEPS_PER_S:
+            self._mover_signs[index] *= -1
+            self._waited[index] = 0
+        return 0
 
     def _rim_positions(self) -> Array:
         """Return how far the rims of the left and the right wheels have run (2,), the mean of

@@ -129,6 +129,17 @@ def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     assert driven.mover_times_s(12.0)[0] > 3.0
 
 
+def test_people_who_have_waited_for_it_turn_round() -> None:
+    person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 1.0, returns: false}]'
+    driven = robot_in('lane', 'turtlebot3_burger', person)
+    walked_s = []
+    for time_s in (6.0, 7.5, 8.5):
+        driven.advance(time_s)
+        walked_s.append(driven.mover_times_s(time_s)[0])
+    # He waits from 1.2 s on, has walked back by 7.4 s, and comes again.
+    assert walked_s == pytest.approx([1.165, 0.1, 1.1], abs=0.15)
+
+
 def test_people_go_back_before_it_where_it_comes_too_near() -> None:
     person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 0.5, returns: false}]'
     driven = robot_in('lane', 'turtlebot3_burger', person)
