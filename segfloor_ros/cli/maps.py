@@ -298,7 +298,7 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     if slam is None:
         raise MapError(
             f'{second.name}: shows no place of {first.name}; both must have seen the same things '
-            'from the same side over half a metre or more'
+            'over half a metre or more, or from the other side the same floor with texture'
         )
     sessions = sessions_of(first.file) + sessions_of(second.file)
     merged = MapFile(first.file.header | {'sessions': sessions}, {PART: slam})
