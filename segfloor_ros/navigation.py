@@ -331,14 +331,14 @@ class Explorer:
 
     def take_obstacles(self, points: Array, scan: FloorScan | None, T_map_base: Array) -> None:
         """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
-        drop those on floor that a scan from a pose has seen to be free since.
+        drop those on floor that a scan from a pose has seen to be free since, or under the robot.
         """
         known = np.vstack([self.obstacles, points[:, :2]])
         cells = np.floor(known / CELL_M).astype(np.int64)
         known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
         away_m = np.hypot(in_base[:, 0], in_base[:, 1])
-        kept = away_m < OBSTACLE_REACH_M
+        kept = (away_m < OBSTACLE_REACH_M) & (away_m > self.body.radius_m / 2)
         if scan is not None and len(scan.ranges_m):
             bearing = np.arctan2(in_base[:, 1], in_base[:, 0])
             ray = np.round((bearing - scan.angle_min_rad) / scan.angle_increment_rad).astype(int)

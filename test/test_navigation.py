@@ -151,15 +151,19 @@ def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None
     np.testing.assert_allclose(explorer.obstacles, in_map[1:, :2])
 
 
-def test_obstacles_that_are_out_of_view_are_remembered_until_their_floor_is_seen_free() -> None:
+def test_obstacles_that_are_out_of_view_are_remembered_until_it_sees_their_floor_or_is_there() -> (
+    None
+):
     explorer = Explorer(BODY, 0)
     beside = np.array([(0.0, 1.0, 0.1), (0.0, 1.01, 0.1)])
     explorer.take_obstacles(beside, None, np.eye(4))
     scan = FloorScan(-0.5, 0.1, np.full(11, 2.0, np.float32), None, 4.0)
     explorer.take_obstacles(np.zeros((0, 3)), scan, np.eye(4))
     assert explorer.obstacles.tolist() == [[0.0, 1.0]], 'one a cell'
-    explorer.take_obstacles(np.zeros((0, 3)), scan, pose_of(0.0, 0.0, np.pi / 2))
-    assert not len(explorer.obstacles)
+    for drops in (pose_of(0.0, 0.0, np.pi / 2), pose_of(0.05, 1.0, np.pi)):
+        explorer.take_obstacles(beside, None, np.eye(4))
+        explorer.take_obstacles(np.zeros((0, 3)), scan, drops)
+        assert not len(explorer.obstacles)
 
 
 class Drive:
