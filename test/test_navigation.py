@@ -151,9 +151,7 @@ def test_a_scan_clears_along_its_own_bearings_wherever_the_robot_looks() -> None
     np.testing.assert_allclose(explorer.obstacles, in_map[1:, :2])
 
 
-def test_obstacles_that_are_out_of_view_are_remembered_until_it_sees_their_floor_or_is_there() -> (
-    None
-):
+def test_obstacles_out_of_view_are_remembered_until_it_sees_their_floor_or_is_there() -> None:
     explorer = Explorer(BODY, 0)
     beside = np.array([(0.0, 1.0, 0.1), (0.0, 1.01, 0.1)])
     explorer.take_obstacles(beside, None, np.eye(4))
