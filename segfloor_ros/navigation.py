@@ -209,8 +209,11 @@ class Costmap:
     def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
         at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
-        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there.
+        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there
+        by more than half a cell.
         """
+        if self.standing_m(pose[:2]) >= self._radius_m - self.grid.resolution_m / 2:
+            return 0.0
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
         best, soonest = 0.0, len(ways_m)
@@ -218,7 +221,7 @@ class Costmap:
             room_m = np.array([self.standing_m(pose[:2] + sign * m * ahead) for m in ways_m])
             ends = (room_m >= self._radius_m) | (room_m < room_m[0] - self.grid.resolution_m)
             first = int(np.argmax(ends))
-            if 0 < first < soonest and room_m[first] >= self._radius_m:
+            if first < soonest and room_m[first] >= self._radius_m:
                 best, soonest = sign, first
         return best
 
