@@ -232,12 +232,11 @@ def test_goals_that_are_given_are_driven_to_in_their_order_and_one_in_a_wall_is_
 
 
 def test_a_goal_to_which_a_wall_has_come_too_near_is_reached_from_the_place_beside_it() -> None:
-    for x, is_reached in ((1.15, True), (1.25, False)):
-        goal = Goal(np.array([x, 0.95]))
-        drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, [goal]), np.array([0.6, 0.55, 0.0]))
-        drive.go_on(200.0)
-        assert goal.is_reached == is_reached
-        assert not is_reached or np.hypot(*(drive.pose[:2] - goal.point)) < 0.15 + CELL_M / 2
+    goal = Goal(np.array([1.12, 0.86]))  # The place is at 1.05, 0.75.
+    drive = Drive(grid_of(TWO_ROOMS), Explorer(BODY, [goal]), np.array([0.6, 0.55, 0.0]))
+    drive.go_on(200.0)
+    assert goal.is_reached
+    assert drive.nearest_m > BODY.radius_m - CELL_M / 2
 
 
 DOORS = """
