@@ -165,9 +165,9 @@ class Costmap:
         return nearest, float(away_m[nearest])
 
     def cost_to(self, ways: Ways, point: Array) -> float:
-        """Return the cost of the way to a point (2,), inf where there is none."""
+        """Return the cost of the way to a point (2,), inf where none leads as near as counts."""
         number, away_m = self.nearest_place(point)
-        return float(ways.cost[number]) if away_m < self._radius_m else np.inf
+        return float(ways.cost[number]) if away_m < ARRIVED_M else np.inf
 
     def nearest_in_reach(self, ways: Ways, point: Array) -> tuple[int, bool]:
         """Return the number of the place in reach that is nearest to a point (2,), and whether it
@@ -209,8 +209,11 @@ class Costmap:
     def way_out(self, pose: Array) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
         at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
-        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there.
+        sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there
+        by more than half a cell.
         """
+        if self.standing_m(pose[:2]) >= self._radius_m - self.grid.resolution_m / 2:
+            return 0.0
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
         best, soonest = 0.0, len(ways_m)
@@ -218,7 +221,7 @@ class Costmap:
             room_m = np.array([self.standing_m(pose[:2] + sign * m * ahead) for m in ways_m])
             ends = (room_m >= self._radius_m) | (room_m < room_m[0] - self.grid.resolution_m)
             first = int(np.argmax(ends))
-            if 0 < first < soonest and room_m[first] >= self._radius_m:
+            if first < soonest and room_m[first] >= self._radius_m:
                 best, soonest = sign, first
         return best
 
@@ -306,6 +309,8 @@ class Explorer:
         self._target: Array | None = None
         self._facing: Array = np.zeros(2)
         self._is_in_reach = True
+        self._end: Array = np.full(2, np.inf)
+        """The last place of the way: where something has come near a goal, not the goal."""
         self._in_reach: Array = np.zeros((0, 2))
         self._aside: Array | None = None
         self._planned_s = -np.inf
@@ -331,14 +336,14 @@ class Explorer:
 
     def take_obstacles(self, points: Array, scan: FloorScan | None, T_map_base: Array) -> None:
         """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
-        drop those on floor that a scan from a pose has seen to be free since.
+        drop those on floor that a scan from a pose has seen to be free since, or under the robot.
         """
         known = np.vstack([self.obstacles, points[:, :2]])
         cells = np.floor(known / CELL_M).astype(np.int64)
         known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
         away_m = np.hypot(in_base[:, 0], in_base[:, 1])
-        kept = away_m < OBSTACLE_REACH_M
+        kept = (away_m < OBSTACLE_REACH_M) & (away_m > self.body.radius_m / 2)
         if scan is not None and len(scan.ranges_m):
             bearing = np.arctan2(in_base[:, 1], in_base[:, 0])
             ray = np.round((bearing - scan.angle_min_rad) / scan.angle_increment_rad).astype(int)
@@ -406,13 +411,13 @@ class Explorer:
             goal = self._ahead[0].point if self._ahead else None
             self._aim_at(time_s, goal if self._aside is None else self._aside)
             self.phase = 'driving' if self._ahead else 'done'
-        self.path, self._is_in_reach = np.zeros((0, 2)), True
+        self.path, self._is_in_reach, self._end = np.zeros((0, 2)), True, np.full(2, np.inf)
         if ways is None or self._target is None:
             return
         self._in_reach = costmap.grid.centres_of(ways.cells[np.isfinite(ways.cost)])
         number, self._is_in_reach = costmap.nearest_in_reach(ways, self._target)
-        way = self.grid.centres_of(ways.cells[ways.to(number)])
-        self.path = np.vstack([way, self._target]) if self._is_in_reach else way
+        self.path = self.grid.centres_of(ways.cells[ways.to(number)])
+        self._end = self.grid.centres_of(ways.cells[number])
 
     def _explore(self, time_s: float, frontier: Array | None, driven: Array) -> None:
         """Drive to a frontier; without any turn to see more, then drive to goals. Before each of
@@ -454,20 +459,21 @@ class Explorer:
         """Everything is explored: draw the goals, wherever the map leads; what stands in the way
         now may go.
         """
-        self.phase, self._tries, self._is_drawn, self._target = 'driving', 0, True, None
+        self.phase, self._tries, self._target = 'driving', 0, None
         if isinstance(self.goals, int):
             assert self.grid is not None
             costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
             ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
             places = ways.cells[np.isfinite(ways.cost)]
-            known = [*self.ended, *(goal for goal in self._ahead if goal.blocked)]
-            count = min(self.goals - len(known), len(places))
+            count = min(self.goals, len(places))
+            if not self._is_drawn:
+                self._ahead = [Goal(np.zeros(2), f'goal_{i + 1}') for i in range(count)]
             drawn = self._rng.choice(len(places), count, replace=False)
             points = costmap.grid.centres_of(places[drawn])
-            names = (f'goal_{number}' for number in range(len(known) + 1, self.goals + 1))
-            self._ahead = [goal for goal in self._ahead if goal.blocked]
-            self._ahead += map(Goal, points, names)
+            for goal, point in zip(self._ahead, points, strict=False):
+                goal.point = goal.point if goal.blocked else point
+        self._is_drawn = True
 
     def _aim_at(self, time_s: float, target: Array | None) -> None:
         is_same = (
@@ -482,8 +488,10 @@ class Explorer:
         """Return how to drive along the way, or how to get on where there is none."""
         if time_s < self._turn_until_s:
             return 0.0, self._turned * self.body.turn_rad_s
-        if self._target is not None and np.hypot(*(self._target - pose[:2])) < ARRIVED_M:
-            return self._arrive(time_s, pose)
+        if self._target is not None:
+            away_m, short_m = np.hypot(*(np.array([self._target, self._end]) - pose[:2]).T)
+            if away_m < ARRIVED_M or (self._is_in_reach and short_m < CELL_M):
+                return self._arrive(time_s, pose)
         if np.hypot(*(self._progress_at - pose[:2])) > ARRIVED_M:
             self._progress_s, self._progress_at, self._tries = time_s, pose[:2], 0
         if self.is_done:
