@@ -55,6 +55,9 @@ PERSON_RADIUS_M = 0.25
 PERSONAL_M = 0.45
 """People come no nearer to where the robot turns: personal space begins there (Hall, 1966)."""
 
+CARRIED_M_S, CARRIED_AT_M = 10.0, 10.0
+"""What is faster stands for something that somebody puts down: until then it is out of the way."""
+
 WAITING_S = 5.0
 """So long somebody waits for the robot, then turns round."""
 
@@ -215,7 +218,10 @@ class DrivenRobot:
             if self._steps >= 0:
                 self._mover_steps[index] += self._stride(mover, index)
             x, y, yaw = place(mover, self._mover_steps[index] / STEPS_PER_S)
-            self._data.mocap_pos[index, :2] = x, y
+            is_carried = mover.speed_m_s > CARRIED_M_S and not any(
+                np.allclose(end, (x, y)) for end in (mover.points[0], mover.points[-1])
+            )
+            self._data.mocap_pos[index] = x, y, CARRIED_AT_M * is_carried
             self._data.mocap_quat[index] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
 
     def _stride(self, mover: Mover, index: int) -> int:

@@ -129,6 +129,17 @@ def test_people_wait_for_it_and_walk_on_when_it_is_out_of_their_way() -> None:
     assert driven.mover_times_s(12.0)[0] > 3.0
 
 
+@pytest.mark.parametrize(('end', 'bumps'), [((4, 0), 0), ((0.3, 0), 1)])
+def test_a_crate_that_is_put_down_touches_only_what_is_where_it_is_put(end, bumps) -> None:
+    crate = f'{{points: [[-4, 0], [{end[0]}, {end[1]}]], size: [0.4, 0.4, 0.4], '
+    crates = f'moving_boxes=[{crate} speed_m_s: 100, start_s: 1, stays_s: 40}}]'
+    driven = robot_in('lane', 'turtlebot3_burger', crates)
+    driven.advance(2.0)
+    driven.drive(0.2, 0.0)
+    driven.advance(4.0)
+    assert len(driven.bumps) == bumps
+
+
 def test_people_who_have_waited_for_it_turn_round() -> None:
     person = 'people=[{points: [[2, 0], [-1, 0]], speed_m_s: 1.0, returns: false}]'
     driven = robot_in('lane', 'turtlebot3_burger', person)
