@@ -379,14 +379,16 @@ def is_blocky(image: NDArray[np.uint8]) -> bool:
 
 def _blockiness(image: NDArray[np.uint8]) -> float:
     """Return the ratio of the mean step across the borders of blocks to that in their middle."""
-    image = np.ascontiguousarray(image)
-    steps, last = cv2.absdiff(image[:, 1:], image[:, :-1]), image.shape[1] - _BLOCK_PX
+    grey = image.astype(np.int16)
 
-    def mean_step(column: int) -> float:
-        before, step, after = (steps[:, column + i : last + i : _BLOCK_PX] for i in (-2, -1, 0))
-        quiet = (before < _QUIET_GREY) & (after < _QUIET_GREY) & (step <= _SIGNIFICANT_GREY)
-        count = int(np.count_nonzero(quiet))
-        return float(step.sum(where=quiet)) / count if count >= _MIN_PIXELS else 0.0
+    def mean_step(first: int) -> float:
+        before, at, after, beyond = (
+            grey[:, first + i : grey.shape[1] - 8 + i : _BLOCK_PX] for i in (-2, -1, 0, 1)
+        )
+        quiet = (np.abs(at - before) < _QUIET_GREY) & (np.abs(beyond - after) < _QUIET_GREY)
+        step = np.abs(after - at)
+        quiet &= step <= _SIGNIFICANT_GREY
+        return float(step[quiet].mean()) if np.count_nonzero(quiet) >= _MIN_PIXELS else 0.0
 
     within = 0.5 * (mean_step(_BLOCK_PX + 3) + mean_step(_BLOCK_PX + 5))
     return mean_step(_BLOCK_PX) / max(within, 0.1)
