@@ -246,16 +246,35 @@ def union(a: Region | None, b: Region | None) -> Region | None:
     return np.maximum(a, b)
 
 
-def blank_border(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-    """Return a mask (H, W) uint8, 255 in the black border of a rectified grey image (H, W) and near
-    it, or None where there is none.
-
-    The border is what is exactly 0 and joined to an edge of the image.
+class BlankBorder:
+    """The black border that rectification leaves in the images of one eye: what is exactly 0 in
+    each of them so far, and joined to an edge. A dark thing that touches the edge moves on.
     """
-    edges = (image[0], image[-1], image[:, 0], image[:, -1])
-    if sum(int(np.count_nonzero(edge == 0)) for edge in edges) < 2 * _LEAST_PX:
+
+    def __init__(self) -> None:
+        self._black: NDArray[np.uint8] | None = None
+        self._region: Region | None = None
+
+    def see(self, image: NDArray[np.uint8]) -> Region | None:
+        """Take in a rectified grey image (H, W). Returns a mask (H, W) uint8, 255 in the border and
+        near it, or None where there is none.
+        """
+        black = (image[::_STEP_PX, ::_STEP_PX] == 0).astype(np.uint8)
+        if self._black is not None and self._black.shape == black.shape:
+            black &= self._black
+            if np.array_equal(black, self._black):
+                return self._region
+        self._black, self._region = black, _border(black, image.shape)
+        return self._region
+
+
+def _border(black: NDArray[np.uint8], shape: tuple[int, ...]) -> Region | None:
+    """Return what is black (h, w), 0 or 1, along the edges, and a margin around it, as a mask of an
+    image of a shape (H, W); None for nothing.
+    """
+    edges = (black[0], black[-1], black[:, 0], black[:, -1])
+    if sum(int(np.count_nonzero(edge)) for edge in edges) < _LEAST_PX:
         return None
-    black = (image[::_STEP_PX, ::_STEP_PX] == 0).astype(np.uint8)
     _, label, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
     touching = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
     large = touching[(touching > 0) & (stats[touching, cv2.CC_STAT_AREA] >= _LEAST_PX)]
@@ -265,8 +284,7 @@ def blank_border(image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
     chosen[large] = 255
     size = _MARGIN_PX // _STEP_PX * 2 + 1
     border = cv2.dilate(chosen[label], np.ones((size, size), np.uint8))
-    whole = cv2.resize(border, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.asarray(whole, np.uint8)
+    return np.asarray(cv2.resize(border, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def stamp_ns(message: Any) -> int:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import blank_border, noise_grey, union
+from segfloor_ros.camera.images import BlankBorder, noise_grey, union
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.matching import (
     BLOCK_PX,
@@ -116,6 +116,7 @@ class FloorSegmentation:
         self._camera = camera
         self._settings = settings
         self.network = NetworkFloor()
+        self._border = BlankBorder()
         self._mount: Mount | None = None
         self.fixture = Fixture()
         self._matcher: TwoScaleMatcher
@@ -147,7 +148,7 @@ class FloorSegmentation:
         first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
         columns = np.s_[first_row:, :: column_step(self._camera)]
         with measure('texture'):
-            moving = union(moving, blank_border(left))
+            moving = union(moving, self._border.see(left))
             if said is not None:
                 moving = union(moving, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
             right, measured = stereo_view(left, right)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.images import Region
+from segfloor_ros.camera.images import BlankBorder, Region
 from segfloor_ros.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
 from segfloor_ros.camera.rig.check import RigCheck
 from segfloor_ros.files.results import Arrays
@@ -122,6 +122,7 @@ class StereoSlam:
         self.front_end = FrontEnd(settings, self.map, self.sensors)
         self.back_end = BackEnd(settings, self.map, self.front_end, background)
         self._ground = GroundViews(self.rig)
+        self._border = BlankBorder()
         self._held = HeldResults()
         self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
@@ -179,7 +180,9 @@ class StereoSlam:
                 turned = motion.steady(frame.stamp_ns) @ invert(motion.T_camera_world)
                 self.rig_check.watch(frame, float(rotation_angle(turned[:3, :3])))
                 frame = self.rig_check.corrected(frame)
-            images = Images.of(frame, self._camera, self._settings.mask_dilation_px)
+            images = Images.of(
+                frame, self._camera, self._border.see(frame.left), self._settings.mask_dilation_px
+            )
             track = (
                 self.front_end.track(frame, images) if self.map.keyframes and not fault else None
             )

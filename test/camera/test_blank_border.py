@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segfloor_ros.camera.images import blank_border
+from segfloor_ros.camera.images import BlankBorder
 
 
 def bordered(seed=0):
@@ -18,14 +18,28 @@ def bordered(seed=0):
 def test_the_border_and_a_margin_around_it_are_found():
     image, black = bordered()
     image[40:60, 70:90] = 0  # black, but part of the scene
-    border = blank_border(image) > 0
+    border = BlankBorder().see(image) > 0
     assert border[black].mean() > 0.99  # all but slivers one pixel high
     assert not border[20:85, 45:115].any()
 
 
 def test_images_without_a_border_have_none():
     image, _ = bordered()
-    assert blank_border(np.maximum(image, 1)) is None
+    assert BlankBorder().see(np.maximum(image, 1)) is None
     image = np.maximum(image, 1)
     image[::9, 0] = 0
-    assert blank_border(image) is None
+    assert BlankBorder().see(image) is None
+
+
+def test_a_dark_thing_that_touches_the_border_belongs_to_the_scene():
+    image, _ = bordered()
+    border = BlankBorder()
+    before = border.see(image)
+    dark = image.copy()
+    dark[70:, 20:60] = 0  # a tyre that drives into the view
+    np.testing.assert_array_equal(border.see(dark), before)
+    # One that is there from the first image on counts as border until it moves.
+    border = BlankBorder()
+    assert border.see(dark)[75, 40]
+    np.testing.assert_array_equal(border.see(image), before)
+    np.testing.assert_array_equal(border.see(dark), before)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.camera.images import Region, blank_border, noise_grey, union
+from segfloor_ros.camera.images import Region, noise_grey, union
 from segfloor_ros.camera.model import StereoCamera, StereoFrame, is_disparity
 from segfloor_ros.geometry import Array
 from segfloor_ros.slam.results import StereoSlamSettings
@@ -86,11 +86,18 @@ class Images:
     depth_scale: float = 0.0
 
     @staticmethod
-    def of(frame: StereoFrame, camera: StereoCamera, mask_dilation_px: int = 0) -> Images:
-        """Prepare the images of a frame. mask_dilation_px: of the mask that came with it."""
+    def of(
+        frame: StereoFrame,
+        camera: StereoCamera,
+        border: Region | None = None,
+        mask_dilation_px: int = 0,
+    ) -> Images:
+        """Prepare the images of a frame. border: that rectification leaves in the left one.
+        mask_dilation_px: of the mask that came with it.
+        """
         depth_scale = camera.disparity_times_depth if is_disparity(frame.right) else 0.0
         left, right = frame.left.astype(np.float32), frame.right.astype(np.float32)
-        excluded = blank_border(frame.left)
+        excluded = border
         if frame.excluded is not None:
             excluded = union(excluded, dilate(frame.excluded, mask_dilation_px))
         return Images(left, right, shrink(frame.left), excluded, depth_scale)

@@ -172,7 +172,7 @@ def test_points_that_slide_along_an_edge_do_not_outweigh_wheels(on_wheels):
         grey = np.where(u > edge_px[:, None], 150, 90) + rng.normal(0, 1.5 + texture, u.shape)
         picture = np.clip(grey, 0, 255).astype(np.uint8)
         frame = StereoFrame(FRAMES, round(FRAMES * 1e8), picture, picture)
-        images = Images.of(frame, CAMERA, 0)
+        images = Images.of(frame, CAMERA)
         assert slam.front_end.is_believable(track, images, frame.stamp_ns) == expected
 
 
