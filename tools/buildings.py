@@ -58,7 +58,7 @@ def _flat(rng: Rng) -> Building:
         walls += [[[x, 0], [x, door - 0.5]], [[x, door + 0.5], [x, y]]]
         way += [[x - 0.5, door], [x + 0.5, door]]
     way.append([ends[4] - 1.3, y / 2])
-    tables = [_thing('table', (ends[k] + 1.9, y / 2 + s), rng) for k, s in ((1, 1.0), (2, -1.0))]
+    tables = [_thing('table', (ends[k] + 1.9, y / 2 + s), rng) for k, s in ((1, 1.25), (2, -1.25))]
     return [_rectangle(0, 0, ends[4], y)], walls, tables, way
 
 
