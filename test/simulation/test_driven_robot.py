@@ -85,12 +85,14 @@ def test_it_stops_as_soon_when_it_also_has_to_turn() -> None:
     assert np.hypot(*(after - before)[:2, 3]) == pytest.approx(0.4**2 / 2, abs=0.02)
 
 
-def test_four_wheels_slip_in_a_turn() -> None:
-    driven = robot_in('lane', 'husky')
-    driven.drive(0.0, 0.6)
-    driven.advance(4.0)
-    by_wheels = yaw_of(driven.wheels[-1].T_wheels_base)
-    assert 0.3 < yaw_of(driven.T_world_base(4.0)) / by_wheels < 0.9
+@pytest.mark.parametrize('command', [(0.0, 0.3), (0.0, 0.8), (0.5, 0.3), (0.3, -0.6)])
+def test_four_wheels_slip_in_a_turn_by_about_as_much_as_its_controller_knows(command) -> None:
+    driven = robot_in('hall', 'husky')
+    driven.drive(*command)
+    driven.advance(3.0)
+    turned = yaw_of(driven.T_world_base(3.0))
+    assert turned == pytest.approx(command[1] * 3.0, rel=0.2)
+    assert yaw_of(driven.wheels[-1].T_wheels_base) == pytest.approx(turned, rel=0.2)
 
 
 def test_a_wall_stops_it_and_is_one_bump_while_its_wheels_go_on() -> None:
