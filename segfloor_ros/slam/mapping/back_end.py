@@ -26,7 +26,7 @@ from segfloor_ros.slam.places.loop_closing import (
     plan_closing,
     solve_closing,
 )
-from segfloor_ros.slam.places.loops import LoopDetector
+from segfloor_ros.slam.places.loops import Candidate, LoopDetector
 from segfloor_ros.slam.results import StereoSlamSettings, Track
 from segfloor_ros.slam.rig import OffsetEstimate
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays
@@ -236,7 +236,10 @@ class BackEnd:
 
     def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
         self._is_closing = False
-        if not apply_closing(self._map, closing, result):
+        is_closed = apply_closing(self._map, closing, result)
+        loop, verdict = closing.edges[-1], 'closed' if is_closed else 'contradicts the map'
+        self.loops.candidates.append(Candidate(loop.i, loop.j, loop.T_i_j, verdict))
+        if not is_closed:
             return
         self.loop_count += 1
         copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)

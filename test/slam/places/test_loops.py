@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.geometry import invert, make_transform, se3_exp
+from segfloor_ros.slam.mapping import back_end
 from segfloor_ros.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.slam.places.loop_closing import apply_closing, plan_closing, solve_closing
 from segfloor_ros.slam.places.loops import PlaceMatcher, objection_to_drift
@@ -63,7 +64,18 @@ def test_a_drift_is_found_and_taken_away(closed):
     slam, errors = closed
     assert max(errors[BENT_AT : BENT_AT + 3]) > 0.1
     assert slam.back_end.loop_count >= 1
+    verdicts = [candidate.verdict for candidate in slam.back_end.loops.candidates]
+    assert verdicts.count('closed') == slam.back_end.loop_count
     assert errors[-1] < 0.03
+
+
+def test_a_loop_that_contradicts_the_map_is_not_noted_as_closed(monkeypatch):
+    monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
+    slam, _ = drive(np.array([0.25, 0.0, 0.1, 0.0, 0.03, 0.0]))
+    verdicts = {candidate.verdict for candidate in slam.back_end.loops.candidates}
+    assert 'contradicts the map' in verdicts
+    assert 'closed' not in verdicts
+    assert slam.back_end.loop_count == 0
 
 
 def test_both_ends_become_one_map(closed):
