@@ -378,6 +378,7 @@ class HeldResults:
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
         """Change the results that are held of a submap."""
         self._held = [change(result) if result.in_submap else result for result in self._held]
+        self._lost = [result for result in self._held if not result.tracked][-MOST_LOOKED_BACK:]
 
     def recognise(self, proof: Mapping[int, Track], T_world_odom: Array) -> None:
         """Release the frames once more that were lost when the camera was looked for, from the

@@ -45,7 +45,8 @@ from segfloor_ros.slam.tracking.patch_alignment import sample_patches
 from segfloor_ros.timing import StageTimes
 
 LOST_NS = 1_500_000_000
-"""For so long the camera is looked for in the map; after that it maps on its own."""
+"""For so long every frame is looked for in the map; after that the camera maps on its own. Beside a
+loaded map it does so from the start, and what it maps is outside after so long."""
 
 HARDLY_BEGUN = 5
 """A map of so few keyframes in which the camera gets lost is given up (Mur-Artal and Tardos,
@@ -128,6 +129,7 @@ class StereoSlam:
         self._lost_ns: int | None = None
         self._looked_ns = 0
         self._began_unsure: tuple[Array, Array] | None = None
+        self._loaded_ns: int | None = None
         self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
 
     @property
@@ -183,8 +185,11 @@ class StereoSlam:
             images = Images.of(
                 frame, self._camera, self._border.see(frame.left), self._settings.mask_dilation_px
             )
+            found = None if fault else self._find_in_loaded(frame, images)
             track = (
-                self.front_end.track(frame, images) if self.map.keyframes and not fault else None
+                self.front_end.track(frame, images, found)
+                if self.map.keyframes and not fault
+                else None
             )
             if track is not None:
                 self._held.recognise(
@@ -192,7 +197,8 @@ class StereoSlam:
                 )
                 self._lost_ns = None
                 if not self.back_end.submap.is_beside:
-                    self.back_end.submap, self._began_unsure = Submap.KNOWN, None
+                    self.back_end.submap = Submap.KNOWN
+                    self._began_unsure = self._loaded_ns = None
             elif self.map.keyframes:
                 self.front_end.bridge(frame, fault)
                 self._search_on(frame, images, fault)
@@ -271,6 +277,29 @@ class StereoSlam:
         """End the background threads, if there are any."""
         self.back_end.close()
 
+    def _find_in_loaded(self, frame: StereoFrame, images: Images) -> Track | None:
+        """Map on its own from the first frame on after a map was loaded, and look for every frame
+        in that map for some time; what is mapped after that is outside. Returns a frame that was
+        found; what was mapped is given up then.
+        """
+        back_end, front_end = self.back_end, self.front_end
+        if back_end.submap is Submap.LOADED and front_end.is_searching and not front_end.is_fixed:
+            self._loaded_ns = self._loaded_ns or frame.stamp_ns
+            self._start_submap()
+        if self._loaded_ns is None or back_end.submap is not Submap.LOST:
+            return None
+        if frame.stamp_ns - self._loaded_ns >= LOST_NS:
+            self._loaded_ns, back_end.submap = None, Submap.OUTSIDE
+            self._held.change(_outside)
+            return None
+        features = front_end.extractor.extract(frame.left, images.excluded)
+        found = back_end.find_in_known(images, features, frame.stamp_ns)
+        if found is not None:
+            proof = back_end.take_proof()
+            self._drop_submap()
+            self._held.recognise(proof, front_end.motion.T_world_odom)
+        return found
+
     def _search_on(self, frame: StereoFrame, images: Images, fault: str) -> None:
         """Map on its own where the camera was looked for in vain for some time; or where it did so
         before and is lost again, look for it in the known map.
@@ -283,7 +312,7 @@ class StereoSlam:
         is_long = frame.stamp_ns - self._lost_ns >= LOST_NS
         if self.back_end.submap is Submap.LOST:
             features = front_end.extractor.extract(frame.left, images.excluded)
-            if is_long or self.back_end.sees_known(images, features, frame.stamp_ns):
+            if is_long or self.back_end.find_in_known(images, features, frame.stamp_ns):
                 self._drop_submap()
         elif is_long and not (front_end.is_fixed or self.back_end.submap.is_beside):
             self._start_submap()
@@ -303,7 +332,7 @@ class StereoSlam:
             self.back_end.reset()
         else:
             self.back_end.start_submap()
-        if self.mount is not None:
+        if self.mount is not None and is_known:
             self._mount_meter, self.rig.mount_may_change = None, False
             self._held.keep(False)
         elif self._mount_meter is not None:
@@ -320,8 +349,10 @@ class StereoSlam:
         self._take_adjustment(wait=True)
         self.back_end.drop_submap()
         self.front_end.reset()
+        if self._mount_meter is not None:
+            self._mount_meter.reset()
         self._moving = self._moving and MovingRegions(self._camera)
-        self._held.change(left_out)
+        self._held.change(left_out if self._loaded_ns is None else _looked_for)
 
     def _add_keyframe(
         self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
@@ -358,8 +389,10 @@ class StereoSlam:
         if self.map.keyframes[-1] is not keyframe:  # it was merged into the known map
             keyframe = self.map.keyframes[-1]
             self._moving = self._moving and MovingRegions(self._camera)
+            if self._mount_meter is not None:
+                self._mount_meter.reset()
             self.sensors.reset_world()
-            self._began_unsure = None
+            self._began_unsure = self._loaded_ns = None
             self._held.change(in_merged_map(self.map, self.front_end.motion.T_world_odom))
         self.front_end.continue_from(images, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
@@ -436,6 +469,20 @@ class StereoSlam:
             repeated=self.front_end.repeats.is_repeated,
             outside=self.back_end.submap is Submap.OUTSIDE,
         )
+
+
+def _looked_for(result: FrameResult) -> FrameResult:
+    """Return what is left of a frame of a camera that was looked for in a loaded map, and mapped
+    meanwhile.
+    """
+    return replace(left_out(result), in_submap=False, state=f'lost: {NOTHING_SEEN}')
+
+
+def _outside(result: FrameResult) -> FrameResult:
+    """Return a frame that was not found in a loaded map, as one outside of it."""
+    lost, outside = SUBMAP_WORDS[Submap.LOST], SUBMAP_WORDS[Submap.OUTSIDE]
+    state = result.state.replace(lost, outside)
+    return replace(result, in_submap=False, outside=result.tracked, state=state)
 
 
 def _carried(result: FrameResult, motion: CameraMotion, covariance: Array) -> FrameResult:

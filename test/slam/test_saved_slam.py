@@ -9,6 +9,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert, se3_exp
+from segfloor_ros.slam.mapping.back_end import Submap
 from segfloor_ros.slam.places.loop_closing import as_seen_by
 from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, StereoSlamSettings
 from segfloor_ros.slam.rig import OffsetEstimate, Rig
@@ -25,8 +26,9 @@ def there(count, aside=0.0):
 
 
 def drive(slam, poses):
-    """Return the results, and the errors in metres of the frames that were tracked."""
-    results = [slam.process(ROOM.frame(k, pose))[-1] for k, pose in enumerate(poses)]
+    """Return the latest result of each frame, and the errors in metres of those tracked."""
+    come = [slam.process(ROOM.frame(k, pose)) for k, pose in enumerate(poses)]
+    results = list({r.index: r for batch in come for r in batch}.values())
     pairs = [(r, p) for r, p in zip(results, poses, strict=True) if r.tracked]
     return results, [
         np.linalg.norm((invert(pose) @ r.T_map_odom @ r.T_odom_base)[:3, 3]) for r, pose in pairs
@@ -131,6 +133,38 @@ def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
     new = [r.keyframe for r in results if r.keyframe][-1]
     assert new.cloud.point_id.max() >= before[0]
     assert set(saved['point_stable_id'][:50]) & set(new.cloud.point_id.tolist())
+
+
+def test_a_drive_in_a_loaded_map_maps_on_its_own_at_once_and_gives_that_up_when_it_is_found(mapped):
+    slam = loaded(mapped, localize=False)
+    before, poses = len(slam.map.keyframes), there(25)[10:18]
+    come = [slam.process(ROOM.frame(0, poses[0]))]
+    assert slam.back_end.submap is Submap.LOST and len(slam.map.keyframes) == 1
+    come += [slam.process(ROOM.frame(k, pose)) for k, pose in enumerate(poses) if k]
+    # Nothing is said before it is certain; then all frames come that saw the place.
+    assert [len(batch) for batch in come] == [0, 0, 3, 1, 1, 1, 1, 1]
+    for result, pose in zip((r for batch in come for r in batch), poses, strict=True):
+        assert result.tracked and not result.in_submap and not result.outside
+        off = invert(pose) @ result.T_map_odom @ result.T_odom_base
+        assert np.linalg.norm(off[:3, 3]) < 0.02
+    assert slam.back_end.submap is Submap.KNOWN
+    # Nobody saw these views in two lights: the map is the one that was loaded, and what is new.
+    assert before <= len(slam.map.keyframes) < before + len(poses)
+
+
+def test_what_a_drive_maps_beside_a_loaded_map_comes_once_it_was_looked_for_in_vain(mapped):
+    slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
+    poses = there(25)
+    come = [slam.process(other.frame(k, pose)) for k, pose in enumerate(poses)]
+    sizes = [len(batch) for batch in come]
+    first = next(k for k, size in enumerate(sizes) if size)
+    assert 10 <= first <= 20
+    assert sizes[first:] == [first + 1, *[1] * (len(poses) - first - 1)]
+    results = [r for batch in come for r in batch]
+    assert [r.index for r in results] == list(range(len(poses)))
+    assert all(r.tracked and r.outside and not r.in_submap for r in results)
+    assert all('outside the loaded map' in r.state for r in results)
+    assert sum(r.keyframe is not None for r in results) == len(slam.map.keyframes)
 
 
 def test_another_room_is_not_this_one(mapped):

@@ -41,7 +41,8 @@ class Submap(Enum):
 
     KNOWN: the map of the drive, or a loaded one that it was recognised in. LOADED: a loaded one
     that it is not yet recognised in. The others are submaps beside a known map, until that is
-    recognised: OUTSIDE a loaded one, or LOST, of a camera that got lost.
+    recognised: LOST, of a camera that got lost or is still looked for in a loaded one, where
+    nothing is published; OUTSIDE a loaded one.
     """
 
     KNOWN = auto()
@@ -133,21 +134,26 @@ class BackEnd:
         known = map_to_arrays(self._map) | self.places.to_arrays()
         self._known = KnownMap(self._map, known, of_drive)
         self.reset()
-        self.submap = Submap.LOST if of_drive else Submap.OUTSIDE
+        self.submap = Submap.LOST
 
     def reset(self) -> None:
         """Go on with an empty map; no id is given twice."""
         self._map.reset(self._map.points.num_ever)
         self._reset_places()
 
-    def sees_known(self, images: Images, features: Features, stamp_ns: int) -> bool:
-        """Whether a camera that is lost in a submap is seen to be in the known map."""
-        return self._known is not None and self._known.is_seen(images, features, stamp_ns)
+    def find_in_known(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
+        """Return a frame with its pose in the known map, once several in a row were found there."""
+        return None if self._known is None else self._known.find(images, features, stamp_ns)
+
+    def take_proof(self) -> dict[int, Track]:
+        """Return, once, the frames that were found in the known map, by stamp."""
+        return {} if self._known is None else self._known.take_proof()
 
     def drop_submap(self) -> None:
         """Go back to the known map; what was mapped beside it is lost."""
         assert self._known is not None
-        known, self._known, self.submap = self._known, None, Submap.KNOWN
+        known, self._known = self._known, None
+        self.submap = Submap.KNOWN if known.of_drive else Submap.LOADED
         arrays = known.to_arrays()
         known.restore(arrays)
         self._reset_places(arrays)

@@ -36,7 +36,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
 from segfloor_ros.slam.places.loops import LoopDetector, PlaceMatcher, drift
 from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognition, Relocaliser
-from segfloor_ros.slam.results import NO_POINT, PROOF
+from segfloor_ros.slam.results import NO_POINT, PROOF, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
@@ -236,7 +236,7 @@ class KnownMap:
 
     def __init__(self, own: SparseMap, arrays: Arrays, of_drive: bool) -> None:
         self._own = own
-        self._of_drive = of_drive
+        self.of_drive = of_drive
         self._map = SparseMap(own.rig)
         fill_map(self._map, arrays)
         self._places = PlaceRecognition(self._map)
@@ -259,13 +259,17 @@ class KnownMap:
         return self._matcher.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:
-        if self._of_drive and not self._matcher.is_within_reach(match):
+        if self.of_drive and not self._matcher.is_within_reach(match):
             return False
         return not self._matcher.objection(keyframe, match)
 
-    def is_seen(self, images: Pixels, features: Features, stamp_ns: int) -> bool:
-        """Whether enough frames in a row see the known map, this one the last of them."""
-        return self._relocaliser.find(images, features, stamp_ns) is not None
+    def find(self, images: Pixels, features: Features, stamp_ns: int) -> Track | None:
+        """Return a frame with its pose in the known map, once several in a row were found there."""
+        return self._relocaliser.find(images, features, stamp_ns)
+
+    def take_proof(self) -> dict[int, Track]:
+        """Return, once, the frames that were found, by stamp."""
+        return self._relocaliser.take_proof()
 
     def _own_ids(self, match: Match) -> NDArray[np.int32]:
         """Return the stable ids (N,) that the points of a match have in the drive's own map, -1

@@ -131,11 +131,17 @@ class FrontEnd:
             return 'the image is again the one before although the camera was moving'
         return fault
 
-    def track(self, frame: StereoFrame, images: Images) -> Track | None:
-        """Find the pose of a frame: from the one before, else by its features."""
+    def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
+        """Find the pose of a frame: from the one before, else by its features. found: in this map,
+        by somebody else.
+        """
         self._rotation.see(images.left)
-        prediction = self.motion.predict(frame.stamp_ns)
-        track = self.follower.follow(images, self.local.point_ids, prediction)
+        if found is not None:
+            features = self.extractor.extract(frame.left, images.excluded)
+            track = self._around(images, features, found)
+        else:
+            prediction = self.motion.predict(frame.stamp_ns)
+            track = self.follower.follow(images, self.local.point_ids, prediction)
         if track is None:
             track = self._search(frame, images)
         if track is None or not self.is_believable(track, images, frame.stamp_ns):
@@ -243,8 +249,10 @@ class FrontEnd:
         lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
         lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
         found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
-        if found is None:
-            return None
+        return None if found is None else self._around(images, features, found)
+
+    def _around(self, images: Images, features: Features, found: Track) -> Track | None:
+        """Track all that is in view where the camera was found."""
         pose = found.T_camera_world
         around = self.local.points_around(found.point_ids, pose)
         return self.tracker.track_at(images, features, around, pose)
