@@ -448,12 +448,11 @@ class SparseMap:
     def remove_points(self, ids: NDArray[np.integer]) -> None:
         """Take points out of the map; their rows are free for new ones."""
         self.alive[ids] = False
-        gone = ~self.alive
-        self.edges.drop(gone[self.edges.point])
-        for keyframe in self.keyframes:
-            known = keyframe.point_id != NO_POINT
-            known[known] = gone[keyframe.point_id[known]]
-            keyframe.point_id[known] = NO_POINT
+        dropped = ~self.alive[self.edges.point]
+        keyframes, rows = self.edges.keyframe[dropped], self.edges.row[dropped]
+        for k in np.unique(keyframes):
+            self.keyframes[k].point_id[rows[keyframes == k]] = NO_POINT
+        self.edges.drop(dropped)
 
     def seen_together(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return whether a keyframe observes both points of each pair (a[i], b[i]), (N,); no point
