@@ -251,11 +251,17 @@ class KnownMap:
         return len(self._map.keyframes)
 
     def recognise(self, keyframe: KeyframeRecord, images: Pixels) -> bool:
-        """Whether enough keyframes in a row see the known map, this one the last of them."""
+        """Whether enough keyframes in a row see the known map, this one the last of them. One whose
+        floor is seen elsewhere than its look says nothing: shelves and pictures are all over a
+        building, and so are floors.
+        """
         anywhere = np.ones(len(self._map.keyframes), bool)
-        match = self._matcher.look(keyframe, images, anywhere, ~anywhere)
-        match = match or self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
+        by_look = self._matcher.look(keyframe, images, anywhere, ~anywhere)
+        by_floor = self._matcher.look_at_floor(keyframe, self._floors.like(keyframe.ground))
+        match = by_look or by_floor
         is_possible = match is not None and self._is_possible(keyframe, match)
+        if by_look and by_floor and not self._matcher.agree(by_look, by_floor):
+            is_possible = False
         return self._matcher.add(match if is_possible else None)
 
     def _is_possible(self, keyframe: KeyframeRecord, match: Match) -> bool:

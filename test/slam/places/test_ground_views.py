@@ -10,11 +10,12 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 from segfloor_ros.files.results import from_bytes, to_bytes
 from segfloor_ros.geometry import invert
 from segfloor_ros.slam.mapping.back_end import Submap
+from segfloor_ros.slam.places.loops import PlaceMatcher
 from segfloor_ros.slam.places.views import GroundViews, motion_between
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.saved_slam import load_slam, save_slam
-from segfloor_ros.slam.sparse_map import NOTHING
+from segfloor_ros.slam.sparse_map import NOTHING, Match
 from segfloor_ros.slam.stereo_slam import StereoSlam
 
 HERE, OPPOSITE = planar_pose(0.0, 0.0, 0.1), planar_pose(1.9, 0.1, 3.0)
@@ -163,3 +164,23 @@ def test_a_session_that_starts_the_other_way_is_recognised_by_the_floor(
     found = results[-1].T_map_odom @ results[-1].T_odom_base
     off_m = np.linalg.norm((invert(invert(IN_CORRIDOR[0]) @ TO_IT[-1]) @ found)[:3, 3])
     assert (off_m < 0.02) == is_known
+
+
+def test_a_keyframe_that_looks_like_another_place_than_its_floor_does_counts_for_neither(
+    there, monkeypatch
+):
+    nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
+
+    def looks_like_the_start(matcher, keyframe, *_):
+        if matcher._known is matcher._map:
+            return None
+        return Match(keyframe.index, 0, keyframe.T_camera_world, *nothing)
+
+    monkeypatch.setattr(PlaceMatcher, 'look', looks_like_the_start)
+    monkeypatch.setattr(PlaceMatcher, 'objection', lambda *_: '')
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    load_slam(slam, CAMERA, there[1], 'there.map')
+    room = StereoRoom(0, floor=FLOOR)
+    for k, pose in enumerate(TO_IT):
+        slam.process(room.frame(k, pose))
+    assert slam.back_end.submap is Submap.OUTSIDE
