@@ -67,6 +67,8 @@ and b of the pixel's value a / depth + b."""
 _STEP_PX = 2
 _MARGIN_PX = 12
 """Blocks that are matched and windows of texture reach so far: the border's edge is no texture."""
+_BLACK = 2
+"""So bright a black border is at most: JPEG is not exact."""
 _LEAST_PX = 40
 """Black pixels of the scene that touch the image's edge are fewer, at half the resolution."""
 
@@ -247,8 +249,8 @@ def union(a: Region | None, b: Region | None) -> Region | None:
 
 
 class BlankBorder:
-    """The black border that rectification leaves in the images of one eye: what is exactly 0 in
-    each of them so far, and joined to an edge. A dark thing that touches the edge moves on.
+    """The black border that rectification leaves in the images of one eye: what is black in each
+    of them so far, and joined to an edge. A dark thing that touches the edge moves on.
     """
 
     def __init__(self) -> None:
@@ -259,7 +261,7 @@ class BlankBorder:
         """Take in a rectified grey image (H, W). Returns a mask (H, W) uint8, 255 in the border and
         near it, or None where there is none.
         """
-        black = (image[::_STEP_PX, ::_STEP_PX] == 0).astype(np.uint8)
+        black = (image[::_STEP_PX, ::_STEP_PX] <= _BLACK).astype(np.uint8)
         if self._black is not None and self._black.shape == black.shape:
             black &= self._black
             if np.array_equal(black, self._black):
