@@ -20,11 +20,12 @@ from rclpy.task import Future
 from std_msgs.msg import UInt8MultiArray
 
 from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.images import shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.camera.images import Region, shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.geometry import Array
 from segfloor_ros.messages import arrays, poses
 from segfloor_ros.messages.arrays import (
     camera_info_message,
@@ -95,6 +96,7 @@ class SlamTopics:
         """Have the nodes behind map anew from now on."""
         self.map_start_ns = map_start_ns
         self._last: FrameResult | None = None
+        self._announced_ns: int | None = None
         self._path_messages = poses.PathMessages(self._own.map_frame)
 
     def begin(self, calibration: StereoCalibration, frames: CameraFrames) -> None:
@@ -109,9 +111,8 @@ class SlamTopics:
 
     def publish(self, result: FrameResult) -> None:
         """Publish a frame's pose, none while there is none, and everything of a keyframe."""
-        if result.tracked:
-            self._publish_odometry(result, '' if result.stamp_ns > self.newest_ns else CORRECTED)
-            self.newest_ns = max(result.stamp_ns, self.newest_ns)
+        if result.tracked and result.stamp_ns != self._announced_ns:
+            self._publish_pose(result)
         if result.moving is not None:
             frame_id = self._own.map_frame
             message = arrays.moving_points_message(result.stamp_ns, frame_id, result.moving)
@@ -119,6 +120,19 @@ class SlamTopics:
         if result.keyframe is not None:
             self._publish_keyframe(result, result.keyframe)
         self._last = result
+
+    def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
+        """Publish pose and images of a keyframe that the map has still to take in. moving: a mask
+        (H, W).
+        """
+        self._publish_pose(result)
+        T_map_base = result.T_map_odom @ result.T_odom_base
+        self._publish_view(result, frame.left, frame.right, moving, T_map_base)
+        self._announced_ns = result.stamp_ns
+
+    def _publish_pose(self, result: FrameResult) -> None:
+        self._publish_odometry(result, '' if result.stamp_ns > self.newest_ns else CORRECTED)
+        self.newest_ns = max(result.stamp_ns, self.newest_ns)
 
     def publish_frame(self, frame: StereoFrame) -> None:
         """Publish the rectified images of a tracked frame, shrunk, while someone listens."""
@@ -168,19 +182,35 @@ class SlamTopics:
         self._out.publish('odometry' + suffix, odometry)
 
     def _publish_keyframe(self, result: FrameResult, keyframe: Keyframe) -> None:
-        own, out = self._own, self._out
-        stamp_ns, at = keyframe.stamp_ns, (keyframe.stamp_ns, own.map_frame)
-        images = keyframe.left, keyframe.right
-        self._publish_pair(KEYFRAME_PARTS, stamp_ns, images, self._calibration)
-        moving = np.zeros_like(keyframe.left) if keyframe.moving is None else keyframe.moving
+        if keyframe.stamp_ns != self._announced_ns:
+            T_map_base, moving = keyframe.T_map_base, keyframe.moving
+            self._publish_view(result, keyframe.left, keyframe.right, moving, T_map_base)
+        out, at = self._out, (keyframe.stamp_ns, self._own.map_frame)
+        out.publish('keyframe/features', arrays.features_message(*at, keyframe.features))
+        path = self._path_messages.next(keyframe.stamp_ns, keyframe.path)
+        out.publish('keyframe/path', path)
+        out.publish('map_points', arrays.sparse_cloud_message(*at, keyframe.cloud))
+
+    def _publish_view(
+        self,
+        result: FrameResult,
+        left: NDArray[np.uint8],
+        right: NDArray[Any],
+        moving: Region | None,
+        T_map_base: Array,
+    ) -> None:
+        """Publish what the floor of a keyframe is found by: images (H, W) and a mask of them, the
+        base's pose (4, 4), and which map it belongs to.
+        """
+        own, out, stamp_ns = self._own, self._out, result.stamp_ns
+        at = stamp_ns, own.map_frame
+        self._publish_pair(KEYFRAME_PARTS, stamp_ns, (left, right), self._calibration)
+        moving = np.zeros_like(left) if moving is None else moving
         out.publish(MOVING_MASK, image_message(stamp_ns, self.frames.left, moving))
         covariance = poses.never_certain(result.covariance_in_map)
-        pose = poses.odometry_message(*at, own.base_frame, keyframe.T_map_base, covariance)
+        pose = poses.odometry_message(*at, own.base_frame, T_map_base, covariance)
         out.publish('keyframe/odometry', pose)
-        out.publish('keyframe/features', arrays.features_message(*at, keyframe.features))
-        out.publish('keyframe/path', self._path_messages.next(stamp_ns, keyframe.path))
         out.publish(MAP_START, map_start_message(*at, self.map_start_ns, self._is_loaded))
-        out.publish('map_points', arrays.sparse_cloud_message(*at, keyframe.cloud))
 
 
 class SlamResults:
@@ -215,6 +245,14 @@ class SlamResults:
         self._unsent.extend((result, slam, milliseconds / len(results)) for result in results)
         if len(self._unsent) == 1:
             self._send_next()
+
+    def announce(self, result: FrameResult, frame: StereoFrame, moving: Region | None) -> None:
+        """Publish pose and images of a keyframe at once, while the map takes it in; its floor is
+        found meanwhile. moving: a mask (H, W).
+        """
+        if self.mount is not None and not self._unsent:
+            self._transforms.broadcast(result)
+            self.topics.announce(result, frame, moving)
 
     def report_held(self, stamp_ns: int, slam: StereoSlam) -> None:
         """Report why no result is ready. While the mount is being measured, and by a drive that was

@@ -208,6 +208,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             if own.path_only and mount is None and not own.has_mount:
                 mount = CAMERA_AS_BASE
             self.slam = make_slam(camera, own, mount, background=own.background)
+        self.slam.announce = self._results.announce if self.settings.background else None
         self._results.topics.begin(self._camera.calibration, frames)
         self._sensors.begin(frames.left, self._camera.rectifier.calibration.left.R)
         self._is_started = True

@@ -368,6 +368,11 @@ class HeldResults:
         self._lost: list[FrameResult] = []
         self._keeps = False
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether the next result that is ready comes at once."""
+        return not self._held
+
     def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
         """Take in the next result and return what is ready: nothing while it is of a submap."""
         self._held.append(result)

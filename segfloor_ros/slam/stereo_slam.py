@@ -30,6 +30,7 @@ from segfloor_ros.slam.results import (
     LastPose,
     StereoSlamSettings,
     Track,
+    in_map,
     in_merged_map,
     left_out,
     take_snapshot,
@@ -99,7 +100,9 @@ class StereoSlam:
     background: adjust the map on a thread beside tracking; a keyframe is then published before its
     adjustment, and results depend on timing. rig, map, sensors: what is known of each. rig_check:
     what is wrong with the images. sessions: the drives that made the map it goes on with.
-    front_end, back_end: tracking and mapping. late_masks: of keyframes, when they come.
+    front_end, back_end: tracking and mapping. late_masks: of keyframes, when they come. announce:
+    where given, is called with the outcome of a frame that becomes a keyframe, in ROS frames, the
+    frame and what moves in it, before the map has taken it in; only where results depend on timing.
     """
 
     def __init__(
@@ -131,6 +134,7 @@ class StereoSlam:
         self._began_unsure: tuple[Array, Array] | None = None
         self._loaded_ns: int | None = None
         self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
+        self.announce: Callable[[FrameResult, StereoFrame, Region | None], None] | None = None
 
     @property
     def mount(self) -> Mount | None:
@@ -362,6 +366,10 @@ class StereoSlam:
         if observed is None:
             return None
         self._take_adjustment(wait=True)
+        is_public = self._held.is_empty and not self.back_end.submap.is_beside
+        if self.announce is not None and track is not None and self.mount is not None and is_public:
+            result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
+            self.announce(result, frame, images.excluded)
         self.back_end.mapper.measure_stereo(frame, images, observed)
         motion = self.front_end.motion
         keyframe = KeyframeRecord(

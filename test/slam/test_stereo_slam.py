@@ -110,6 +110,29 @@ def test_the_background_thread_loses_nothing(frames):
         assert np.linalg.norm((invert(a.T_odom_base) @ b.T_odom_base)[:3, 3]) < 0.05
 
 
+def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(frames):
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    announced = {}
+
+    def announce(result, frame, moving):
+        assert slam.map.keyframes[-1].stamp_ns < result.stamp_ns  # not yet in the map
+        announced[result.stamp_ns] = result, frame, moving
+
+    slam.announce = announce
+    results = [result for frame in frames for result in slam.process(frame)]
+    slam.close()
+    keyframes = [r for r in results if r.keyframe]
+    # The first one begins the map.
+    assert list(announced) == [r.stamp_ns for r in keyframes[1:]]
+    for result in keyframes[1:]:
+        early, frame, _ = announced[result.stamp_ns]
+        np.testing.assert_array_equal(frame.left, result.keyframe.left)
+        np.testing.assert_allclose(early.T_odom_base, result.T_odom_base, atol=1e-12)
+        T_map_base = early.T_map_odom @ early.T_odom_base
+        np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=1e-12)
+        np.testing.assert_allclose(early.covariance, result.covariance, atol=1e-12)
+
+
 def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     for frame in frames[:12]:
