@@ -208,7 +208,9 @@ class StereoSlam:
                 self._search_on(frame, images, fault)
         is_wanted = not fault and self.back_end.wants_keyframe(track)
         searched = None
-        if self._moving is not None and self._moving.is_due(is_wanted, track is not None):
+        if self._moving is not None and self._moving.is_due(
+            frame.stamp_ns, is_wanted, track is not None
+        ):
             with self._times.measure('moving'):
                 searched = self._moving.search(
                     frame,

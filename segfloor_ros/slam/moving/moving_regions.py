@@ -38,6 +38,9 @@ from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
 from segfloor_ros.slam.tracking.pose import FLOOR_M
 
+MIN_SINCE_NS = 200_000_000
+"""Frames are searched so far apart at least, or as keyframes."""
+
 DISPARITIES = 64
 BLOCK_PX = 5
 P1, P2, SPECKLE_PX = 100, 400, 40
@@ -113,19 +116,20 @@ class MovingRegions:
         self._views: deque[DepthView] = deque(maxlen=KEPT_VIEWS)
         self._found: NDArray[np.uint8] | None = None
         self._meter = MovingPointMeter()
-        self._frames_since = 0
+        self._frames_since, self._searched_ns = 0, 0
         self._exposure = 1.0, 0.0
 
-    def is_due(self, is_keyframe: bool, is_tracked: bool) -> bool:
+    def is_due(self, stamp_ns: int, is_keyframe: bool, is_tracked: bool) -> bool:
         """Whether to search a frame."""
         self._frames_since += 1
-        return is_keyframe or (is_tracked and self._frames_since >= MIN_FRAMES)
+        is_late = stamp_ns - self._searched_ns >= MIN_SINCE_NS
+        return is_keyframe or (is_tracked and is_late and self._frames_since >= MIN_FRAMES)
 
     def search(
         self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None
     ) -> Searched:
         """Find what moves in a frame whose pose is known."""
-        self._frames_since = 0
+        self._frames_since, self._searched_ns = 0, frame.stamp_ns
         disparity = self.measure(frame.left, frame.right)
         left = self._pair[0]
         view = FlowView(frame.stamp_ns, left, disparity, T_odom_camera)

@@ -161,3 +161,16 @@ def test_eyes_of_different_brightness_see_the_same_wall(regions):
         found = regions.search(StereoFrame(0, 0, left, darker), np.eye(4), np.eye(4), None)
         assert not found.moving.any()
     assert (np.abs(found.disparity - WALL_PX) < 0.5).mean() > 0.9
+
+
+@pytest.mark.parametrize(('rate_hz', 'between'), [(3, 3), (10, 3), (30, 6)])
+def test_a_fast_camera_is_not_searched_more_often(rate_hz, between):
+    made, texture = MovingRegions(CAMERA), noise(600)
+    searched = []
+    for k in range(4 * between):
+        stamp_ns = (1 + k) * 1_000_000_000 // rate_hz
+        if made.is_due(stamp_ns, is_keyframe=k == 0, is_tracked=True):
+            frame = StereoFrame(k, stamp_ns, *pair(texture, WALL_PX))
+            made.search(frame, np.eye(4), np.eye(4), None)
+            searched.append(k)
+    assert searched == [0, between, 2 * between, 3 * between]
