@@ -69,6 +69,8 @@ _MARGIN_PX = 12
 """Blocks that are matched and windows of texture reach so far: the border's edge is no texture."""
 _BLACK = 2
 """So bright a black border is at most: JPEG is not exact."""
+_SURELY = 3
+"""What was seen so often to be bright is part of the scene."""
 _LEAST_PX = 40
 """Black pixels of the scene that touch the image's edge are fewer, at half the resolution."""
 
@@ -249,25 +251,31 @@ def union(a: Region | None, b: Region | None) -> Region | None:
 
 
 class BlankBorder:
-    """The black border that rectification leaves in the images of one eye: what is black in each
-    of them so far, and joined to an edge. A dark thing that touches the edge moves on.
+    """The black border that rectification leaves in the images of one eye: what is black, joined to
+    an edge, and was never seen to be anything else. A dark thing at the edge moves on.
     """
 
     def __init__(self) -> None:
-        self._black: NDArray[np.uint8] | None = None
-        self._region: Region | None = None
+        self._times_bright: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._last: tuple[NDArray[np.uint8], Region | None] | None = None
 
     def see(self, image: NDArray[np.uint8]) -> Region | None:
         """Take in a rectified grey image (H, W). Returns a mask (H, W) uint8, 255 in the border and
         near it, or None where there is none.
         """
-        black = (image[::_STEP_PX, ::_STEP_PX] <= _BLACK).astype(np.uint8)
-        if self._black is not None and self._black.shape == black.shape:
-            black &= self._black
-            if np.array_equal(black, self._black):
-                return self._region
-        self._black, self._region = black, _border(black, image.shape)
-        return self._region
+        is_black = image[::_STEP_PX, ::_STEP_PX] <= _BLACK
+        if self._last is None or self._times_bright.shape != is_black.shape:
+            self._times_bright = np.zeros(is_black.shape, np.uint8)
+        # A single image may be spoilt.
+        bright = self._times_bright
+        bright[~is_black & (bright < _SURELY)] += 1
+        black = (is_black & (bright < _SURELY)).astype(np.uint8)
+        if self._last is None or not np.array_equal(black, self._last[0]):
+            self._last = black, _border(black, image.shape)
+        region = self._last[1]
+        if region is not None and region.shape != image.shape:
+            region = _border(black, image.shape)
+        return region
 
 
 def _border(black: NDArray[np.uint8], shape: tuple[int, ...]) -> Region | None:

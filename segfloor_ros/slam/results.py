@@ -370,7 +370,7 @@ class HeldResults:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the next result that is ready comes at once."""
+        """Whether nothing is held back."""
         return not self._held
 
     def take(self, result: FrameResult, mount: Mount | None) -> list[FrameResult]:
@@ -381,7 +381,9 @@ class HeldResults:
         return [] if result.in_submap else self.release(mount)
 
     def change(self, change: Callable[[FrameResult], FrameResult]) -> None:
-        """Change the results that are held of a submap."""
+        """Change the results that are held of a submap; those that are lost then may be recognised
+        later.
+        """
         self._held = [change(result) if result.in_submap else result for result in self._held]
         self._lost = [result for result in self._held if not result.tracked][-MOST_LOOKED_BACK:]
 

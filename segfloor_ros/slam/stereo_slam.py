@@ -82,6 +82,10 @@ class LateMasks:
     def take_points_back(self) -> None:
         """Remove the points; while nothing is being adjusted."""
         for keyframe, mask in self._masks:
+            if keyframe.index >= len(self._map.keyframes):
+                continue
+            if self._map.keyframes[keyframe.index] is not keyframe:
+                continue  # of a submap that was given up or merged
             ids = keyframe.point_id[is_inside(mask, keyframe.observations.uvd_px[:, :2])]
             ids = ids[ids != NO_POINT]
             self._map.remove_points(ids[self._map.points['born'][ids] >= keyframe.index])
@@ -189,20 +193,18 @@ class StereoSlam:
             images = Images.of(
                 frame, self._camera, self._border.see(frame.left), self._settings.mask_dilation_px
             )
-            found = None if fault else self._find_in_loaded(frame, images)
+            found, proof = self._find_in_loaded(frame, images, fault)
             track = (
                 self.front_end.track(frame, images, found)
                 if self.map.keyframes and not fault
                 else None
             )
             if track is not None:
-                self._held.recognise(
-                    self.front_end.relocaliser.take_proof(), self.front_end.motion.T_world_odom
-                )
+                proof |= self.front_end.relocaliser.take_proof()
+                self._held.recognise(proof, self.front_end.motion.T_world_odom)
                 self._lost_ns = None
                 if not self.back_end.submap.is_beside:
-                    self.back_end.submap = Submap.KNOWN
-                    self._began_unsure = self._loaded_ns = None
+                    self.back_end.submap, self._began_unsure = Submap.KNOWN, None
             elif self.map.keyframes:
                 self.front_end.bridge(frame, fault)
                 self._search_on(frame, images, fault)
@@ -283,28 +285,37 @@ class StereoSlam:
         """End the background threads, if there are any."""
         self.back_end.close()
 
-    def _find_in_loaded(self, frame: StereoFrame, images: Images) -> Track | None:
+    def _find_in_loaded(
+        self, frame: StereoFrame, images: Images, fault: str
+    ) -> tuple[Track | None, dict[int, Track]]:
         """Map on its own from the first frame on after a map was loaded, and look for every frame
         in that map for some time; what is mapped after that is outside. Returns a frame that was
-        found; what was mapped is given up then.
+        found, and those before that prove it, by stamp; what was mapped is given up then, as it is
+        where an image cannot be tracked.
         """
         back_end, front_end = self.back_end, self.front_end
-        if back_end.submap is Submap.LOADED and front_end.is_searching and not front_end.is_fixed:
-            self._loaded_ns = self._loaded_ns or frame.stamp_ns
+        if fault and back_end.is_beside_loaded:
+            self._drop_submap()
+        if fault or front_end.is_fixed:
+            return None, {}
+        if back_end.submap is Submap.LOADED and front_end.is_searching:
             self._start_submap()
-        if self._loaded_ns is None or back_end.submap is not Submap.LOST:
-            return None
-        if frame.stamp_ns - self._loaded_ns >= LOST_NS:
-            self._loaded_ns, back_end.submap = None, Submap.OUTSIDE
+            self._loaded_ns = None
+        elif back_end.is_beside_loaded and self._loaded_ns is None:
+            # Not before: to make a submap beside a large map takes so long that frames are skipped.
+            self._loaded_ns = frame.stamp_ns
+        if not back_end.is_beside_loaded:
+            return None, {}
+        if self._loaded_ns is not None and frame.stamp_ns - self._loaded_ns >= LOST_NS:
+            back_end.submap = Submap.OUTSIDE
             self._held.change(_outside)
-            return None
+            return None, {}
         features = front_end.extractor.extract(frame.left, images.excluded)
         found = back_end.find_in_known(images, features, frame.stamp_ns)
+        proof = back_end.take_proof()
         if found is not None:
-            proof = back_end.take_proof()
             self._drop_submap()
-            self._held.recognise(proof, front_end.motion.T_world_odom)
-        return found
+        return found, proof
 
     def _search_on(self, frame: StereoFrame, images: Images, fault: str) -> None:
         """Map on its own where the camera was looked for in vain for some time; or where it did so
@@ -316,7 +327,10 @@ class StereoSlam:
             return
         self._lost_ns = frame.stamp_ns if self._lost_ns is None else self._lost_ns
         is_long = frame.stamp_ns - self._lost_ns >= LOST_NS
-        if self.back_end.submap is Submap.LOST:
+        if self.back_end.is_beside_loaded:
+            if is_long:
+                self._drop_submap()
+        elif self.back_end.submap is Submap.LOST:
             features = front_end.extractor.extract(frame.left, images.excluded)
             if is_long or self.back_end.find_in_known(images, features, frame.stamp_ns):
                 self._drop_submap()
@@ -352,13 +366,16 @@ class StereoSlam:
     def _drop_submap(self) -> None:
         """Look for the camera in the known map again; what was mapped beside it is lost."""
         self._lost_ns = None
+        was_looked_for = self.back_end.is_beside_loaded
         self._take_adjustment(wait=True)
         self.back_end.drop_submap()
         self.front_end.reset()
+        if was_looked_for:
+            self.sensors.reset_world()
         if self._mount_meter is not None:
             self._mount_meter.reset()
         self._moving = self._moving and MovingRegions(self._camera)
-        self._held.change(left_out if self._loaded_ns is None else _looked_for)
+        self._held.change(_looked_for if was_looked_for else left_out)
 
     def _add_keyframe(
         self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
@@ -402,7 +419,7 @@ class StereoSlam:
             if self._mount_meter is not None:
                 self._mount_meter.reset()
             self.sensors.reset_world()
-            self._began_unsure = self._loaded_ns = None
+            self._began_unsure = None
             self._held.change(in_merged_map(self.map, self.front_end.motion.T_world_odom))
         self.front_end.continue_from(images, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
@@ -10,7 +12,7 @@ from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.geometry import invert, se3_exp
 from segfloor_ros.slam.mapping.back_end import Submap
-from segfloor_ros.slam.places.loop_closing import as_seen_by
+from segfloor_ros.slam.places.loop_closing import KnownMap, as_seen_by
 from segfloor_ros.slam.results import UNKNOWN_COVARIANCE, StereoSlamSettings
 from segfloor_ros.slam.rig import OffsetEstimate, Rig
 from segfloor_ros.slam.saved_slam import fill_map, load_slam, moved, save_slam
@@ -165,6 +167,44 @@ def test_what_a_drive_maps_beside_a_loaded_map_comes_once_it_was_looked_for_in_v
     assert all(r.tracked and r.outside and not r.in_submap for r in results)
     assert all('outside the loaded map' in r.state for r in results)
     assert sum(r.keyframe is not None for r in results) == len(slam.map.keyframes)
+
+
+def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
+    """Two sightings by one frame and one by another are no proof."""
+    slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
+    stamps, find = [], KnownMap.find
+    monkeypatch.setattr(KnownMap, 'find', lambda known, *a: stamps.append(a[2]) or find(known, *a))
+    here = there(25)[10]
+    rooms = [other, other, other, ROOM, ROOM, ROOM]
+    for k, room in enumerate(rooms):
+        slam.process(room.frame(5 + k, here))
+        assert (slam.back_end.submap is Submap.KNOWN) == (k == 5)
+    assert len(stamps) == len(set(stamps)) == len(rooms)
+
+
+def test_after_a_pose_that_was_wrong_the_whole_map_is_searched_again(mapped, monkeypatch):
+    monkeypatch.setattr('segfloor_ros.slam.places.place_recognition.NARROW_SEARCHES', 20)
+    slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
+    slam.process(other.frame(5, poses[0]))
+    slam.search_near(planar_pose(30.0, 0.0, 0.0), 1.0, 0.5)
+    results = [r for k in range(25) for r in slam.process(other.frame(6 + k, poses[0]))]
+    assert slam.back_end.submap is Submap.LOST
+    assert not any(r.tracked for r in results)
+    come = [slam.process(ROOM.frame(31 + k, pose)) for k, pose in enumerate(poses[10:18])]
+    assert come[-1][-1].tracked and slam.back_end.submap is Submap.KNOWN
+
+
+def test_images_that_cannot_be_tracked_are_said_while_a_loaded_map_is_searched(mapped):
+    slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
+    for k in range(3):
+        assert slam.process(other.frame(5 + k, poses[k])) == []
+    dark = [slam.process(replace(f, left=0 * f.left, right=0 * f.right)) for f in
+            (other.frame(8 + k, poses[0]) for k in range(3))]  # fmt: skip
+    results = [r for batch in dark for r in batch]
+    assert len(results) == 6 and not any(r.tracked or r.in_submap for r in results)
+    assert all('without contrast' in r.state for r in results[-3:])
+    come = [slam.process(ROOM.frame(11 + k, pose)) for k, pose in enumerate(poses[10:18])]
+    assert come[-1][-1].tracked and slam.back_end.submap is Submap.KNOWN
 
 
 def test_another_room_is_not_this_one(mapped):

@@ -41,8 +41,8 @@ class Submap(Enum):
 
     KNOWN: the map of the drive, or a loaded one that it was recognised in. LOADED: a loaded one
     that it is not yet recognised in. The others are submaps beside a known map, until that is
-    recognised: LOST, of a camera that got lost or is still looked for in a loaded one, where
-    nothing is published; OUTSIDE a loaded one.
+    recognised. LOST: results are held back; the camera got lost, or a map was loaded and is still
+    searched. OUTSIDE: a loaded map was searched in vain, and results come.
     """
 
     KNOWN = auto()
@@ -90,6 +90,12 @@ class BackEnd:
     def idle(self) -> bool:
         """Whether nothing is being solved that a new keyframe would have to wait for."""
         return self._local.idle
+
+    @property
+    def is_beside_loaded(self) -> bool:
+        """Whether it maps a submap while the camera is still looked for in a loaded map."""
+        known = self._known
+        return self.submap is Submap.LOST and known is not None and not known.of_drive
 
     @property
     def holds_one(self) -> bool:
@@ -159,8 +165,11 @@ class BackEnd:
         self._reset_places(arrays)
 
     def keep_submap(self) -> bool:
-        """Give the known map up, where the submap has more keyframes. Returns whether it did."""
-        if self._known is None or len(self._map.keyframes) <= self._known.num_keyframes:
+        """Give the known map up, where the drive made it and the submap has more keyframes. Returns
+        whether it did.
+        """
+        known = self._known
+        if known is None or not known.of_drive or len(self._map.keyframes) <= known.num_keyframes:
             return False
         self._known, self.submap = None, Submap.KNOWN
         return True

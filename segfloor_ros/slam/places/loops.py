@@ -69,8 +69,8 @@ second of all points the other side may see through: edges hide what is behind b
 @dataclass(frozen=True)
 class Candidate:
     """What became of a keyframe that saw a place, both by index, as it seemed from T_keyframe_place
-    (4, 4): verdict is 'seen' for one that counts, 'closed' for the last of a loop, too, else what
-    spoke against it.
+    (4, 4): verdict is 'seen' for one that counts, else what spoke against it. The last of a loop
+    comes once more, as 'closed', or with what spoke against the loop.
     """
 
     keyframe: int

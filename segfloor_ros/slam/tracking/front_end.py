@@ -132,8 +132,8 @@ class FrontEnd:
         return fault
 
     def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
-        """Find the pose of a frame: from the one before, else by its features. found: in this map,
-        by somebody else.
+        """Find the pose of a frame: from the one before, else by its features. found: where
+        it is in this map, as that was found while the camera was in a submap.
         """
         self._rotation.see(images.left)
         if found is not None:
