@@ -167,7 +167,7 @@ class StereoSlam:
         last = self.front_end.motion.last_pose()
         if self.mount is None or self.front_end.motion.state.is_lost:
             return None
-        return replace(last, covariance=self._covariance())
+        return replace(last, covariance=_covariance(self.front_end.motion, self._began_unsure))
 
     def add(self, measurement: Measurement) -> None:
         """Take in what wheels or an IMU measured; those up to a frame come before it."""
@@ -183,7 +183,11 @@ class StereoSlam:
             fault = self.front_end.fault(frame)
             if self.front_end.repeats.is_carried and not fault:
                 result = self._result(frame, None, '', None)
-                result = _carried(result, self.front_end.motion, self._covariance())
+                result = _carried(
+                    result,
+                    self.front_end.motion,
+                    _covariance(self.front_end.motion, self._began_unsure),
+                )
                 return self._held.take(result, self.mount)
             if not fault:
                 motion = self.front_end.motion
@@ -236,8 +240,11 @@ class StereoSlam:
         """Return the results that are still held back after the last frame. Of a map and a submap
         that was not recognised in it the larger one stays, and frames of the other are in none
         (`left_out`): those that were returned before, where the map begins after them. A map that
-        was loaded stays.
+        was loaded stays; what was mapped while it was searched is outside of it.
         """
+        if self.back_end.is_beside_loaded:
+            self.back_end.submap = Submap.OUTSIDE
+            self._held.change(_outside)
         if self.back_end.submap is Submap.LOST:
             self._take_adjustment(wait=True)
             if not self.sessions and self.back_end.keep_submap():
@@ -311,8 +318,7 @@ class StereoSlam:
             self._held.change(_outside)
             return None, {}
         features = front_end.extractor.extract(frame.left, images.excluded)
-        found = back_end.find_in_known(images, features, frame.stamp_ns)
-        proof = back_end.take_proof()
+        found, proof = back_end.find_in_known(images, features, frame.stamp_ns)
         if found is not None:
             self._drop_submap()
         return found, proof
@@ -332,7 +338,8 @@ class StereoSlam:
                 self._drop_submap()
         elif self.back_end.submap is Submap.LOST:
             features = front_end.extractor.extract(frame.left, images.excluded)
-            if is_long or self.back_end.find_in_known(images, features, frame.stamp_ns):
+            found, _ = self.back_end.find_in_known(images, features, frame.stamp_ns)
+            if is_long or found is not None:
                 self._drop_submap()
         elif is_long and not (front_end.is_fixed or self.back_end.submap.is_beside):
             self._start_submap()
@@ -460,14 +467,6 @@ class StereoSlam:
         if change():
             self.front_end.follow_map(before, self.map.keyframes[-1].T_camera_world)
 
-    def _covariance(self) -> Array:
-        """Return the covariance (6, 6) of the last pose, with that of where its map began."""
-        motion, began = self.front_end.motion, self._began_unsure
-        if began is None:
-            return motion.covariance
-        A = adjoint(motion.T_camera_world @ invert(began[0]))
-        return motion.covariance + A @ began[1] @ A.T
-
     def _result(
         self, frame: StereoFrame, track: Track | None, fault: str, keyframe: Keyframe | None
     ) -> FrameResult:
@@ -486,7 +485,7 @@ class StereoSlam:
             tracked,
             motion.T_odom_camera,
             motion.T_world_odom,
-            self._covariance() if tracked else unknown,
+            _covariance(self.front_end.motion, self._began_unsure) if tracked else unknown,
             len(track.point_ids) if track else 0,
             state if tracked else f'lost: {why}',
             self.map.keyframes[-1].stamp_ns if self.map.keyframes else frame.stamp_ns,
@@ -496,6 +495,16 @@ class StereoSlam:
             repeated=self.front_end.repeats.is_repeated,
             outside=self.back_end.submap is Submap.OUTSIDE,
         )
+
+
+def _covariance(motion: CameraMotion, began: tuple[Array, Array] | None) -> Array:
+    """Return the covariance (6, 6) of the last pose; began: pose (4, 4) and covariance of where its
+    map began, if that was unsure.
+    """
+    if began is None:
+        return motion.covariance
+    A = adjoint(motion.T_camera_world @ invert(began[0]))
+    return motion.covariance + A @ began[1] @ A.T
 
 
 def _looked_for(result: FrameResult) -> FrameResult:

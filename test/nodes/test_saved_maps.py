@@ -291,7 +291,7 @@ def test_a_map_that_was_not_recognised_is_not_overwritten(saved, loaded) -> None
         take = lambda message: transforms.extend(message.transforms)  # noqa: E731
         chain.graph.tester.create_subscription(TFMessage, '/tf', take, 100)
     room = StereoRoom(seed=77)
-    other = [room.frame(k, planar_pose(0.06 * k, 0.0, 0.01 * k)) for k in range(16)]
+    other = [room.frame(k, planar_pose(0.05 * k, 0.0, 0.01 * k)) for k in range(20)]
     answers = chain.drive(other)
     chain.mapped(last_keyframe(answers))
     # Where the robot is in the loaded map is not known: tf does not say it, poses are unsure.

@@ -169,6 +169,13 @@ def test_what_a_drive_maps_beside_a_loaded_map_comes_once_it_was_looked_for_in_v
     assert sum(r.keyframe is not None for r in results) == len(slam.map.keyframes)
 
 
+def test_what_a_short_drive_maps_beside_a_loaded_map_comes_at_its_end(mapped):
+    slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
+    assert not [r for k in range(8) for r in slam.process(other.frame(5 + k, there(8)[k]))]
+    rest = slam.finish()
+    assert [r.tracked and r.outside for r in rest] == [True] * 8
+
+
 def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
     """Two sightings by one frame and one by another are no proof."""
     slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)

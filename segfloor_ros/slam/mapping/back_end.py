@@ -147,13 +147,14 @@ class BackEnd:
         self._map.reset(self._map.points.num_ever)
         self._reset_places()
 
-    def find_in_known(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
-        """Return a frame with its pose in the known map, once several in a row were found there."""
-        return None if self._known is None else self._known.find(images, features, stamp_ns)
-
-    def take_proof(self) -> dict[int, Track]:
-        """Return, once, the frames that were found in the known map, by stamp."""
-        return {} if self._known is None else self._known.take_proof()
+    def find_in_known(
+        self, images: Images, features: Features, stamp_ns: int
+    ) -> tuple[Track | None, dict[int, Track]]:
+        """Return a frame with its pose in the known map, once several in a row were found there,
+        and those, by stamp.
+        """
+        assert self._known is not None
+        return self._known.find(images, features, stamp_ns)
 
     def drop_submap(self) -> None:
         """Go back to the known map; what was mapped beside it is lost."""

@@ -269,13 +269,14 @@ class KnownMap:
             return False
         return not self._matcher.objection(keyframe, match)
 
-    def find(self, images: Pixels, features: Features, stamp_ns: int) -> Track | None:
-        """Return a frame with its pose in the known map, once several in a row were found there."""
-        return self._relocaliser.find(images, features, stamp_ns)
-
-    def take_proof(self) -> dict[int, Track]:
-        """Return, once, the frames that were found, by stamp."""
-        return self._relocaliser.take_proof()
+    def find(
+        self, images: Pixels, features: Features, stamp_ns: int
+    ) -> tuple[Track | None, dict[int, Track]]:
+        """Return a frame with its pose in the known map, once several in a row were found there,
+        and those, by stamp.
+        """
+        found = self._relocaliser.find(images, features, stamp_ns)
+        return found, self._relocaliser.take_proof()
 
     def _own_ids(self, match: Match) -> NDArray[np.int32]:
         """Return the stable ids (N,) that the points of a match have in the drive's own map, -1
