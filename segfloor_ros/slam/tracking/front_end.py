@@ -138,7 +138,7 @@ class FrontEnd:
         self._rotation.see(images.left)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
-            track = self._around(images, features, found)
+            track = self._relocalise(images, features, frame.stamp_ns, found)
         else:
             prediction = self.motion.predict(frame.stamp_ns)
             track = self.follower.follow(images, self.local.point_ids, prediction)
@@ -242,20 +242,22 @@ class FrontEnd:
                 return found
         return replace(close, is_poor=True)
 
-    def _relocalise(self, images: Images, features: Features, stamp_ns: int) -> Track | None:
-        """Look for the view in the whole map."""
-        motion = self.motion
-        is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
-        lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
-        lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
-        found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
-        return None if found is None else self._around(images, features, found)
-
-    def _around(self, images: Images, features: Features, found: Track) -> Track | None:
-        """Track all that is in view where the camera was found."""
-        pose = found.T_camera_world
-        around = self.local.points_around(found.point_ids, pose)
-        return self.tracker.track_at(images, features, around, pose)
+    def _relocalise(
+        self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
+    ) -> Track | None:
+        """Look for the view in the whole map, unless it was found there already, and track all that
+        is in view there.
+        """
+        if found is None:
+            motion = self.motion
+            is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
+            lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
+            lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
+            found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
+        if found is None:
+            return None
+        around = self.local.points_around(found.point_ids, found.T_camera_world)
+        return self.tracker.track_at(images, features, around, found.T_camera_world)
 
     def is_new_place(self) -> bool:
         """Whether the sensors have the camera somewhere new: the map goes on from there."""
