@@ -256,26 +256,23 @@ class BlankBorder:
     """
 
     def __init__(self) -> None:
-        self._times_bright: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
-        self._last: tuple[NDArray[np.uint8], Region | None] | None = None
+        self._shape: tuple[int, ...] = ()
 
     def see(self, image: NDArray[np.uint8]) -> Region | None:
         """Take in a rectified grey image (H, W). Returns a mask (H, W) uint8, 255 in the border and
         near it, or None where there is none.
         """
         is_black = image[::_STEP_PX, ::_STEP_PX] <= _BLACK
-        if self._last is None or self._times_bright.shape != is_black.shape:
+        if self._shape != image.shape:
+            self._shape, self._black = image.shape, np.zeros(0, np.uint8)
             self._times_bright = np.zeros(is_black.shape, np.uint8)
         # A single image may be spoilt.
         bright = self._times_bright
         bright[~is_black & (bright < _SURELY)] += 1
         black = (is_black & (bright < _SURELY)).astype(np.uint8)
-        if self._last is None or not np.array_equal(black, self._last[0]):
-            self._last = black, _border(black, image.shape)
-        region = self._last[1]
-        if region is not None and region.shape != image.shape:
-            region = _border(black, image.shape)
-        return region
+        if not np.array_equal(black, self._black):
+            self._black, self._region = black, _border(black, image.shape)
+        return self._region
 
 
 def _border(black: NDArray[np.uint8], shape: tuple[int, ...]) -> Region | None:

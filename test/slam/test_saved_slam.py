@@ -176,6 +176,17 @@ def test_what_a_short_drive_maps_beside_a_loaded_map_comes_at_its_end(mapped):
     assert [r.tracked and r.outside for r in rest] == [True] * 8
 
 
+def test_a_late_mask_of_a_submap_that_was_given_up_takes_nothing_from_the_map(mapped):
+    slam, other, poses = loaded(mapped, localize=False), StereoRoom(seed=77), there(25)
+    alive = slam.map.alive.sum()
+    frame = other.frame(5, poses[0])
+    slam.process(frame)
+    slam.late_masks.add(frame.stamp_ns, np.full_like(frame.left, 255))
+    slam.search_near(poses[10], 1.0, 0.5)
+    slam.late_masks.take_points_back()
+    assert slam.map.alive.sum() == alive
+
+
 def test_a_frame_that_is_lost_is_looked_for_once(mapped, monkeypatch):
     """Two sightings by one frame and one by another are no proof."""
     slam, other = loaded(mapped, localize=False), StereoRoom(seed=77)
