@@ -48,6 +48,17 @@ def invert(T_a_b: Array) -> Array:
     return T_b_a
 
 
+def without_drift(T: Array) -> Array:
+    """Return products of poses (..., 4, 4) with their rotations orthonormal again, by a Newton step
+    of the polar decomposition (Higham 1986): `invert` transposes, so the rounding errors of
+    repeated products would grow threefold each time.
+    """
+    result = T.copy()
+    R = T[..., :3, :3]
+    result[..., :3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (np.swapaxes(R, -1, -2) @ R))
+    return result
+
+
 def transform_points(T_a_b: Array, points_b: NDArray[np.floating]) -> Array:
     """Map points (N, 3) of frame b into frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]

@@ -6,7 +6,7 @@
 places. `rooms`: equal rooms beside a corridor, furnished alike. `aisles`: parallel aisles between
 equal shelves. Measures, looks and the light follow from the seed. With an even seed rooms and
 aisles repeat at the period of every texture: floor, walls and ceiling are the same to the pixel.
-Every drive comes back to where it has been.
+Every drive comes back to where it has been, and a second one, `_back`, then drives all of it back.
 """
 
 from __future__ import annotations
@@ -150,6 +150,14 @@ def make_aisles(seed: int) -> Scene:
     return _scene(seed, look, walls, boxes, [*way, *back, [-0.4, 0.0], [length - 1, 0.05]])
 
 
+def driven_back(scene: Scene, seed: int) -> Scene:
+    """Return a scene whose camera turns at the end of its way, and drives it back."""
+    way = np.array(scene['path']['waypoints'])
+    back = way[-2::-1] + np.random.default_rng([seed, 4]).uniform(-0.06, 0.06, (len(way) - 1, 2))
+    waypoints = [*way.tolist(), *back.round(3).tolist()]
+    return scene | {'path': scene['path'] | {'waypoints': waypoints}}
+
+
 MAKERS = {'ring': make_ring, 'rooms': make_rooms, 'aisles': make_aisles}
 
 
@@ -158,8 +166,10 @@ def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for kind, count in SEEDS.items():
         for seed in range(1, count + 1):
-            text = yaml.safe_dump(MAKERS[kind](seed), sort_keys=False)
-            (folder / f'{kind}_{seed}.yaml').write_text(text)
+            scene = MAKERS[kind](seed)
+            for name, drive in (('', scene), ('_back', driven_back(scene, seed))):
+                text = yaml.safe_dump(drive, sort_keys=False)
+                (folder / f'{kind}_{seed}{name}.yaml').write_text(text)
 
 
 if __name__ == '__main__':

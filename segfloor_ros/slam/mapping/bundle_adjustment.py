@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.camera.model import StereoCamera, Up
-from segfloor_ros.geometry import Array, invert, se3_exp, transform_points
+from segfloor_ros.geometry import Array, invert, se3_exp, transform_points, without_drift
 from segfloor_ros.slam.mapping.normal_equations import (
     Factor,
     Linearisation,
@@ -329,6 +329,7 @@ def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:
 
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
     """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
+    T_camera_world = without_drift(T_camera_world)
     edges = sparse_map.edges
     last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
     last[edges.point] = edges.keyframe

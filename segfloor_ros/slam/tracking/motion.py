@@ -21,12 +21,11 @@ from segfloor_ros.geometry import (
     invert,
     is_within,
     make_transform,
-    quaternion_xyzw,
     rotation_angle,
     rotation_from_angles,
     se3_exp,
     se3_log,
-    transform_from_quaternion,
+    without_drift,
 )
 from segfloor_ros.slam.results import SAME, LastPose
 from segfloor_ros.slam.rig import is_gated
@@ -204,7 +203,7 @@ class CameraMotion:
         predicted = self._predicted(measured)
         if self.state.is_blind and predicted is not None:
             T_odom_camera = invert(predicted[0] @ self.T_world_odom)
-            self.T_world_odom = _without_drift(invert(T_camera_world) @ invert(T_odom_camera))
+            self.T_world_odom = without_drift(invert(T_camera_world) @ invert(T_odom_camera))
         motion = se3_log(T_camera_world @ invert(self.T_camera_world))
         steady = not (self.state.is_lost or self.state.is_blind)
         self._velocity = motion / _step_s(self._last_stamp_ns, stamp_ns) if steady else np.zeros(6)
@@ -230,7 +229,7 @@ class CameraMotion:
         if not measured.by_wheels and sigma_m(predicted[1]) > SAME[0]:
             return False
         self.since_keyframe.add(measured)
-        self.T_camera_world, self.covariance = _without_drift(predicted[0]), predicted[1]
+        self.T_camera_world, self.covariance = without_drift(predicted[0]), predicted[1]
         self._last_stamp_ns = stamp_ns
         self.state = TrackingState(f'on {measured.source}')
         R_world_odom = self.T_world_odom[:3, :3]
@@ -251,7 +250,7 @@ class CameraMotion:
         self._heading_sigma_rad = self._latest = self.since_keyframe.motion = None
         self._body.reset()
         if stamp_ns is not None and turned is not None and sigma_rad is not None:
-            self.T_camera_world = _without_drift(turned[0])
+            self.T_camera_world = without_drift(turned[0])
             self._last_stamp_ns = stamp_ns
             self._heading_sigma_rad = sigma_rad + turned[1]
 
@@ -261,10 +260,10 @@ class CameraMotion:
         """
         T_odom_camera = self.T_odom_camera
         T_keyframe = self.since_keyframe.T_camera_world @ invert(T_reference_before)
-        self.since_keyframe.T_camera_world = _without_drift(T_keyframe @ T_reference_after)
+        self.since_keyframe.T_camera_world = without_drift(T_keyframe @ T_reference_after)
         T_camera_reference = self.T_camera_world @ invert(T_reference_before)
-        self.T_camera_world = _without_drift(T_camera_reference @ T_reference_after)
-        self.T_world_odom = _without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
+        self.T_camera_world = without_drift(T_camera_reference @ T_reference_after)
+        self.T_world_odom = without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
 
     def measured(self, stamp_ns: int) -> RelativeMotion | None:
         """Return the motion since the last pose, by wheels or by an IMU alone, or none where the
@@ -341,13 +340,6 @@ def _step_s(before_ns: int, now_ns: int) -> float:
 def sigma_m(covariance: Array) -> float:
     """Return the standard deviation of the place of a pose with a covariance (6, 6)."""
     return float(np.sqrt(np.diag(covariance)[:3].max()))
-
-
-def _without_drift(T: Array) -> Array:
-    """Return a product of poses (4, 4) with its rotation orthonormal again: `invert` transposes,
-    so the rounding errors of repeated products would grow threefold each time.
-    """
-    return transform_from_quaternion(T[:3, 3], quaternion_xyzw(T[:3, :3]))
 
 
 class ImageRotation:

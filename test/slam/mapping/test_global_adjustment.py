@@ -49,6 +49,15 @@ def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
     np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
 
 
+def test_rotations_stay_rotations_however_often_the_map_is_adjusted(bent):
+    for _ in range(25):
+        adjust(bent)
+    turns = np.stack([k.T_camera_world[:3, :3] for k in bent.keyframes])
+    np.testing.assert_allclose(
+        turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (COUNT, 1, 1)), atol=1e-12
+    )
+
+
 def test_a_world_that_turns_takes_points_their_directions_and_retired_keyframes_along(bent):
     T = se3_exp(np.array([0.3, -0.2, 0.1, 0.1, 0.2, 0.5]))
     bent.retire(bent.keyframes[30], bent.keyframes[31])
