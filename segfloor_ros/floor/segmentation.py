@@ -303,11 +303,10 @@ class FloorSegmentation:
         slope = image_slope(left_rows)
         upright_px = upright_above(view, disparity, compared, textured)
         for _ in range(2):
-            barred = beside | odd
             mask = fill_regions(
-                view, mask, slope, upright_px, compared, textured, evidence.standing, barred
+                view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
             )
-            may_be = compared.consistent & ~compared.denied & ~barred
+            may_be = compared.consistent & ~compared.denied & ~(beside | odd)
             mask = fill_gaps(view, profile, mask, may_be)
             unlike = unlike_floor(left, mask == FLOOR)
             odd = unlike & (evidence.off | evidence.odd)

@@ -73,13 +73,15 @@ def fill_regions(
     compared: Comparison,
     textured: NDArray[np.bool_],
     standing: NDArray[np.bool_],
-    barred: NDArray[np.bool_],
+    beside: NDArray[np.bool_],
+    odd: NDArray[np.bool_],
 ) -> NDArray[np.uint8]:
     """Return the mask with NO_EVIDENCE turned to floor in regions that look alike and continue
     floor.
 
     slope: `image_slope`; upright_px: `upright_above`. standing: (R, W), what is measured above the
-    floor. barred: (R, W), where no region goes on. A region is bounded by edges of the image
+    floor. beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look
+    like floor; nor does plain floor begin there. A region is bounded by edges of the image
     stronger than most of the floor's own; floor by evidence must be in a share of its columns. In
     it a pixel becomes floor below floor, the next evidence up its column; or between floor on its
     left and right; or, if it is not blank and not measured above the floor, nearer than any of its
@@ -105,11 +107,11 @@ def fill_regions(
     inside = (highest < small.shape[0]) & alike & (small == NO_EVIDENCE)
     nearer = (rows >= highest) & (not_blank > 0) & ~standing[part]
     fill = inside & (nearer | _next_to_floor(small))
-    fill &= ~barred[part]
+    fill &= ~(beside | odd)[part]
     mask = with_floor(mask, _enlarged(fill, mask))
     # Light on the floor is no border, where both ends of a stretch are known.
     no_border = agreed & (slope < _STRONG_SLOPE)
-    to_contact = fill_to_contact(view, mask, no_border, upright_px, compared)
+    to_contact = fill_to_contact(view, mask, no_border, ~odd[part], upright_px, compared)
     return with_floor(mask, _enlarged(to_contact, mask))
 
 
@@ -130,28 +132,29 @@ def _top_of_supported(
     """Return the topmost row (count,) with floor of each region, the number of rows where it has
     too little.
     """
-    height, width = region.shape
     rows, columns = pixels_where(floor)
-    owner: NDArray[np.intp] = region[rows, columns].astype(np.intp)
-    large = np.flatnonzero(np.bincount(owner, minlength=count) >= _MIN_REGION_PX)
-    large = large[large > 0]
-    number = np.zeros(count, np.intp)
-    number[large] = np.arange(1, len(large) + 1)
-    owner = number[owner]
-
-    def columns_of(owner: NDArray[np.intp], columns: NDArray[np.int32]) -> NDArray[np.intp]:
-        cells = np.bincount(owner * width + columns, minlength=(len(large) + 1) * width)
-        return np.count_nonzero(cells.reshape(-1, width), axis=1)
-
-    extent = columns_of(
-        number[region].reshape(-1), np.tile(np.arange(width, dtype=np.int32), height)
-    )
-    wide = columns_of(owner, columns) >= _MIN_COLUMNS * extent
-    first = np.full(len(large) + 1, height, np.intp)
+    owner = region[rows, columns]
+    first = np.full(count, len(region), np.intp)
     first[owner[::-1]] = rows[::-1]  # the topmost comes last
-    top = np.full(count, height, np.intp)
-    top[large] = np.where(wide, first, height)[1:]
-    return top
+    is_wide = _columns_of(region, count, floor) >= _MIN_COLUMNS * _columns_of(region, count)
+    is_large = np.bincount(owner, minlength=count) >= _MIN_REGION_PX
+    is_large[0] = False
+    return np.where(is_large & is_wide, first, len(region))
+
+
+def _columns_of(
+    region: NDArray[np.int32], count: int, where: NDArray[np.bool_] | None = None
+) -> NDArray[np.intp]:
+    """Return in how many columns each region (count,) of a picture (R, W) has pixels of `where`."""
+    width = region.shape[1]
+    if where is None:
+        cell = region * np.int32(width) + np.arange(width, dtype=np.int32)
+    else:
+        rows, columns = pixels_where(where)
+        cell = region[rows, columns] * np.int32(width) + columns
+    cells = np.zeros(count * width, np.bool_)
+    cells[cell.ravel()] = True
+    return np.count_nonzero(cells.reshape(count, width), axis=1)
 
 
 def _next_to_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -251,13 +254,15 @@ def fill_to_contact(
     view: FloorView,
     mask: NDArray[np.uint8],
     alike: NDArray[np.bool_],
+    may_begin: NDArray[np.bool_],
     upright_px: NDArray[np.float32],
     compared: Comparison,
 ) -> NDArray[np.bool_]:
     """Return where plain floor goes on up to the foot of something upright.
 
-    mask: (R, W). alike, upright_px (`upright_above`): what looks like floor, and what stands, at
-    half the resolution in both directions of the image, the shape of the result.
+    mask: (R, W). alike, may_begin, upright_px (`upright_above`): where nothing borders, what may be
+    floor although none is seen nearer, and what stands, at half the resolution in both directions
+    of the image, the shape of the result.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
@@ -272,7 +277,7 @@ def fill_to_contact(
     last = small.shape[0] - 1
     below = np.minimum.accumulate(np.where(open_, last, rows)[::-1], axis=0)[::-1]
     starts = np.take_along_axis(small, below, axis=0) == FLOOR
-    starts |= open_[last] & (below == last)
+    starts |= open_[last] & (below == last) & may_begin
     return open_ & starts & np.take_along_axis(contact, above, axis=0)
 
 

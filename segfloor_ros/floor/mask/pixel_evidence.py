@@ -40,8 +40,9 @@ _LEAST_KNOWN = 0.2
 
 _DIRT = 0.1
 """By such a share of its brightness a floor varies: dust, wear."""
-_SAMPLED, _FITS = 4, 4
-"""Every such row and column tells how light falls on the floor; so often it is asked."""
+_SAMPLED, _FITS = 8, 4
+"""Every such row and column, one independent of the other, tells how light falls on the floor; so
+often it is asked."""
 _FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
 
 _AGAINST_GREY = 1.0
@@ -302,15 +303,19 @@ def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[
         weighted = terms * counted
         weighted /= counted.sum()
         # A few pixels do not tell how it bends.
-        light = np.linalg.solve(weighted @ terms.T + _FLAT, weighted @ seen)
+        bends = weighted @ terms.T + _FLAT
+        light = np.linalg.solve(bends, weighted @ seen)
         squares = (seen - light @ terms) ** 2
         variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
         counted = (squares < SIGMAS**2 * variance).astype(np.float32)
     one, across, down, across2, both, down2 = light
     expected = (one + down * y + down2 * y * y)[:, None] + (across + both * y)[:, None] * x
     expected += across2 * x * x
+    at = _quadratic(*(axis.ravel() for axis in np.meshgrid(x[::_SAMPLED], y[::_SAMPLED])))
+    of_light = np.einsum('an,an->n', at, np.linalg.solve(bends, at)) / counted.sum()
+    unsure = cv2.resize(1 + of_light.reshape(brightness[part].shape), image.shape[::-1])
     # Grey levels are whole: no surface is known better.
-    return (brightness - expected) ** 2 > SIGMAS**2 * (variance + 1 / grey**2)
+    return (brightness - expected) ** 2 > SIGMAS**2 * (variance * unsure + 1 / grey**2)
 
 
 def _quadratic(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -45,6 +45,16 @@ def test_where_no_floor_is_known_nothing_is_odd():
     assert not unlike_floor(image, np.zeros(image.shape, bool)).any()
 
 
+def test_how_floor_looks_is_known_the_less_the_farther_off_the_less_of_it_is_seen():
+    """A patch of floor does not tell how light falls at the other end of the image."""
+    image = floor_image(np.random.default_rng(4), 4.0)
+    image[:, 250:] //= 3
+    little, much = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
+    little[130:154, :40], much[:, :200] = True, True
+    assert unlike_floor(image, little)[:, 260:].mean() < 0.05
+    assert unlike_floor(image, much)[:, 260:].mean() > 0.95
+
+
 @pytest.mark.parametrize('floor_kind', FLOORS)
 def test_a_plain_dark_thing_right_ahead_is_not_filled_as_floor(floor_kind):
     """It has no disparity of its own, and floor all around it."""

@@ -14,11 +14,15 @@ SEEN_ROW, CONTACT_ROW = 160, 80  # of the view: floor is seen from the one, a wa
 
 
 def filled(
-    wall_px_of_floor: float, seen_row: int = SEEN_ROW, has_texture: bool = True
+    wall_px_of_floor: float,
+    seen_row: int = SEEN_ROW,
+    has_texture: bool = True,
+    may_begin: bool = True,
 ) -> np.ndarray:
     """Return what is filled below a wall, its disparity as a multiple of the floor's there.
 
-    seen_row: from where on floor is seen. has_texture: the wall.
+    seen_row: from where on floor is seen. has_texture: the wall. may_begin: whether what is not
+    seen may be floor by its look.
     """
     view = FloorView.of(CAMERA, MOUNT, FIRST_ROW)
     line = FloorLine.of(CAMERA, MOUNT)
@@ -35,7 +39,7 @@ def filled(
     compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
     upright_px = upright_above(view, disparity, compared, wall & has_texture)
-    result = fill_to_contact(view, mask, plain, upright_px, compared)
+    result = fill_to_contact(view, mask, plain, plain & may_begin, upright_px, compared)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 
@@ -52,6 +56,11 @@ def test_not_where_the_wall_stands_nearer_or_is_far_behind(ratio):
 def test_it_may_begin_at_the_lower_edge_of_the_image():
     assert filled(1.0, seen_row=1000).all()
     assert not filled(1.3, seen_row=1000).any()
+
+
+def test_it_does_not_begin_with_what_does_not_look_like_the_floor():
+    assert not filled(1.0, seen_row=1000, may_begin=False).any()
+    assert filled(1.0, may_begin=False).all()
 
 
 def test_not_below_what_has_no_disparity():
