@@ -437,11 +437,21 @@ def plane_of_frame(
     uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
     found_px = part[rows, columns].astype(np.float64)
     samples = Samples.of(camera, uv_px, found_px, weight)
+    expected = np.vstack([expected, swung(expected[0], 2 * SAME_PX / camera.fy / slope)])
     share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
     start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
     sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
     unknown, still = np.full(3, np.nan), np.zeros((0, 3))
     return refine(samples, start, unknown, still, start, sigma, NEAR_SCALES_PX)
+
+
+def swung(angles_height: Array, step_rad: float) -> Array:
+    """Return a camera's pitch, roll and height (N, 3) as its base swings over a bump, in steps of
+    its pitch.
+    """
+    steps = math.ceil(_SWING_RAD / step_rad)
+    angles_rad = step_rad * np.delete(np.arange(-steps, steps + 1), steps)
+    return angles_height + np.outer(angles_rad, (1.0, 0.0, 0.0))
 
 
 def likeliest(share: Array, expected: Array) -> int:

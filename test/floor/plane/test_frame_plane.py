@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.floor.disparity.profile import FloorLine
+from segfloor_ros.camera.model import Mount, StereoCamera
+from segfloor_ros.floor.disparity.profile import FloorLine, column_step
 from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame
 from segfloor_ros.floor.segmentation import FloorSegmentation
@@ -57,19 +57,35 @@ def test_where_nothing_is_matched_the_camera_is_as_it_is_mounted():
     np.testing.assert_allclose(found, expected[0], atol=1e-6)
 
 
+def plane_seen(camera: StereoCamera, true: Mount, first_row: int) -> np.ndarray:
+    """Return pitch, roll and height that are found of a floor below a camera said to be on MOUNT,
+    whose axes are `true`.
+    """
+    line = FloorLine.of(camera, true)
+    rows = np.arange(first_row, camera.height)[:, None]
+    columns = np.arange(0, camera.width, column_step(camera))
+    derolled = rows + line.shear * (columns - camera.cx)
+    disparity = (line.slope * (derolled - line.horizon)).astype(np.float32)
+    texture = np.full_like(disparity, 50.0)
+    expected = expectations(MOUNT, np.eye(4))
+    return plane_of_frame(camera, first_row, disparity, texture, 1.0, expected).angles_height
+
+
 @pytest.mark.parametrize('camera', [SMALL_CAMERA, CAMERA])
 def test_rows_of_a_view_that_begins_below_the_top_are_those_of_the_image(camera):
     """The robot brakes: the floor is higher in the image than as the camera is mounted."""
     true = Mount(0.29, MOUNT.pitch_rad + np.radians(2.0), np.radians(1.5))
-    first_row, line = camera.height // 2, FloorLine.of(camera, true)
-    rows = np.arange(first_row, camera.height)[:, None]
-    columns = np.arange(0, camera.width, 2 if camera is CAMERA else 1)
-    derolled = rows + line.shear * (columns - camera.cx)
-    disparity = (line.slope * (derolled - line.horizon)).astype(np.float32)
-    texture = np.full_like(disparity, 50.0)
-    fit = plane_of_frame(camera, first_row, disparity, texture, 1.0, expectations(MOUNT, np.eye(4)))
-    found = [true.pitch_rad, true.roll_rad, true.height_m]
-    np.testing.assert_allclose(fit.angles_height, found, atol=0.004)
+    found = plane_seen(camera, true, camera.height // 2)
+    np.testing.assert_allclose(found, [true.pitch_rad, true.roll_rad, true.height_m], atol=0.004)
+
+
+@pytest.mark.parametrize('swing_deg', [-2.0, -1.2, 1.2, 2.5])
+def test_a_floor_that_a_bump_moves_by_many_pixels_is_found(swing_deg):
+    """The longer the focal length the farther it moves."""
+    camera = StereoCamera(1280, 480, 1000.0, 1000.0, 640.0, 200.0, 0.12)
+    true = replace(MOUNT, pitch_rad=MOUNT.pitch_rad + np.radians(swing_deg))
+    found = plane_seen(camera, true, 120)
+    np.testing.assert_allclose(found, [true.pitch_rad, 0.0, true.height_m], atol=0.002)
 
 
 def carried(heights_m: list[float], *patches: Patch) -> FloorSegmentation:
