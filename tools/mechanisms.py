@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 
 from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.mask.filling import fill_regions, upright_above
+from segfloor_ros.floor.mask.filling import fill_regions, fill_to_contact, upright_above
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'
@@ -60,19 +60,13 @@ def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> 
     return upright_above(view, disparity, compared, np.ones_like(textured))
 
 
-def _filled_whatever_stands(
-    view: Any,
-    mask: Any,
-    slope: Any,
-    upright_px: Any,
-    compared: Any,
-    textured: Any,
-    standing: Any,
-    barred: Any,
-) -> Any:
-    return fill_regions(
-        view, mask, slope, upright_px, compared, textured, _nowhere(standing), barred
-    )
+def _filled_whatever_stands(*arguments: Any) -> Any:
+    *shapes, standing, beside, odd = arguments
+    return fill_regions(*shapes, _nowhere(standing), beside, odd)
+
+
+def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:
+    return fill_to_contact(view, mask, alike, np.ones_like(may_begin), *others)
 
 
 SLAM: dict[str, Mechanism] = {
@@ -118,9 +112,15 @@ FLOOR: dict[str, Mechanism] = {
             )
         }
     ),
+    'swings over bumps': Mechanism(
+        {'floor.plane.plane.swung': lambda angles_height, _: np.zeros((0, len(angles_height)))}
+    ),
     'guard at the right border': Mechanism({'floor.segmentation._BORDER_BLOCKS': 0}),
     'floor up to contacts': Mechanism(
         {'floor.mask.filling.fill_to_contact': lambda view, mask, alike, *_: _nowhere(alike)}
+    ),
+    'what the image cuts off looks like floor': Mechanism(
+        {'floor.mask.filling.fill_to_contact': _begun_anywhere}
     ),
     'contacts with what has texture alone': Mechanism(
         {'floor.segmentation.upright_above': _above_anything}
