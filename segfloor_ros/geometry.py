@@ -49,8 +49,8 @@ def invert(T_a_b: Array) -> Array:
 
 
 def without_drift(T: Array) -> Array:
-    """Return products of poses (..., 4, 4) with their rotations orthonormal again, by a Newton step
-    of the polar decomposition (Higham 1986): `invert` transposes, so the rounding errors of
+    """Return products of poses (..., 4, 4) with their rotations, which are nearly so, orthonormal
+    again, by a step of Bjoerck and Bowie (1971): `invert` transposes, so the rounding errors of
     repeated products would grow threefold each time.
     """
     result = T.copy()

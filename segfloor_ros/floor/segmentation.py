@@ -242,6 +242,8 @@ class FloorSegmentation:
     ) -> FloorObservation:
         rows = np.arange(self._camera.height, dtype=np.float64)
         whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
+        # On a bump the floor may reach higher than was looked for.
+        whole[max(0, int(view.line.horizon)) : view.first_row] = NO_EVIDENCE
         whole[view.first_row :] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
         return FloorObservation(
             disparity_px=disparity,

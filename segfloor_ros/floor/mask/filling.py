@@ -3,8 +3,8 @@ to the base of what stands on it.
 
 Plain floor shows nothing that both cameras see alike, but what stands behind it does: an upright
 surface has the disparity of the floor on which it stands. Where a plain stretch that begins with
-floor, or at the lower edge of the image, ends at such a surface, and at the row where that surface
-meets the floor, all of it is floor.
+floor, or at the lower edge of the image with what mostly looks like it, ends at such a surface, and
+at the row where that surface meets the floor, all of it is floor.
 
 How far what a network calls floor can be believed: as often as geometry agreed so far.
 """
@@ -81,11 +81,10 @@ def fill_regions(
 
     slope: `image_slope`; upright_px: `upright_above`. standing: (R, W), what is measured above the
     floor. beside, odd: (R, W), where no region goes on: `beside_something`, and what does not look
-    like floor; nor does plain floor begin there. A region is bounded by edges of the image
-    stronger than most of the floor's own; floor by evidence must be in a share of its columns. In
-    it a pixel becomes floor below floor, the next evidence up its column; or between floor on its
-    left and right; or, if it is not blank and not measured above the floor, nearer than any of its
-    floor.
+    like floor. A region is bounded by edges of the image stronger than most of the floor's own;
+    floor by evidence must be in a share of its columns. In it a pixel becomes floor below floor,
+    the next evidence up its column; or between floor on its left and right; or, if it is not blank
+    and not measured above the floor, nearer than any of its floor.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
@@ -147,13 +146,9 @@ def _columns_of(
 ) -> NDArray[np.intp]:
     """Return in how many columns each region (count,) of a picture (R, W) has pixels of `where`."""
     width = region.shape[1]
-    if where is None:
-        cell = region * np.int32(width) + np.arange(width, dtype=np.int32)
-    else:
-        rows, columns = pixels_where(where)
-        cell = region[rows, columns] * np.int32(width) + columns
+    cell = region * np.int32(width) + np.arange(width, dtype=np.int32)
     cells = np.zeros(count * width, np.bool_)
-    cells[cell.ravel()] = True
+    cells[cell.ravel() if where is None else cell[where]] = True
     return np.count_nonzero(cells.reshape(count, width), axis=1)
 
 
@@ -260,9 +255,9 @@ def fill_to_contact(
 ) -> NDArray[np.bool_]:
     """Return where plain floor goes on up to the foot of something upright.
 
-    mask: (R, W). alike, may_begin, upright_px (`upright_above`): where nothing borders, what may be
-    floor although none is seen nearer, and what stands, at half the resolution in both directions
-    of the image, the shape of the result.
+    mask: (R, W). alike, may_begin, upright_px (`upright_above`): where nothing borders, what most
+    of a stretch must be if no floor is seen nearer, and what stands, at half the resolution in both
+    directions of the image, the shape of the result.
     """
     part = np.s_[::STEP_PX, :: STEP_PX // view.step]
     small = mask[part]
@@ -277,8 +272,9 @@ def fill_to_contact(
     last = small.shape[0] - 1
     below = np.minimum.accumulate(np.where(open_, last, rows)[::-1], axis=0)[::-1]
     starts = np.take_along_axis(small, below, axis=0) == FLOOR
-    starts |= open_[last] & (below == last) & may_begin
-    return open_ & starts & np.take_along_axis(contact, above, axis=0)
+    cut_off = open_ & open_[last] & (below == last)
+    columns = 2 * (cut_off & may_begin).sum(axis=0) > cut_off.sum(axis=0)
+    return open_ & (starts | (cut_off & columns)) & np.take_along_axis(contact, above, axis=0)
 
 
 def upright_above(

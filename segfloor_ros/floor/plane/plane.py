@@ -447,10 +447,10 @@ def plane_of_frame(
 
 def swung(angles_height: Array, step_rad: float) -> Array:
     """Return a camera's pitch, roll and height (N, 3) as its base swings over a bump, in steps of
-    its pitch.
+    its pitch of at most so much.
     """
-    steps = math.ceil(_SWING_RAD / step_rad)
-    angles_rad = step_rad * np.delete(np.arange(-steps, steps + 1), steps)
+    steps = max(1, math.ceil(_SWING_RAD / step_rad))
+    angles_rad = np.delete(np.linspace(-_SWING_RAD, _SWING_RAD, 2 * steps + 1), steps)
     return angles_height + np.outer(angles_rad, (1.0, 0.0, 0.0))
 
 

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import Arrays
@@ -34,6 +33,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
     solve_global,
 )
 from segfloor_ros.slam.mapping.keyframe_mapping import fuse_duplicates
+from segfloor_ros.slam.mapping.normal_equations import solve_symmetric
 from segfloor_ros.slam.places.loops import LoopDetector, PlaceMatcher, drift
 from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT, PROOF, Track
@@ -227,7 +227,7 @@ def _solve(graph: PoseGraph, poses: Array, error: Array, weight: Array, damping:
     step = np.zeros(6 * count)
     added = (damping * diagonal + 1e-12)[None]
     damped = H + sparse.dia_array((added, [0]), shape=H.shape).tocsc()
-    step[moving] = -splu(damped.tocsc()).solve(g)
+    step[moving] = -solve_symmetric(damped.tocsc(), g)
     return step.reshape(-1, 6)
 
 

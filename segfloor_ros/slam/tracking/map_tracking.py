@@ -404,8 +404,10 @@ class Follower:
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
         if len(rows) < ENOUGH:
             return None
-        # Of the farther half a disparity says next to nothing of the pose.
-        near = rows[expected_px[rows] >= np.median(expected_px[rows])]
+        near = rows
+        if not images.depth_scale and len(rows) >= 2 * ENOUGH:
+            # Of the farther half a disparity says next to nothing of the pose.
+            near = rows[expected_px[rows] >= np.median(expected_px[rows])]
         measure_disparity(images, observations, near, expected_px[near] + offset_px)
         ids = seen.ids[rows]
         measured = observations.take(rows)

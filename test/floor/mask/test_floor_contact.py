@@ -17,12 +17,12 @@ def filled(
     wall_px_of_floor: float,
     seen_row: int = SEEN_ROW,
     has_texture: bool = True,
-    may_begin: bool = True,
+    alike_rows: int = 1000,
 ) -> np.ndarray:
     """Return what is filled below a wall, its disparity as a multiple of the floor's there.
 
-    seen_row: from where on floor is seen. has_texture: the wall. may_begin: whether what is not
-    seen may be floor by its look.
+    seen_row: from where on floor is seen. has_texture: the wall. alike_rows: how many of the lowest
+    look like floor.
     """
     view = FloorView.of(CAMERA, MOUNT, FIRST_ROW)
     line = FloorLine.of(CAMERA, MOUNT)
@@ -38,8 +38,9 @@ def filled(
     floor_px = profile.at_pixels(view.derolled[::2, :: 2 // view.step])
     compared = Comparison(floor_px, wall, wall, wall, ~wall)
     plain = ~wall[::2, :: 2 // view.step]
+    may_begin = (rows >= shape[0] - alike_rows)[::2, :: 2 // view.step]
     upright_px = upright_above(view, disparity, compared, wall & has_texture)
-    result = fill_to_contact(view, mask, plain, plain & may_begin, upright_px, compared)
+    result = fill_to_contact(view, mask, plain, may_begin, upright_px, compared)
     assert not result[rows[::2, :: 2 // view.step] < CONTACT_ROW].any()
     return result[CONTACT_ROW // 2 : SEEN_ROW // 2]
 
@@ -58,9 +59,10 @@ def test_it_may_begin_at_the_lower_edge_of_the_image():
     assert not filled(1.3, seen_row=1000).any()
 
 
-def test_it_does_not_begin_with_what_does_not_look_like_the_floor():
-    assert not filled(1.0, seen_row=1000, may_begin=False).any()
-    assert filled(1.0, may_begin=False).all()
+def test_it_does_not_begin_with_what_mostly_does_not_look_like_the_floor():
+    assert filled(1.0, alike_rows=0).all()
+    for few in (0, 12, 60):
+        assert not filled(1.0, seen_row=1000, alike_rows=few).any()
 
 
 def test_not_below_what_has_no_disparity():

@@ -10,7 +10,7 @@ from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_p
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.profile import FloorLine, column_step
 from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
-from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame
+from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame, swung
 from segfloor_ros.floor.segmentation import FloorSegmentation
 
 
@@ -86,6 +86,13 @@ def test_a_floor_that_a_bump_moves_by_many_pixels_is_found(swing_deg):
     true = replace(MOUNT, pitch_rad=MOUNT.pitch_rad + np.radians(swing_deg))
     found = plane_seen(camera, true, 120)
     np.testing.assert_allclose(found, [true.pitch_rad, 0.0, true.height_m], atol=0.002)
+
+
+@pytest.mark.parametrize('step_deg', [0.7, 2.0, 9.0])
+def test_a_base_swings_as_far_as_robots_do_and_no_farther(step_deg):
+    swings = swung(np.array([0.1, 0.0, 0.3]), np.radians(step_deg))[:, 0] - 0.1
+    assert np.degrees(np.abs(swings)).max() == pytest.approx(3.0)
+    assert np.degrees(np.abs(swings)).min() <= step_deg + 1e-9 or len(swings) == 2
 
 
 def carried(heights_m: list[float], *patches: Patch) -> FloorSegmentation:
