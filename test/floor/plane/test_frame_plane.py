@@ -9,9 +9,11 @@ from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_p
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.floor.disparity.profile import FloorLine, column_step
-from segfloor_ros.floor.observation import FLOOR, FloorSegmentationSettings
+from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorSegmentationSettings
 from segfloor_ros.floor.plane.plane import expectations, likeliest, plane_of_frame, swung
 from segfloor_ros.floor.segmentation import FloorSegmentation
+
+LONG_CAMERA = StereoCamera(1280, 480, 1000.0, 1000.0, 640.0, 200.0, 0.12)
 
 
 def pitched(pitch_deg: float):
@@ -82,10 +84,21 @@ def test_rows_of_a_view_that_begins_below_the_top_are_those_of_the_image(camera)
 @pytest.mark.parametrize('swing_deg', [-2.0, -1.2, 1.2, 2.5])
 def test_a_floor_that_a_bump_moves_by_many_pixels_is_found(swing_deg):
     """The longer the focal length the farther it moves."""
-    camera = StereoCamera(1280, 480, 1000.0, 1000.0, 640.0, 200.0, 0.12)
     true = replace(MOUNT, pitch_rad=MOUNT.pitch_rad + np.radians(swing_deg))
-    found = plane_seen(camera, true, 120)
+    found = plane_seen(LONG_CAMERA, true, 120)
     np.testing.assert_allclose(found, [true.pitch_rad, 0.0, true.height_m], atol=0.002)
+
+
+def test_far_floor_that_a_dip_lifts_above_what_is_looked_at_is_unknown():
+    dipped = replace(MOUNT, pitch_rad=MOUNT.pitch_rad + np.radians(2.5))
+    left, right, floor, _ = Scene([floor_patch()], LONG_CAMERA, dipped).render()
+    stage = FloorSegmentation(LONG_CAMERA, FloorSegmentationSettings())
+    mask = stage.process(left, right, MOUNT).mask
+    assert (mask[floor] == FLOOR).mean() > 0.6
+    before, now = (round(FloorLine.of(LONG_CAMERA, mount).horizon) for mount in (MOUNT, dipped))
+    assert before - now > 40
+    assert (mask[: now - 2] == NOT_FLOOR).all()
+    assert (mask[now + 2 : before - 20] == NO_EVIDENCE).all()
 
 
 @pytest.mark.parametrize('step_deg', [0.7, 2.0, 9.0])
