@@ -303,10 +303,11 @@ def gather(
     observations.
     """
     uvd, sigma = np.empty((len(row), 3)), np.empty((len(row), 3))
-    for k in np.unique(keyframe):
-        mine = keyframe == k
-        taken = observations[k].take(row[mine])
-        uvd[mine], sigma[mine] = taken.uvd_px, taken.sigma_px
+    order = np.argsort(keyframe, kind='stable')
+    for mine in np.split(order, np.flatnonzero(np.diff(keyframe[order])) + 1):
+        if len(mine):
+            seen = observations[keyframe[mine[0]]]
+            uvd[mine], sigma[mine] = seen.uvd_px[row[mine]], seen.sigma_px[row[mine]]
     return Observations(uvd, sigma)
 
 
