@@ -397,18 +397,12 @@ class Follower:
             return None
         pose = roughly.estimate.T_camera_world
         seen = self._select(local_ids, pose, images.excluded)
-        expected_px = seen.uvd_px[:, 2]
-        unmeasured = np.column_stack([seen.uvd_px[:, :2], np.full(len(seen.ids), np.nan)])
-        observations = Observations(unmeasured, np.ones(unmeasured.shape))
+        observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
         rows = np.arange(len(seen.ids))
         rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
+        measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
         if len(rows) < ENOUGH:
             return None
-        near = rows
-        if not images.depth_scale and len(rows) >= 2 * ENOUGH:
-            # Of the farther half a disparity says next to nothing of the pose.
-            near = rows[expected_px[rows] >= np.median(expected_px[rows])]
-        measure_disparity(images, observations, near, expected_px[near] + offset_px)
         ids = seen.ids[rows]
         measured = observations.take(rows)
         found = self._consensus.refine(pose, ids, measured.without_offset(offset_px))

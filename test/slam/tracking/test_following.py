@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.geometry import invert, transform_points
+from segfloor_ros.geometry import invert
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.images import Images, follow_pixels, shrink
@@ -53,10 +53,6 @@ def test_follows_a_frame_to_the_millimetre_or_not_at_all(room):
     assert np.linalg.norm(error[:3, 3]) < 0.003
     assert len(track.point_ids) <= TRACKED_POINTS
     assert np.isin(track.point_ids, track.visible_ids).all()
-    is_measured = np.isfinite(track.observations.uvd_px[:, 2])
-    points = transform_points(track.T_camera_world, slam.map.xyz_world[track.point_ids])
-    assert 0.4 < is_measured.mean() < 0.6
-    assert points[is_measured, 2].max() < 1.01 * points[~is_measured, 2].min()
     assert follow(other) is None
 
 
