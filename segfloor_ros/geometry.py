@@ -49,13 +49,12 @@ def invert(T_a_b: Array) -> Array:
 
 
 def without_drift(T: Array) -> Array:
-    """Return products of poses (..., 4, 4) with their rotations, which are nearly so, orthonormal
-    again, by a step of Bjoerck and Bowie (1971): `invert` transposes, so the rounding errors of
-    repeated products would grow threefold each time.
+    """Return products of poses (..., 4, 4) with the nearest rotations: `invert` transposes, so the
+    rounding errors of repeated products would grow threefold each time.
     """
     result = T.copy()
-    R = T[..., :3, :3]
-    result[..., :3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (np.swapaxes(R, -1, -2) @ R))
+    U, _, V = np.linalg.svd(T[..., :3, :3])
+    result[..., :3, :3] = U @ V
     return result
 
 

@@ -60,9 +60,18 @@ def _above_anything(view: Any, disparity: Any, compared: Any, textured: Any) -> 
     return upright_above(view, disparity, compared, np.ones_like(textured))
 
 
-def _filled_whatever_stands(*arguments: Any) -> Any:
-    *shapes, standing, beside, odd = arguments
-    return fill_regions(*shapes, _nowhere(standing), beside, odd)
+def _filled_whatever_stands(
+    view: Any,
+    mask: Any,
+    slope: Any,
+    upright_px: Any,
+    compared: Any,
+    textured: Any,
+    standing: Any,
+    *others: Any,
+) -> Any:
+    shapes = view, mask, slope, upright_px, compared, textured
+    return fill_regions(*shapes, _nowhere(standing), *others)
 
 
 def _begun_anywhere(view: Any, mask: Any, alike: Any, may_begin: Any, *others: Any) -> Any:

@@ -6,6 +6,7 @@ lost that tracking, relocalisation or the closing of loops need.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from scipy import sparse
 from segfloor_ros.camera.model import Mount, StereoCamera, WheelPose
 from segfloor_ros.errors import CalibrationError, InputError, MapError
 from segfloor_ros.files.results import Arrays, MapFile, joined, split, take
-from segfloor_ros.geometry import Array, invert, transform_points
+from segfloor_ros.geometry import Array, invert, transform_points, without_drift
 from segfloor_ros.slam.places.views import views_to_keep
 from segfloor_ros.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud
 from segfloor_ros.slam.rig import MIN_DEPTH_M, Observations
@@ -45,11 +46,16 @@ BEFORE_ALL_NS = -MOMENT_NS
 PLACES = ('point_xyz_world', 'keyframe_T_camera_world', 'keyframe_T_camera_followed')
 OF_KEYFRAME = 'keyframe_', 'feature_', 'corner_', 'word'
 """How the names of arrays begin that hold something for each keyframe."""
+BENT = 1e-3
+"""Rotations that are off by more bend a map by as many metres per metre."""
+
 LAST_ARRAYS = ('T_camera_world', 'T_world_odom', 'covariance', 'velocity')
 
 LOST_IDS = 1_000_000
 """More than a drive gives to points after its map was kept for the last time: who goes on with that
 map does not give them again."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -100,13 +106,31 @@ def load_slam(
         stamp_ns = arrays['keyframe_stamp_ns']
         shift_ns = 0 if last is not None else BEFORE_ALL_NS - int(stamp_ns[-1])
         skipped = 0 if last is None else LOST_IDS
-        moved = arrays | {
+        moved = straightened(arrays, name) | {
             'keyframe_stamp_ns': stamp_ns + shift_ns,
             'num_ever': arrays['num_ever'] + skipped,
         }
         slam.load(moved, mount, localize, last)
         slam.sessions = sessions_of(saved)
         return loaded_map(saved, shift_ns)
+
+
+def straightened(arrays: Arrays, name: str) -> Arrays:
+    """Return a map whose keyframes' rotations are some, by the file's name: releases up to 2026-11
+    let them be bent by many loops, which is said.
+    """
+    poses = {column: arrays[column] for column in PLACES[1:]}
+    straight = {column: without_drift(T) for column, T in poses.items()}
+    off = max(float(np.abs(poses[c] - straight[c]).max(initial=0.0)) for c in poses)
+    if off < BENT:
+        return arrays
+    logger.warning(
+        '%s: is bent by up to %.0f %%, as it was made by a release that let every loop bend it a '
+        'little more; map anew',
+        name,
+        100 * off,
+    )
+    return arrays | straight
 
 
 @contextmanager

@@ -137,6 +137,26 @@ def test_mapping_goes_on_in_the_same_frame_with_new_ids(mapped):
     assert set(saved['point_stable_id'][:50]) & set(new.cloud.point_id.tolist())
 
 
+def test_a_map_that_many_loops_have_bent_is_said_to_be_bent(mapped, caplog):
+    saved, slam = save_slam(mapped, CAMERA), StereoSlam(CAMERA, SETTINGS)
+    bent = saved.parts['slam']['keyframe_T_camera_world'].copy()
+    bent[:, :3, 0] *= 1.05
+    load_slam(
+        slam,
+        CAMERA,
+        MapFile(saved.header, {'slam': saved.parts['slam'] | {'keyframe_T_camera_world': bent}}),
+        'x',
+    )
+    assert 'x: is bent by up to 5 %' in caplog.text
+    turns = np.stack([k.T_camera_world[:3, :3] for k in slam.map.keyframes])
+    np.testing.assert_allclose(
+        turns @ turns.swapaxes(1, 2), np.tile(np.eye(3), (len(turns), 1, 1)), atol=1e-9
+    )
+    caplog.clear()
+    loaded(mapped, localize=True)
+    assert caplog.text == ''
+
+
 def test_a_drive_in_a_loaded_map_maps_on_its_own_at_once_and_gives_that_up_when_it_is_found(mapped):
     slam = loaded(mapped, localize=False)
     before, poses = len(slam.map.keyframes), there(25)[10:18]
