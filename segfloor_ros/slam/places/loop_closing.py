@@ -174,7 +174,7 @@ def optimise(graph: PoseGraph) -> tuple[Array, Array]:
         candidate = se3_exp(step) @ poses
         trial = _errors(graph, candidate)
         trial_weight, trial_cost = _robust(graph, trial, candidate)
-        if trial_cost > cost:
+        if not trial_cost <= cost:  # nor where it is no number
             damping *= 10.0
             continue
         converged = cost - trial_cost < CONVERGED * cost + 1e-12
