@@ -54,6 +54,7 @@ from segfloor_ros.slam.saved_slam import (
     parts_that_fit,
     saved_camera,
     sessions_of,
+    straightened,
 )
 
 KEEPOUT = 'type: 0, base: 0.0, multiplier: 1.0'
@@ -279,8 +280,9 @@ class SavedMap:
 
 def open_map(path: Path) -> SavedMap:
     """Read a saved map with all its parts. Raises InputError."""
-    saved = SavedMap(str(path), read_map_file(path))
-    with parts_that_fit(saved.name):
+    file, name = read_map_file(path), str(path)
+    with parts_that_fit(name):
+        saved = SavedMap(name, straightened(file, name))
         saved.facts()
     return saved
 

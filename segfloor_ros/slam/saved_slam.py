@@ -100,13 +100,12 @@ def load_slam(
     """
     with parts_that_fit(name):
         check_camera(saved, camera, name)
+        saved = straightened(saved, name)
         mount, arrays = mount_of(saved), saved.parts[PART]
-        if not all(np.isfinite(arrays[column]).all() for column in PLACES):
-            raise ValueError('places that are nowhere')
         stamp_ns = arrays['keyframe_stamp_ns']
         shift_ns = 0 if last is not None else BEFORE_ALL_NS - int(stamp_ns[-1])
         skipped = 0 if last is None else LOST_IDS
-        moved = straightened(arrays, name) | {
+        moved = arrays | {
             'keyframe_stamp_ns': stamp_ns + shift_ns,
             'num_ever': arrays['num_ever'] + skipped,
         }
@@ -115,22 +114,24 @@ def load_slam(
         return loaded_map(saved, shift_ns)
 
 
-def straightened(arrays: Arrays, name: str) -> Arrays:
+def straightened(saved: MapFile, name: str) -> MapFile:
     """Return a map whose keyframes' rotations are some, by the file's name: releases up to 2026-11
-    let them be bent by many loops, which is said.
+    let them be bent by many loops, which is said. Raises ValueError where something is nowhere.
     """
-    poses = {column: arrays[column] for column in PLACES[1:]}
-    straight = {column: without_drift(T) for column, T in poses.items()}
-    off = max(float(np.abs(poses[c] - straight[c]).max(initial=0.0)) for c in poses)
+    arrays = saved.parts[PART]
+    if not all(np.isfinite(arrays[column]).all() for column in PLACES):
+        raise ValueError('places that are nowhere')
+    straight = {column: without_drift(arrays[column]) for column in PLACES[1:]}
+    off = max(float(np.abs(arrays[c] - T).max(initial=0.0)) for c, T in straight.items())
     if off < BENT:
-        return arrays
+        return saved
     logger.warning(
         '%s: is bent by up to %.0f %%, as it was made by a release that let every loop bend it a '
         'little more; map anew',
         name,
         100 * off,
     )
-    return arrays | straight
+    return MapFile(saved.header, saved.parts | {PART: arrays | straight})
 
 
 @contextmanager

@@ -68,6 +68,16 @@ def paths(saved, count):
     return (poses[:count], frames[:count]), (poses[count:], frames[count:])
 
 
+def test_a_map_that_is_merged_is_straightened_and_said_to_be_bent(first, tmp_path, caplog):
+    bent = first.slam['keyframe_T_camera_world'].copy()
+    bent[:, :3, 0] *= 1.05
+    parts = first.file.parts | {'slam': first.slam | {'keyframe_T_camera_world': bent}}
+    write_map_file(tmp_path / 'old.map', replace(first.file, parts=parts))
+    turns = open_map(tmp_path / 'old.map').slam['keyframe_T_camera_world'][:, :3, :3]
+    np.testing.assert_allclose(turns @ turns.swapaxes(1, 2), [np.eye(3)] * len(turns), atol=1e-9)
+    assert 'old.map: is bent by up to 5 %' in caplog.text
+
+
 def test_two_robots_maps_are_one_in_the_frame_of_the_first(first, second, merged):
     drives = paths(merged, len(first.slam['keyframe_stamp_ns']))
     for (poses, frames), truth in zip(drives, (THERE, BESIDE), strict=True):
