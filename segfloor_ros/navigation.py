@@ -139,6 +139,8 @@ class Costmap:
         self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
+        self.stops = self.places & (self.room_m > radius_m + CELL_M)
+        """Where the robot can turn though its pose is off by as much as the map."""
         self._cells = np.argwhere(self.places)
         self._index = np.full(self.places.shape, -1, np.int64)
         self._index[self.places] = np.arange(len(self._cells))
@@ -244,8 +246,8 @@ class Costmap:
         """Return the places next to free floor that borders on what is unknown, (N, 2) for each
         connected stretch of them. Behind a wall there is no such floor.
         """
-        near_m = self._radius_m + self.grid.resolution_m
-        border = (self.places & (self._edge_m <= near_m)).astype(np.uint8)
+        near_m = self._radius_m + CELL_M + self.grid.resolution_m
+        border = (self.stops & (self._edge_m <= near_m)).astype(np.uint8)
         count, labels = cv2.connectedComponents(border, connectivity=8)
         return [np.argwhere(labels == label) for label in range(1, count)]
 
@@ -465,7 +467,7 @@ class Explorer:
             costmap = Costmap.around(self.body, self.grid, np.zeros((0, 2)), driven)
             ways = costmap.ways_from(driven[-1], np.inf)
             assert ways is not None
-            places = ways.cells[np.isfinite(ways.cost)]
+            places = ways.cells[np.isfinite(ways.cost) & costmap.stops[tuple(ways.cells.T)]]
             count = min(self.goals, len(places))
             if not self._is_drawn:
                 self._ahead = [Goal(np.zeros(2), f'goal_{i + 1}') for i in range(count)]

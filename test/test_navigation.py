@@ -109,14 +109,40 @@ def test_what_it_could_not_see_at_its_start_is_unknown_once_it_has_been_further_
         assert is_free or costmap.frontiers()
 
 
-def test_frontiers_are_places_a_radius_away_from_unknown_floor_but_not_from_slits() -> None:
+def test_frontiers_are_places_to_turn_beside_unknown_floor_but_not_beside_slits() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[1:4, 1] = UNKNOWN
     assert costmap_of(grid).frontiers() == []
     grid.cells[1:-1, 18:-1] = UNKNOWN
     (frontier,) = costmap_of(grid).frontiers()
-    assert frontier[:, 1].max() == 16
+    assert frontier[:, 1].max() == 15, 'a radius, what its pose is off, and as fine as the map is'
     assert frontier[:, 1].min() >= 14
+
+
+ROOM_AND_PASSAGE = """
+####################
+#.........##########
+#.........##########
+#..................#
+#..................#
+#..................#
+#.........##########
+#.........##########
+####################
+"""
+
+
+def test_in_a_passage_as_narrow_as_its_pose_is_sure_it_drives_but_does_not_turn() -> None:
+    body, driven = dataclasses.replace(BODY, radius_m=0.12), np.array([[0.5, 0.45]])
+    costmap = Costmap.around(body, grid_of(ROOM_AND_PASSAGE), NOTHING, driven)
+    ways = costmap.ways_from(np.array([0.5, 0.45]), 0.3)
+    assert ways is not None and np.isfinite(costmap.cost_to(ways, np.array([1.65, 0.45])))
+    assert costmap.stops[4, 3:7].all() and not costmap.stops[:, 11:].any()
+    explorer = Explorer(body, 20, seed=1)
+    drive = Drive(grid_of(ROOM_AND_PASSAGE), explorer, np.array([0.5, 0.45, 0.0]), is_known=True)
+    while explorer.phase == 'exploring':
+        drive.go_on(drive.time_s + 0.2)
+    assert explorer._ahead and all(goal.point[0] < 1.05 for goal in explorer._ahead)
 
 
 def test_what_is_unknown_behind_a_wall_is_no_frontier() -> None:
@@ -404,8 +430,9 @@ def test_of_drawn_goals_the_nearest_is_next_and_one_without_a_way_waits_for_the_
     drive = Drive(grid_of(TWO_ROOMS), explorer, np.array([0.6, 0.55, 0.0]), is_known=True)
     while explorer.phase == 'exploring':
         drive.go_on(drive.time_s + 0.2)
-    nearest = min(explorer._ahead, key=lambda g: np.hypot(*(g.point - drive.pose[:2])))
-    assert explorer.goal is nearest
+    away_m = [np.hypot(*(goal.point - drive.pose[:2])) for goal in explorer._ahead]
+    assert explorer.goal is explorer._ahead[0]
+    assert away_m[0] < min(away_m) + 2 * CELL_M, 'the soonest, within a step of the robot'
     shut = drive.truth.cells[3:7, 13]
     shut[:] = OCCUPIED
     while any(goal.point[0] < 1.3 for goal in explorer._ahead):
