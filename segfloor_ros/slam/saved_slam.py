@@ -115,8 +115,8 @@ def load_slam(
 
 
 def straightened(saved: MapFile, name: str) -> MapFile:
-    """Return a map whose keyframes' rotations are some, by the file's name: releases up to 2026-11
-    let them be bent by many loops, which is said. Raises ValueError where something is nowhere.
+    """Return a map with true rotations of its keyframes; releases up to 2026-11 let many loops bend
+    them, which is said by the name of the file. Raises ValueError where something is nowhere.
     """
     arrays = saved.parts[PART]
     if not all(np.isfinite(arrays[column]).all() for column in PLACES):
