@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points, without_drift
 from segfloor_ros.slam.mapping.normal_equations import (
+    CONVERGED,
     Factor,
     Linearisation,
     Step,
@@ -41,9 +42,6 @@ from segfloor_ros.slam.rig import (
     squared_norms,
 )
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
-
-CONVERGED = 2e-3
-"""Stop at this relative decrease of the cost; the next keyframe goes on from there."""
 
 STEPS = 6
 """An adjustment mostly converges in three."""
@@ -90,8 +88,9 @@ def adjust(
     is_wanted: Callable[[], bool] = lambda: True,
 ) -> BundleResult:
     """Minimise the Huber cost over free poses and points; damping by the gain ratio (Madsen et
-    al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16). It ends early when
-    the result is no longer wanted.
+    al., Methods for Non-Linear Least Squares Problems, 2004, algorithm 3.16). A point whose step
+    leads through a camera that sees it waits: one that is far away would spoil the step of all. It
+    ends early when the result is no longer wanted.
     """
     prior, order = problem.offset, np.argsort(problem.keyframe, kind='stable')
     problem = _take_observations(problem, order)
@@ -105,6 +104,10 @@ def adjust(
         step = system.solve(damping)
         candidate = _apply(problem, step)
         trial = _evaluate(camera, candidate, prior)
+        through = problem.point[state.front & ~trial.front]
+        if len(through):
+            candidate.points_world[through] = problem.points_world[through]
+            trial = _evaluate(camera, candidate, prior)
         predicted = system.predicted_decrease(step, damping)
         gain = (state.cost - trial.cost) / max(predicted, 1e-12)
         if gain > 0:

@@ -5,7 +5,10 @@ The last axis of the arrays here is the observation or the point: NumPy works on
 times faster than on many small matrices.
 
 Most keyframes share no point: the complement is a sparse matrix (Konolige, Sparse Sparse Bundle
-Adjustment, BMVC 2010).
+Adjustment, BMVC 2010). Its factor fills up as the map grows, so a large map is solved by conjugate
+gradients, without the complement itself (Agarwal et al., Bundle Adjustment in the Large, ECCV
+2010). They are slow to bend a long path as a whole; that is solved beside, on stretches of the path
+that move rigidly (a two-level preconditioner: Nicolaides, Deflation of Conjugate Gradients, 1987).
 
 What wheels and an accelerometer measure of keyframes is added. With e = log(T_now T_before^-1 Z^-1)
 for a measured motion Z, twists of both poses change it, to first order, by d_now - Ad(T_now
@@ -24,11 +27,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import splu
 
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, adjoint, invert, se3_log
 from segfloor_ros.slam.rig import (
+    LOCAL_KEYFRAMES,
     SMALLEST,
     chi2_limit,
     huber_cost,
@@ -38,6 +43,12 @@ from segfloor_ros.slam.rig import (
 )
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge
+
+CONVERGED = 2e-3
+"""Stop at this relative decrease of the cost; the next keyframe goes on from there."""
+
+MANY = 300
+"""From so many cameras on, gradients are faster than a factor."""
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
@@ -61,7 +72,7 @@ class System:
     each pair (keyframe, point[m]) that an observation ties together, those of camera k from
     starts[k] to starts[k + 1]; right-hand sides. The disparity offset is one more unknown: its
     products with cameras (K, 6), points (3, P), itself. between: two cameras and the block (6, 6)
-    that ties them without points.
+    that ties them without points. adjoints (K, 6, 6): of the poses of the cameras.
     """
 
     U: Array
@@ -75,6 +86,7 @@ class System:
     offset_point: Array
     offset_offset: float
     offset_rhs: float
+    adjoints: Array
     between: tuple[tuple[int, int, Array], ...] = ()
 
     def with_prior(self, information: float, offset_error_px: float) -> System:
@@ -96,15 +108,19 @@ class System:
         diagonal = np.einsum('kaa->ka', self.U)
         U = self.U + np.eye(6) * (damping * diagonal + 1e-9)[:, None]
         y = [_times_lower(L_inverse, of_point) for of_point in (self.point_rhs, self.offset_point)]
-        x, rhs, back = solve_complement(
+        complement = Complement(
             U,
             np.ascontiguousarray(self._blocks(L_inverse).transpose(2, 0, 1)),
             self.starts,
             self.point,
-            np.stack(y, axis=-1).swapaxes(0, 1),
-            np.stack([self.camera_rhs, self.offset_camera], axis=-1),
+            self.V.shape[2],
             self.between,
         )
+        of_points = np.stack(y, axis=-1).swapaxes(0, 1).reshape(-1, 2)
+        of_cameras = np.stack([self.camera_rhs, self.offset_camera], axis=-1).reshape(-1, 2)
+        rhs = of_cameras - complement.Y @ of_points
+        x = complement.solve(rhs, self.adjoints)
+        back = (of_points - complement.Y.T @ x).reshape(-1, 3, 2)
         information = self.offset_offset - float((y[1] ** 2).sum() + rhs[:, 1] @ x[:, 1])
         offset = self.offset_rhs - float((y[0] * y[1]).sum() + rhs[:, 1] @ x[:, 0])
         offset /= information
@@ -207,6 +223,7 @@ def normal_equations(camera: StereoCamera, at: Linearisation) -> System:
         of_point[1],
         float(at.weight[:, 2].sum()),
         -float(at.weight[:, 2] @ at.residual[:, 2]),
+        adjoint(at.T_camera_world[: at.num_free]),
     )
 
 
@@ -240,36 +257,74 @@ def _sum_by(index: NDArray[np.intp], values: Array, size: int) -> Array:
     return np.asarray(sums.reshape(*values.shape[:-1], size), np.float64)
 
 
-def solve_complement(
-    U: Array,
-    Y: Array,
-    starts: NDArray[np.intp],
-    point: NDArray[np.intp],
-    y: Array,
-    rhs: Array,
-    between: tuple[tuple[int, int, Array], ...],
-) -> tuple[Array, Array, Array]:
-    """Solve (U - Y Y^T) x = rhs - Y y for several right-hand sides (..., R).
+class Complement:
+    """The complement U - Y Y^T of cameras.
 
     U: (K, 6, 6), Y: (M, 6, 3) by blocks, those of camera k from starts[k] to starts[k + 1], point:
-    (M,) their columns. y: (P, 3, R), rhs: (K, 6, R). between: further blocks off the diagonal.
-    Returns x (6 K, R), the right-hand side (6 K, R) and y - Y^T x (P, 3, R).
+    (M,) their columns, of num_points. between: further blocks off the diagonal.
     """
-    count, size = len(U), y.shape[0]
-    blocks = sparse.bsr_array((Y, point, starts), shape=(6 * count, 3 * size))
-    S = sparse.bsr_array((U, np.arange(count), np.arange(count + 1)), shape=(6 * count,) * 2)
-    S = S - blocks @ blocks.T
-    if between:
-        j, k = (np.array([link[side] for link in between]) for side in (0, 1))
-        tied = np.stack([link[2] for link in between])
-        rows = (6 * j[:, None, None] + np.arange(6)[:, None] + np.zeros(6, int)).ravel()
-        columns = (6 * k[:, None, None] + np.zeros((6, 1), int) + np.arange(6)).ravel()
-        off = sparse.coo_array((tied.ravel(), (rows, columns)), shape=S.shape)
-        S = S + off + off.T
-    flat = y.reshape(3 * size, y.shape[-1])
-    reduced = rhs.reshape(6 * count, -1) - blocks @ flat
-    x = solve_symmetric(S.tocsc(), reduced)
-    return x, reduced, (flat - blocks.T @ x).reshape(y.shape)
+
+    def __init__(
+        self,
+        U: Array,
+        Y: Array,
+        starts: NDArray[np.intp],
+        point: NDArray[np.intp],
+        num_points: int,
+        between: tuple[tuple[int, int, Array], ...],
+    ) -> None:
+        self._count, size = len(U), 6 * len(U)
+        self.Y = sparse.bsr_array((Y, point, starts), shape=(size, 3 * num_points))
+        self._U = _block_diagonal(U)
+        if between:
+            j, k = (np.array([link[side] for link in between]) for side in (0, 1))
+            tied = np.stack([link[2] for link in between])
+            rows = (6 * j[:, None, None] + np.arange(6)[:, None] + np.zeros(6, int)).ravel()
+            columns = (6 * k[:, None, None] + np.zeros((6, 1), int) + np.arange(6)).ravel()
+            off = sparse.coo_array((tied.ravel(), (rows, columns)), shape=(size, size))
+            self._U = self._U + off + off.T
+        rows_of = [Y[a:b].transpose(1, 0, 2).reshape(6, -1) for a, b in pairwise(starts)]
+        self._diagonal = U - np.stack([Y_k @ Y_k.T for Y_k in rows_of])
+
+    def solve(self, b: Array, adjoints: Array) -> Array:
+        """Return x (6 K, R) for right-hand sides b (6 K, R), of cameras whose poses have these
+        adjoints (K, 6, 6): where they are many, up to `CONVERGED` of what it is good for.
+        """
+        if self._count < MANY:
+            return solve_symmetric((self._U - self.Y @ self.Y.T).tocsc(), b)
+        return self._by_gradients(b, adjoints)
+
+    def _by_gradients(self, b: Array, adjoints: Array) -> Array:
+        """Conjugate gradients, preconditioned camera by camera and stretch by stretch."""
+        Y_T = self.Y.T
+        cameras = _block_diagonal(np.linalg.inv(self._diagonal))
+        stretch = np.arange(self._count) // LOCAL_KEYFRAMES
+        moved = (adjoints, stretch, np.arange(self._count + 1))  # each as its stretch moves
+        R = sparse.bsr_array(moved, shape=(6 * self._count, 6 * (stretch[-1] + 1)))
+        of_stretches = R.T @ self.Y
+        coarse = np.asarray((R.T @ (self._U @ R) - of_stretches @ of_stretches.T).toarray())
+        factor = cho_factor(coarse)
+
+        x, r = np.zeros_like(b), b
+        z = p = cameras @ r + R @ cho_solve(factor, R.T @ r)
+        left = enough = (r * z).sum(axis=0)
+        for _ in range(len(b)):
+            q = self._U @ p - self.Y @ (Y_T @ p)
+            step = left / np.maximum((p * q).sum(axis=0), SMALLEST)
+            x, r = x + step * p, r - step * q
+            z = cameras @ r + R @ cho_solve(factor, R.T @ r)
+            before, left = left, (r * z).sum(axis=0)
+            if (left <= CONVERGED * enough).all():
+                break
+            p = z + left / np.maximum(before, SMALLEST) * p
+        return x
+
+
+def _block_diagonal(blocks: Array) -> sparse.bsr_array:
+    """Return the matrix with blocks (K, 6, 6) on its diagonal."""
+    count = len(blocks)
+    shape = (6 * count, 6 * count)
+    return sparse.bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=shape)
 
 
 def solve_symmetric(A: sparse.csc_array, b: Array) -> Array:
