@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points, without_drift
 from segfloor_ros.slam.mapping.normal_equations import (
-    CONVERGED,
     Factor,
     Linearisation,
     Step,
@@ -42,6 +41,9 @@ from segfloor_ros.slam.rig import (
     squared_norms,
 )
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
+
+CONVERGED = 2e-3
+"""Stop at this relative decrease of the cost; the next keyframe goes on from there."""
 
 STEPS = 6
 """An adjustment mostly converges in three."""

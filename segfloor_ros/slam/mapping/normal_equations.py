@@ -19,7 +19,7 @@ Huber's: wheels that slip lie by much more than they are taken to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
@@ -44,11 +44,9 @@ from segfloor_ros.slam.rig import (
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 from segfloor_ros.slam.sparse_map import KeyframeRecord, LoopEdge
 
-CONVERGED = 2e-3
-"""Stop at this relative decrease of the cost; the next keyframe goes on from there."""
-
-MANY = 300
-"""From so many cameras on, gradients are faster than a factor."""
+MANY, LEFT = 300, 0.01
+"""From so many cameras on, gradients are faster than a factor; they end where less than this share
+of what they began with is left: the next step begins where the cost is another one."""
 
 FLOOR_SIGMA = np.array([1e-3] * 3 + [1e-4] * 3)
 """No motion is measured better: the base shakes on its way."""
@@ -274,6 +272,7 @@ class Complement:
         between: tuple[tuple[int, int, Array], ...],
     ) -> None:
         self._count, size = len(U), 6 * len(U)
+        self._diagonal, self._runs = U, (Y, starts[1:-1])
         self.Y = sparse.bsr_array((Y, point, starts), shape=(size, 3 * num_points))
         self._U = _block_diagonal(U)
         if between:
@@ -283,41 +282,41 @@ class Complement:
             columns = (6 * k[:, None, None] + np.zeros((6, 1), int) + np.arange(6)).ravel()
             off = sparse.coo_array((tied.ravel(), (rows, columns)), shape=(size, size))
             self._U = self._U + off + off.T
-        rows_of = [Y[a:b].transpose(1, 0, 2).reshape(6, -1) for a, b in pairwise(starts)]
-        self._diagonal = U - np.stack([Y_k @ Y_k.T for Y_k in rows_of])
 
     def solve(self, b: Array, adjoints: Array) -> Array:
         """Return x (6 K, R) for right-hand sides b (6 K, R), of cameras whose poses have these
-        adjoints (K, 6, 6): where they are many, up to `CONVERGED` of what it is good for.
+        adjoints (K, 6, 6): where they are many, up to a small share of what it is good for.
         """
         if self._count < MANY:
             return solve_symmetric((self._U - self.Y @ self.Y.T).tocsc(), b)
-        return self._by_gradients(b, adjoints)
-
-    def _by_gradients(self, b: Array, adjoints: Array) -> Array:
-        """Conjugate gradients, preconditioned camera by camera and stretch by stretch."""
-        Y_T = self.Y.T
-        cameras = _block_diagonal(np.linalg.inv(self._diagonal))
-        stretch = np.arange(self._count) // LOCAL_KEYFRAMES
-        moved = (adjoints, stretch, np.arange(self._count + 1))  # each as its stretch moves
-        R = sparse.bsr_array(moved, shape=(6 * self._count, 6 * (stretch[-1] + 1)))
-        of_stretches = R.T @ self.Y
-        coarse = np.asarray((R.T @ (self._U @ R) - of_stretches @ of_stretches.T).toarray())
-        factor = cho_factor(coarse)
-
+        Y_T, approximate = self.Y.T, self._approximate_inverse(adjoints)
         x, r = np.zeros_like(b), b
-        z = p = cameras @ r + R @ cho_solve(factor, R.T @ r)
-        left = enough = (r * z).sum(axis=0)
+        z = p = approximate(r)
+        left = all_of_it = (r * z).sum(axis=0)
         for _ in range(len(b)):
             q = self._U @ p - self.Y @ (Y_T @ p)
             step = left / np.maximum((p * q).sum(axis=0), SMALLEST)
             x, r = x + step * p, r - step * q
-            z = cameras @ r + R @ cho_solve(factor, R.T @ r)
+            z = approximate(r)
             before, left = left, (r * z).sum(axis=0)
-            if (left <= CONVERGED * enough).all():
+            if (left <= LEFT * all_of_it).all():
                 break
             p = z + left / np.maximum(before, SMALLEST) * p
         return x
+
+    def _approximate_inverse(self, adjoints: Array) -> Callable[[Array], Array]:
+        """Return what solves each camera by itself, and each stretch of some in a row as a rigid
+        body: the sum of both.
+        """
+        of_camera = [Y_k.transpose(1, 0, 2).reshape(6, -1) for Y_k in np.split(*self._runs)]
+        alone = self._diagonal - np.stack([Y_k @ Y_k.T for Y_k in of_camera])
+        inverse = _block_diagonal(np.linalg.inv(alone))
+        stretch = np.arange(self._count) // LOCAL_KEYFRAMES
+        moved = (adjoints, stretch, np.arange(self._count + 1))
+        as_one = sparse.bsr_array(moved, shape=(6 * self._count, 6 * (stretch[-1] + 1)))
+        Y = as_one.T @ self.Y
+        factor = cho_factor((as_one.T @ (self._U @ as_one) - Y @ Y.T).toarray())
+        return lambda r: inverse @ r + as_one @ cho_solve(factor, as_one.T @ r)
 
 
 def _block_diagonal(blocks: Array) -> sparse.bsr_array:

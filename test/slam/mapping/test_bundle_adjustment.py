@@ -32,6 +32,21 @@ def test_fixed_keyframes_do_not_move():
     np.testing.assert_array_equal(result.T_camera_world[3:], truth.T_camera_world[3:])
 
 
+def test_a_far_point_whose_step_leads_through_the_cameras_keeps_no_other_from_moving():
+    truth = make_problem()
+    start = disturbed(truth)
+    start.points_world[0] *= 77.0 / start.points_world[0, 2]
+    result = adjust(CAMERA, start, iterations=2)
+    before, after = (
+        np.linalg.norm(problem.T_camera_world[:3, :3, 3] - truth.T_camera_world[:3, :3, 3], axis=1)
+        for problem in (start, result)
+    )
+    assert (after < 0.1 * before).all()
+    np.testing.assert_array_equal(result.points_world[0], start.points_world[0])
+    others = np.linalg.norm(result.points_world[1:] - truth.points_world[1:], axis=1)
+    assert np.median(others) < 0.01
+
+
 def test_noise_is_averaged_and_outliers_are_named():
     truth = make_problem(sigma=0.3)
     spoiled = truth.observations.uvd_px.copy()

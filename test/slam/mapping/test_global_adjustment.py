@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from segfloor_ros.geometry import invert, se3_exp, transform_points
+from segfloor_ros.slam.mapping import normal_equations
 from segfloor_ros.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -47,6 +48,17 @@ def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
     assert before > 0.1
     assert errors_m(bent).max() < 0.05 * before
     np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
+
+
+def test_a_large_map_is_adjusted_without_a_factor_and_comes_out_the_same(bent, monkeypatch):
+    copied = copy_map(bent, NO_OFFSET, None)
+    by_factor = solve_global(CAMERA, copied, lambda: True)
+    monkeypatch.setattr(normal_equations, 'MANY', COUNT // 2)
+    monkeypatch.delattr(normal_equations, 'solve_symmetric')
+    by_gradients = solve_global(CAMERA, copied, lambda: True)
+    poses = (invert(found.adjusted.T_camera_world) for found in (by_factor, by_gradients))
+    moved_m = np.linalg.norm(np.subtract(*poses)[:, :3, 3], axis=1)
+    assert moved_m.max() < 0.02 * errors_m(bent).max()
 
 
 def test_rotations_stay_rotations_however_often_the_map_is_adjusted(bent):
