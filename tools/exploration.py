@@ -50,7 +50,7 @@ JOBS = {
     'corridor1': Job('corridor1'),
     'complex_room': Job('complex_room', minutes=20),
     'house_map': Job('house_map.yaml', 'husky', 30),
-    'depot': Job('depot.yaml', 'husky', 30),
+    'depot': Job('depot.yaml', 'husky', 60),
 }
 
 HEAD = (
