@@ -130,10 +130,16 @@ class Costmap:
         standing &= ~self._discs(driven[-1:], radius_m / 2)
         self.free = ((grid.cells == FREE) | trodden) & ~standing
         unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
-        dark = cv2.morphologyEx(unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        self.dark = dark[1:-1, 1:-1] > 0
-        """What is unknown, but for slits that the map leaves along walls."""
-        beside = cv2.dilate(dark, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        half = max(1, round(radius_m / 2 / grid.resolution_m))
+        dark, wide = (
+            cv2.morphologyEx(
+                unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)
+            )
+            for side in (3, 2 * half + 1)  # without slits that the map leaves along walls
+        )
+        self.dark = wide[1:-1, 1:-1] > 0
+        """What is unknown, where half the robot would fit in."""
+        beside = cv2.dilate(wide, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
         self._edge_m = grid.away_m(beside & self.free)
         standing_m = self._standing_m = grid.away_m(standing)
         self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
@@ -244,7 +250,8 @@ class Costmap:
 
     def frontiers(self) -> list[Cells]:
         """Return the places next to free floor that borders on what is unknown, (N, 2) for each
-        connected stretch of them. Behind a wall there is no such floor.
+        connected stretch of them. Behind a wall there is no such floor, and no way leads on where
+        half the robot would not fit.
         """
         near_m = self._radius_m + CELL_M + self.grid.resolution_m
         border = (self.stops & (self._edge_m <= near_m)).astype(np.uint8)

@@ -119,6 +119,16 @@ def test_frontiers_are_places_to_turn_beside_unknown_floor_but_not_beside_slits(
     assert frontier[:, 1].min() >= 14
 
 
+def test_what_is_too_narrow_for_half_the_robot_hides_no_way_but_is_kept_away_from() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[4:8, 20:24] = UNKNOWN
+    driven = np.array([(0.65, 0.55)])
+    for radius_m, count in ((0.15, 1), (0.45, 0)):
+        costmap = Costmap(grid, radius_m, 2 * radius_m, NOTHING, driven, 0.0)
+        assert len(costmap.frontiers()) == count
+        assert costmap.room_m[6, 19] < 2 * CELL_M
+
+
 ROOM_AND_PASSAGE = """
 ####################
 #.........##########
