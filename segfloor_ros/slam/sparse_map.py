@@ -437,6 +437,17 @@ class SparseMap:
         )
         self._retired.append(keyframe)
 
+    def thin_out(self, keyframe: KeyframeRecord) -> None:
+        """Forget the features of a keyframe that show no point: of an old one they will never."""
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        new_row = np.zeros(len(keyframe.point_id), np.int32)
+        new_row[rows] = np.arange(len(rows))
+        mine = self.edges.keyframe == keyframe.index
+        self.edges.row[mine] = new_row[self.edges.row[mine]]
+        keyframe.features = keyframe.features.take(rows)
+        keyframe.observations = keyframe.observations.take(rows)
+        keyframe.point_id = keyframe.point_id[rows]
+
     def follow(self) -> None:
         """Move the retired keyframes with those that they follow."""
         # The latest retired first: an older one may follow it.

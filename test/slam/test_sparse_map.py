@@ -5,6 +5,7 @@ from hand_made_maps import CAMERA, add, keyframe
 
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
+from segfloor_ros.slam.saved_slam import map_to_arrays
 from segfloor_ros.slam.sparse_map import PointRows, SparseMap
 
 
@@ -78,6 +79,20 @@ def test_unlinking_the_last_observer_removes_the_point():
     points, keyframes, rows = sparse_map.edges_of(np.array([0, 1, 2]))
     edges = set(zip(points.tolist(), keyframes.tolist(), rows.tolist(), strict=True))
     assert edges == {(0, 0, 0), (1, 0, 1), (1, 1, 2)}
+
+
+def test_features_of_no_point_are_forgotten_and_the_map_is_the_same():
+    sparse_map, first, second = two_keyframes()
+    before = map_to_arrays(sparse_map)
+    sparse_map.thin_out(first)
+    assert len(first.features.octave) == len(first.observations.uvd_px) == 3
+    np.testing.assert_array_equal(first.point_id, [0, 1, 2])
+    assert len(second.point_id) == 3, 'another keeps what it has'
+    for name, values in map_to_arrays(sparse_map).items():
+        np.testing.assert_array_equal(values, before[name])
+    sparse_map.remove_points(np.array([2]))
+    np.testing.assert_array_equal(first.point_id, [0, 1, NO_POINT])
+    np.testing.assert_array_equal(second.point_id, [NO_POINT, NO_POINT, 1])
 
 
 def test_points_that_tracking_seldom_finds_are_poor():

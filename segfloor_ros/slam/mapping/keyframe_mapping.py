@@ -184,7 +184,7 @@ class LocalMapper:
     def apply(self, adjustment: Adjustment, result: BundleResult) -> None:
         """Write an adjustment back to the map, which has had no new keyframe since, and cull poor
         points. One that loses what the newest keyframe saw has followed something that moves, or a
-        wrong match, and is left out.
+        wrong match, and is left out. A keyframe as old as the neighbourhood gets no more points.
         """
         kept = result.inliers[adjustment.edge_keyframe == adjustment.newest]
         if len(kept) and kept.mean() < MAJORITY:
@@ -195,6 +195,8 @@ class LocalMapper:
         settled = adjustment.newest - SETTLING_KEYFRAMES
         self._map.remove_points(self._map.poor_points(settled, MIN_FOUND_RATIO))
         retire_redundant(self._map, adjustment.free)
+        if adjustment.newest >= NEIGHBOURS:
+            self._map.thin_out(self._map.keyframes[adjustment.newest - NEIGHBOURS])
         self._map.follow()
 
     def _choose_keyframes(
