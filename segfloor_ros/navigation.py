@@ -441,7 +441,9 @@ class Explorer:
             self._begin_goals(driven)
 
     def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
-        """Return the frontier to drive to: the soonest, or the present one while it is one."""
+        """Return the frontier to drive to: the soonest, or the present one while it is one that it
+        can reach: of two that are as soon each seems sooner in turn.
+        """
         least = self.body.radius_m
         best, best_cost = None, np.inf
         for cells in costmap.frontiers():
@@ -454,7 +456,7 @@ class Explorer:
                 cost = np.where(is_near & (len(self.ended) <= goals), np.inf, cost)
             if self._target is not None:
                 is_same = np.hypot(*(points - self._target).T) < 2 * least
-                cost = np.where(is_same, cost - 1.0, cost)
+                cost = np.where(is_same, cost - FAR_M / 2, cost)
             nearest = int(np.argmin(cost))
             if cost[nearest] < best_cost:
                 best, best_cost = points[nearest], cost[nearest]

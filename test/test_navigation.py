@@ -129,6 +129,24 @@ def test_what_is_too_narrow_for_half_the_robot_hides_no_way_but_is_kept_away_fro
         assert costmap.room_m[6, 19] < 2 * CELL_M
 
 
+def test_it_goes_on_to_its_frontier_though_another_has_become_nearer_as_long_as_a_way_leads() -> (
+    None
+):
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[1:-1, 1:4] = grid.cells[1:-1, 22:25] = UNKNOWN
+    explorer = Explorer(BODY, 0, grid=grid)
+    ends = []
+    for time_s, x in ((0.0, 1.75), (2.0, 0.75)):
+        explorer.step(time_s, pose_of(x, 0.55, np.pi))
+        ends.append(explorer.path[-1, 0])
+    assert min(ends) > 1.75
+    explorer.grid = grid_of(TWO_ROOMS)
+    explorer.grid.cells[:] = grid.cells
+    explorer.grid.cells[3:8, 13] = OCCUPIED
+    explorer.step(4.0, pose_of(0.75, 0.55, np.pi))
+    assert explorer.path[-1, 0] < 0.75
+
+
 ROOM_AND_PASSAGE = """
 ####################
 #.........##########
