@@ -278,7 +278,8 @@ class KeyframeRecord:
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
     motion: since the keyframe before, by wheels. up: in the camera, as it was measured.
     links: indices of earlier keyframes that it shared many points with when it was made.
-    ground: what it shows of the floor.
+    ground: what it shows of the floor. is_thin: whether features that show no point are gone, so
+    that rows from before do not count any more.
     """
 
     index: int
@@ -293,6 +294,7 @@ class KeyframeRecord:
     retired: Retirement | None = None
     links: tuple[int, ...] = ()
     ground: GroundView = NOTHING
+    is_thin: bool = False
 
     @property
     def T_world_camera(self) -> Array:
@@ -427,10 +429,7 @@ class SparseMap:
         index and stamp stay.
         """
         self.unlink(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT))
-        none = np.zeros(0, np.intp)
-        keyframe.features = keyframe.features.take(none)
-        keyframe.observations = keyframe.observations.take(none)
-        keyframe.point_id = keyframe.point_id[none]
+        self.thin_out(keyframe)
         keyframe.ground = NOTHING
         keyframe.retired = Retirement(
             reference.index, keyframe.T_camera_world @ reference.T_world_camera
@@ -447,6 +446,7 @@ class SparseMap:
         keyframe.features = keyframe.features.take(rows)
         keyframe.observations = keyframe.observations.take(rows)
         keyframe.point_id = keyframe.point_id[rows]
+        keyframe.is_thin = True
 
     def follow(self) -> None:
         """Move the retired keyframes with those that they follow."""

@@ -3,10 +3,11 @@
 import numpy as np
 from hand_made_maps import CAMERA, add, keyframe
 
+from segfloor_ros.slam.places import loop_closing
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.saved_slam import map_to_arrays
-from segfloor_ros.slam.sparse_map import PointRows, SparseMap
+from segfloor_ros.slam.sparse_map import Match, PointRows, SparseMap
 
 
 def two_keyframes():
@@ -93,6 +94,15 @@ def test_features_of_no_point_are_forgotten_and_the_map_is_the_same():
     sparse_map.remove_points(np.array([2]))
     np.testing.assert_array_equal(first.point_id, [0, 1, NO_POINT])
     np.testing.assert_array_equal(second.point_id, [NO_POINT, NO_POINT, 1])
+
+
+def test_a_place_seen_before_features_were_forgotten_merges_no_points():
+    sparse_map, first, _ = two_keyframes()
+    ids = np.array([1], np.int32)
+    seen = Match(0, 1, np.eye(4), np.array([3]), ids, sparse_map.stable_id[ids])
+    sparse_map.thin_out(first)
+    loop_closing._merge(sparse_map, seen)
+    np.testing.assert_array_equal(first.point_id, [0, 1, 2])
 
 
 def test_points_that_tracking_seldom_finds_are_poor():

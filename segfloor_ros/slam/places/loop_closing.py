@@ -128,7 +128,7 @@ def fuse_latest(sparse_map: SparseMap, latest: int) -> None:
 def _merge(sparse_map: SparseMap, match: Match) -> None:
     """Make one point of what a keyframe knows as its own and the place as another."""
     keyframe = sparse_map.keyframes[match.keyframe]
-    if keyframe.retired is not None:
+    if keyframe.is_thin:
         return
     same = sparse_map.alive[match.ids] & (sparse_map.stable_id[match.ids] == match.stable_ids)
     own = np.where(same, keyframe.point_id[match.rows], NO_POINT)
@@ -284,7 +284,7 @@ class KnownMap:
         """
         keyframe = self._own.keyframes[match.keyframe]
         own = np.full(len(match.rows), NO_POINT, np.int32)
-        if keyframe.retired is None:
+        if not keyframe.is_thin:
             own = keyframe.point_id[match.rows]
         return np.where(own != NO_POINT, self._own.stable_id[own], np.int32(NO_POINT))
 
