@@ -46,7 +46,7 @@ JOBS = {
     'corridor2': Job('corridor2'),
     'yard': Job('yard', 'husky'),
     'doors': Job('doors'),
-    'people': Job('people', 'husky'),
+    'people': Job('people', 'husky', 20),
     'corridor1': Job('corridor1'),
     'complex_room': Job('complex_room', minutes=20),
     'house_map': Job('house_map.yaml', 'husky', 30),
