@@ -45,6 +45,7 @@ def keyframe(index, point_id, x=0.0):
         1000 * index,
         make_transform(np.eye(3), np.array([-x, 0.0, 0.0])),
         found,
+        found.octave,
         Observations(np.zeros((count, 3)), np.ones((count, 3))),
         np.array(point_id, np.int32),
     )

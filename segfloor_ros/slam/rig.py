@@ -117,11 +117,12 @@ class Observations:
     """Stereo measurements of N features.
 
     uvd_px: (N, 3) float64 = (u, v, disparity), disparity NaN where there is none. sigma_px: (N,
-    3) standard deviations.
+    3) standard deviations. Of old keyframes, and of those in files, they are only kept, in float32
+    and float16; as `exact` they are computed with.
     """
 
-    uvd_px: Array
-    sigma_px: Array
+    uvd_px: NDArray[np.floating]
+    sigma_px: NDArray[np.floating]
 
     def __len__(self) -> int:
         return len(self.uvd_px)
@@ -129,6 +130,14 @@ class Observations:
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Observations:
         """Return the chosen rows."""
         return Observations(self.uvd_px[rows], self.sigma_px[rows])
+
+    def compact(self) -> Observations:
+        """Return the same measurements in little memory."""
+        return Observations(self.uvd_px.astype(np.float32), self.sigma_px.astype(np.float16))
+
+    def exact(self) -> Observations:
+        """Return the same measurements to compute with."""
+        return Observations(self.uvd_px.astype(np.float64), self.sigma_px.astype(np.float64))
 
     @property
     def has_disparity(self) -> NDArray[np.bool_]:

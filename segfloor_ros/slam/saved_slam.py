@@ -34,7 +34,6 @@ from segfloor_ros.slam.sparse_map import (
     Retirement,
     SparseMap,
 )
-from segfloor_ros.slam.tracking.images import Features
 
 if TYPE_CHECKING:  # which uses this module
     from segfloor_ros.slam.stereo_slam import StereoSlam
@@ -221,7 +220,7 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
     pairs = list(zip(keyframes, shown, strict=True))
     uvd, length = joined([k.observations.uvd_px[r] for k, r in pairs], np.zeros((0, 3)))
     sigma, _ = joined([k.observations.sigma_px[r] for k, r in pairs], np.zeros((0, 3)))
-    octave, _ = joined([k.features.octave[r] for k, r in pairs], np.zeros(0, np.uint8))
+    octave, _ = joined([k.octave[r] for k, r in pairs], np.zeros(0, np.uint8))
     point, _ = joined([new_row[k.point_id[r]] for k, r in pairs], np.zeros(0, np.int32))
     links, link_length = joined(
         [np.array(k.links, np.int32) for k in keyframes], np.zeros(0, np.int32)
@@ -258,8 +257,7 @@ def fill_map(sparse_map: SparseMap, arrays: Arrays) -> None:
     """
     first, first_row = len(sparse_map.keyframes), len(sparse_map.alive)
     sparse_map.points.from_arrays(arrays, first)
-    descriptor = sparse_map.descriptor[first_row:]
-    for index, record in enumerate(_keyframes(arrays, descriptor, first, first_row), first):
+    for index, record in enumerate(_keyframes(arrays, first, first_row), first):
         if record.index != index or (record.point_id >= len(sparse_map.alive)).any():
             raise ValueError('features of points that are not there')
         sparse_map.restore(record)
@@ -345,9 +343,7 @@ def moved(arrays: Arrays, T_new_old: Array) -> Arrays:
     }
 
 
-def _keyframes(
-    arrays: Arrays, descriptor: NDArray[np.uint8], first: int, first_row: int
-) -> list[KeyframeRecord]:
+def _keyframes(arrays: Arrays, first: int, first_row: int) -> list[KeyframeRecord]:
     length = arrays['keyframe_features']
     uvd, sigma, octave, point = (
         split(arrays[f'feature_{name}'], length)
@@ -365,9 +361,6 @@ def _keyframes(
         ]
     records = []
     for k, stamp_ns in enumerate(arrays['keyframe_stamp_ns'].tolist()):
-        # Points carry the look of their features.
-        features = Features(uvd[k][:, :2].copy(), octave[k], descriptor[point[k]])
-        observations = Observations(uvd[k].astype(np.float64), sigma[k].astype(np.float64))
         follows = int(arrays['keyframe_follows'][k])
         retired = Retirement(first + follows, arrays['keyframe_T_camera_followed'][k])
         records.append(
@@ -376,8 +369,9 @@ def _keyframes(
                 int(arrays['keyframe_frame_index'][k]),
                 stamp_ns,
                 arrays['keyframe_T_camera_world'][k],
-                features,
-                observations,
+                None,
+                octave[k],
+                Observations(uvd[k], sigma[k]),
                 (first_row + point[k]).astype(np.int32),
                 retired=retired if follows != NO_POINT else None,
                 links=tuple((first + links[k]).tolist()),

@@ -34,32 +34,32 @@ MAX_PATCH_ZOOM = 1.3
 
 @dataclass(frozen=True)
 class Column:
-    """A column of rows of some shape. in_file: the type that is exact enough for a file; None for
-    what follows from the rest. start: the value of a new point, unless it is given.
+    """A column of rows of some shape. start: the value of a new point, unless it is given.
+    in_file: whether a file has it; the others follow from the rest.
     """
 
     dtype: type
-    in_file: type | None
     shape: tuple[int, ...] = ()
     start: Any = 0
+    in_file: bool = True
 
 
 COLUMNS = {
-    'xyz_world': Column(np.float64, np.float64, (3,)),
-    'stable_id': Column(np.int32, np.int32),
-    'alive': Column(np.bool_, None, start=True),
-    'descriptor': Column(np.uint8, np.uint8, (32,)),
-    'patch': Column(np.uint8, np.uint8, (SIDE_PX, SIDE_PX)),
-    'patch_distance_m': Column(np.float64, np.float32),
-    'viewing_distance_m': Column(np.float64, np.float32),
-    'viewing_octave': Column(np.float64, np.float32),
-    'viewing_direction': Column(np.float64, np.float32, (3,)),
-    'visible_count': Column(np.int32, np.int32, start=1),
-    'found_count': Column(np.int32, np.int32, start=1),
-    'observer_count': Column(np.int32, None),
-    'seen_through_count': Column(np.int32, np.int32),
-    'born': Column(np.int32, np.int32),
-    'seen_last': Column(np.int32, np.int32),
+    'xyz_world': Column(np.float64, (3,)),
+    'stable_id': Column(np.int32),
+    'alive': Column(np.bool_, start=True, in_file=False),
+    'descriptor': Column(np.uint8, (32,)),
+    'patch': Column(np.uint8, (SIDE_PX, SIDE_PX)),
+    'patch_distance_m': Column(np.float32),
+    'viewing_distance_m': Column(np.float32),
+    'viewing_octave': Column(np.float32),
+    'viewing_direction': Column(np.float32, (3,)),
+    'visible_count': Column(np.int32, start=1),
+    'found_count': Column(np.int32, start=1),
+    'observer_count': Column(np.int32, in_file=False),
+    'seen_through_count': Column(np.int32),
+    'born': Column(np.int32),
+    'seen_last': Column(np.int32),
 }
 
 OF_KEYFRAMES = ('born', 'seen_last')
@@ -111,9 +111,7 @@ class PointRows:
     def to_arrays(self, rows: NDArray[np.intp]) -> Arrays:
         """Return what a file holds of some rows (N,)."""
         arrays: Arrays = {
-            f'point_{name}': self[name][rows].astype(column.in_file)
-            for name, column in COLUMNS.items()
-            if column.in_file is not None
+            f'point_{name}': self[name][rows] for name, column in COLUMNS.items() if column.in_file
         }
         return arrays | {'num_ever': np.array([self.num_ever])}
 
@@ -121,7 +119,7 @@ class PointRows:
         """Add what `to_arrays` returned, behind points that are all alive; its keyframes are
         counted from first_keyframe on. Raises KeyError or ValueError for other arrays.
         """
-        kept = [name for name, column in COLUMNS.items() if column.in_file is not None]
+        kept = [name for name, column in COLUMNS.items() if column.in_file]
         check_lengths({name: arrays[f'point_{name}'] for name in kept})
         rows = self.add(len(arrays['point_stable_id']))
         for name in kept:
@@ -159,15 +157,18 @@ class GrowingArray:
         """Append rows of zeros."""
         self.extend(np.zeros((count, *self._buffer.shape[1:]), self._buffer.dtype))
 
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Drop the rows that are not chosen (N,)."""
-        kept = self.rows[chosen]
-        self._buffer[: len(kept)] = kept
-        self._length = len(kept)
+    def drop(self, dropped: NDArray[np.intp]) -> None:
+        """Drop rows (N,), ascending."""
+        first = int(dropped[0]) if len(dropped) else self._length
+        kept = np.delete(self.rows[first:], dropped - first, axis=0)
+        self._length = first + len(kept)
+        self._buffer[first : self._length] = kept
 
 
 class Edges:
-    """Observations (E,): the row of a point, the index of a keyframe, and its feature."""
+    """Observations (E,): the row of a point, the index of a keyframe, and its feature; keyframe by
+    keyframe.
+    """
 
     def __init__(self) -> None:
         self._columns = [GrowingArray((), np.int32) for _ in range(3)]
@@ -193,10 +194,14 @@ class Edges:
         for column, values in zip(self._columns, columns, strict=True):
             column.extend(values)
 
-    def drop(self, dropped: NDArray[np.bool_]) -> None:
-        """Drop observations (E,)."""
+    def of(self, keyframe: int) -> slice:
+        """Return where the observations of a keyframe are."""
+        return slice(*np.searchsorted(self.keyframe, [keyframe, keyframe + 1]).tolist())
+
+    def drop(self, dropped: NDArray[np.intp]) -> None:
+        """Drop observations by number (N,), ascending."""
         for column in self._columns:
-            column.keep(~dropped)
+            column.drop(dropped)
 
 
 @dataclass(frozen=True)
@@ -273,7 +278,8 @@ Covisible = tuple[NDArray[np.intp], NDArray[np.intp]]
 class KeyframeRecord:
     """One keyframe of the map.
 
-    The pose moves in bundle adjustment. observations: as measured, the disparity offset of the rig
+    The pose moves in bundle adjustment. features: None of an old one, of which the levels of the
+    pyramid are left, octave (N,) uint8. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
     one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
     motion: since the keyframe before, by wheels. up: in the camera, as it was measured.
@@ -286,7 +292,8 @@ class KeyframeRecord:
     frame_index: int
     stamp_ns: int
     T_camera_world: Array
-    features: Features
+    features: Features | None
+    octave: NDArray[np.uint8]
     observations: Observations
     point_id: NDArray[np.int32]
     motion: RelativeMotion | None = None
@@ -368,6 +375,15 @@ class SparseMap:
         known[known] = self.alive[rows[known]]
         return np.where(known, rows, NO_POINT).astype(np.int32)
 
+    def features_of(self, keyframe: KeyframeRecord) -> Features:
+        """Return the features of a keyframe; those of an old one look like the points that they
+        show.
+        """
+        if keyframe.features is not None:
+            return keyframe.features
+        uv_px = keyframe.observations.uvd_px[:, :2].astype(np.float32)
+        return Features(uv_px, keyframe.octave, self.descriptor[keyframe.point_id])
+
     def add_keyframe(
         self,
         keyframe: KeyframeRecord,
@@ -401,34 +417,36 @@ class SparseMap:
         ids = keyframe.point_id[rows]
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
-        self.descriptor[ids] = keyframe.features.descriptor[rows]
+        self.descriptor[ids] = self.features_of(keyframe).descriptor[rows]
         self.points['seen_last'][ids] = keyframe.index
         self.viewing_distance_m[ids] = distance
-        self.viewing_octave[ids] = keyframe.features.octave[rows]
+        self.viewing_octave[ids] = keyframe.octave[rows]
         self.viewing_direction[ids] = sight / distance[:, None]
         zoom = np.abs(np.log(np.maximum(self.patch_distance_m[ids], 1e-6) / distance))
         stale = zoom > np.log(MAX_PATCH_ZOOM)
         self.patch[ids[stale]] = patches[rows[stale]]
         self.patch_distance_m[ids[stale]] = distance[stale]
 
-    def unlink(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
-        """Forget the observations `rows` of a keyframe; a point that nobody observes any more
-        is removed.
+    def unlink(self, keyframe: int | NDArray[np.integer], row: NDArray[np.integer]) -> None:
+        """Forget observations: features `row` (N,) of a keyframe, or of keyframes (N,), by index. A
+        point that nobody observes any more is removed.
         """
-        ids = keyframe.point_id[rows]
-        keyframe.point_id[rows] = NO_POINT
-        gone = np.zeros(len(self.alive), bool)
-        gone[ids] = True
-        edges = gone[self.edges.point] & (self.edges.keyframe == keyframe.index)
-        self.edges.drop(edges)
-        self.observer_count[ids] -= 1
-        self.alive[ids[self.observer_count[ids] <= 0]] = False
+        dropped = [np.zeros(0, np.intp)]
+        keyframe = np.broadcast_to(keyframe, row.shape)
+        for k in np.unique(keyframe):
+            rows, record, own = row[keyframe == k], self.keyframes[k], self.edges.of(k)
+            ids = record.point_id[rows]
+            record.point_id[rows] = NO_POINT
+            dropped.append(own.start + np.flatnonzero(np.isin(self.edges.row[own], rows)))
+            self.observer_count[ids] -= 1
+            self.alive[ids[self.observer_count[ids] <= 0]] = False
+        self.edges.drop(np.concatenate(dropped))
 
     def retire(self, keyframe: KeyframeRecord, reference: KeyframeRecord) -> None:
         """Take a keyframe's observations out of the map and let its pose follow `reference`; its
         index and stamp stay.
         """
-        self.unlink(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT))
+        self.unlink(keyframe.index, np.flatnonzero(keyframe.point_id != NO_POINT))
         self.thin_out(keyframe)
         keyframe.ground = NOTHING
         keyframe.retired = Retirement(
@@ -437,14 +455,17 @@ class SparseMap:
         self._retired.append(keyframe)
 
     def thin_out(self, keyframe: KeyframeRecord) -> None:
-        """Forget the features of a keyframe that show no point: of an old one they will never."""
+        """Forget the features of a keyframe that show no point: of an old one they will never. Of
+        the others as much is kept as in a file.
+        """
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
         new_row = np.zeros(len(keyframe.point_id), np.int32)
         new_row[rows] = np.arange(len(rows))
-        mine = self.edges.keyframe == keyframe.index
+        mine = self.edges.of(keyframe.index)
         self.edges.row[mine] = new_row[self.edges.row[mine]]
-        keyframe.features = keyframe.features.take(rows)
-        keyframe.observations = keyframe.observations.take(rows)
+        keyframe.features = None
+        keyframe.octave = keyframe.octave[rows]
+        keyframe.observations = keyframe.observations.take(rows).compact()
         keyframe.point_id = keyframe.point_id[rows]
         keyframe.is_thin = True
 
@@ -459,7 +480,7 @@ class SparseMap:
     def remove_points(self, ids: NDArray[np.integer]) -> None:
         """Take points out of the map; their rows are free for new ones."""
         self.alive[ids] = False
-        dropped = ~self.alive[self.edges.point]
+        dropped = np.flatnonzero(~self.alive[self.edges.point])
         keyframes, rows = self.edges.keyframe[dropped], self.edges.row[dropped]
         for k in np.unique(keyframes):
             self.keyframes[k].point_id[rows[keyframes == k]] = NO_POINT
@@ -469,13 +490,14 @@ class SparseMap:
         """Return whether a keyframe observes both points of each pair (a[i], b[i]), (N,); no point
         occurs twice.
         """
-        pair: NDArray[np.intp] = np.full((2, len(self.alive)), -1)
-        pair[0, a] = pair[1, b] = np.arange(len(a))
-        of_pair = pair[:, self.edges.point]
-        keyframe = self.edges.keyframe
-        keys = [of[of >= 0] * len(self.keyframes) + keyframe[of >= 0] for of in of_pair]
+        both = np.concatenate([a, b])
+        point, keyframe, _ = self.edges_of(both)
+        order = np.argsort(both)
+        number = order[np.searchsorted(both, point, sorter=order)]
+        of_b = number >= len(a)
+        key = number % max(len(a), 1) * len(self.keyframes) + keyframe
         together = np.zeros(len(a), bool)
-        together[np.intersect1d(*keys) // len(self.keyframes)] = True
+        together[np.intersect1d(key[~of_b], key[of_b]) // len(self.keyframes)] = True
         return together
 
     def merge(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> int:
@@ -502,9 +524,9 @@ class SparseMap:
 
     def _rename(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
         """Give the observations of points `gone` to points `kept`."""
-        new_row = np.arange(len(self.alive), dtype=np.int32)
+        new_row: NDArray[np.int32] = np.full(len(self.alive), NO_POINT, np.int32)
         new_row[gone] = kept
-        moved = np.flatnonzero(new_row[self.edges.point] != self.edges.point)
+        moved = np.flatnonzero((new_row != NO_POINT)[self.edges.point])
         self.edges.point[moved] = new_row[self.edges.point[moved]]
         for k in np.unique(self.edges.keyframe[moved]):
             mine = moved[self.edges.keyframe[moved] == k]

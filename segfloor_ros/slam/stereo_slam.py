@@ -404,6 +404,7 @@ class StereoSlam:
             frame.stamp_ns,
             motion.T_camera_world,
             observed.features,
+            observed.features.octave,
             observed.observations,
             self.map.living(observed.point_id),
             motion.since_keyframe.start(motion.T_camera_world, motion.covariance),

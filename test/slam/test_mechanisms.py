@@ -36,7 +36,7 @@ def test_what_is_seen_again_is_not_mapped_twice():
 def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately():
     # Keyframe 0 sees points 0 to 4, the others, right beside it, only 5 to 9.
     sparse_map = row_of_views(4, [NO_POINT] * 5 + list(range(5, 10)), 0.05)
-    sparse_map.unlink(sparse_map.keyframes[0], np.arange(5, 10))
+    sparse_map.unlink(0, np.arange(5, 10))
     local = LocalMap(sparse_map, 30)
     local.move_to(np.arange(5, 10, dtype=np.int32), np.eye(4))
     np.testing.assert_array_equal(local.point_ids, np.arange(10))

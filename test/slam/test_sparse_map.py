@@ -72,10 +72,10 @@ def test_rows_are_reused_before_new_ones_are_made():
 
 def test_unlinking_the_last_observer_removes_the_point():
     sparse_map, first, second = two_keyframes()
-    sparse_map.unlink(second, np.array([0]))
+    sparse_map.unlink(second.index, np.array([0]))
     np.testing.assert_array_equal(sparse_map.observer_count, [1, 2, 1])
     assert sparse_map.alive.all()
-    sparse_map.unlink(first, np.array([3]))
+    sparse_map.unlink(first.index, np.array([3]))
     np.testing.assert_array_equal(sparse_map.alive, [True, True, False])
     points, keyframes, rows = sparse_map.edges_of(np.array([0, 1, 2]))
     edges = set(zip(points.tolist(), keyframes.tolist(), rows.tolist(), strict=True))
@@ -86,7 +86,11 @@ def test_features_of_no_point_are_forgotten_and_the_map_is_the_same():
     sparse_map, first, second = two_keyframes()
     before = map_to_arrays(sparse_map)
     sparse_map.thin_out(first)
-    assert len(first.features.octave) == len(first.observations.uvd_px) == 3
+    assert len(first.octave) == len(first.observations) == 3
+    assert first.observations.uvd_px.nbytes + first.observations.sigma_px.nbytes == 3 * 18
+    np.testing.assert_array_equal(
+        sparse_map.features_of(first).descriptor, sparse_map.descriptor[first.point_id]
+    )
     np.testing.assert_array_equal(first.point_id, [0, 1, 2])
     assert len(second.point_id) == 3, 'another keeps what it has'
     for name, values in map_to_arrays(sparse_map).items():
@@ -129,3 +133,35 @@ def test_points_of_a_map_behind_another_count_its_keyframes_from_where_they_come
     assert own['born'].tolist() == [0, 0, 0, 7, 11]
     assert own['seen_last'][3:].tolist() == [11, 12]
     assert own['stable_id'].tolist() == [0, 1, 2, 0, 1]
+
+
+def test_observations_are_those_of_the_keyframes_whatever_is_done_to_them():
+    rng, sparse_map = np.random.default_rng(0), SparseMap(Rig(CAMERA))
+    for k in range(8):
+        known = np.flatnonzero(sparse_map.alive)
+        seen = rng.choice(known, min(len(known), 15), replace=False)
+        ids = np.concatenate([seen, np.full(12, NO_POINT)])
+        new = np.arange(len(seen), len(ids) - 2)
+        add(sparse_map, keyframe(k, ids), new, rng.normal(size=(len(new), 3)))
+        kept = np.array([k, max(k - 1, 0)])
+        sparse_map.unlink(kept[:1], np.array([0]))
+        sparse_map.unlink(kept, np.array([1, 2]))
+        chosen = rng.permutation(np.flatnonzero(sparse_map.alive))[:7]
+        sparse_map.merge(chosen[:3], chosen[3:6])
+        sparse_map.remove_points(chosen[6:])
+        if k > 3:
+            sparse_map.thin_out(sparse_map.keyframes[k - 3])
+        edges, records = sparse_map.edges, sparse_map.keyframes
+        observed = [
+            (int(record.point_id[row]), record.index, int(row))
+            for record in records
+            for row in np.flatnonzero(record.point_id != NO_POINT)
+        ]
+        columns = (edges.point, edges.keyframe, edges.row)
+        listed = list(zip(*(column.tolist() for column in columns), strict=True))
+        assert sorted(listed) == sorted(observed)
+        assert (np.diff(edges.keyframe) >= 0).all(), 'keyframe by keyframe'
+        count = np.bincount(edges.point, minlength=len(sparse_map.alive))
+        np.testing.assert_array_equal(
+            count[sparse_map.alive], sparse_map.observer_count[sparse_map.alive]
+        )

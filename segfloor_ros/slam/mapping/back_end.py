@@ -17,7 +17,12 @@ import numpy as np
 from segfloor_ros.camera.model import Up
 from segfloor_ros.files.results import Arrays
 from segfloor_ros.geometry import Array
-from segfloor_ros.slam.mapping.bundle_adjustment import apply_global, copy_map, solve_global
+from segfloor_ros.slam.mapping.bundle_adjustment import (
+    GlobalResult,
+    apply_global,
+    copy_map,
+    solve_global,
+)
 from segfloor_ros.slam.mapping.keyframe_mapping import LocalMapper
 from segfloor_ros.slam.places.loop_closing import (
     Closing,
@@ -34,6 +39,10 @@ from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.images import Features, Images
 from segfloor_ros.timing import timed
+
+GROWN = 1.25
+"""The whole map is adjusted after a loop once it has so many times the keyframes that it had when
+it was last: that costs a long drive no more than a few adjustments of all it has mapped."""
 
 
 class Submap(Enum):
@@ -57,7 +66,8 @@ class Submap(Enum):
 
 
 class BackEnd:
-    """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after.
+    """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
+    loop that moves it far or once it has grown.
 
     background: on threads beside tracking; else at once, so that the outcome does not depend on
     timing. Tracking never waits for an adjustment of the whole map. submap: what the map is.
@@ -84,6 +94,7 @@ class BackEnd:
         self._global = AdjustmentRunner(background)
         self._background = background
         self._is_closing = False
+        self._adjusted_keyframes = 0
         self._up_world: Up | None = None
 
     @property
@@ -179,6 +190,7 @@ class BackEnd:
         self._global.reset()
         self.places.reset()
         self.loops.reset()
+        self._adjusted_keyframes = 0
         if words is not None:
             self.places.from_arrays(words)
 
@@ -258,11 +270,16 @@ class BackEnd:
         if not is_closed:
             return
         self.loop_count += 1
-        copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
-        self._global.submit(
-            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()),
-            partial(apply_global, self._map),
-        )
+        if closing.is_far or len(self._map.keyframes) >= GROWN * self._adjusted_keyframes:
+            copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
+            self._global.submit(
+                partial(solve_global, self._rig.camera, copied, self._global.is_wanted()),
+                partial(self._apply_global, len(copied.records)),
+            )
+
+    def _apply_global(self, num_keyframes: int, result: GlobalResult | None) -> None:
+        self._adjusted_keyframes = num_keyframes
+        apply_global(self._map, result)
 
 
 class AdjustmentRunner:

@@ -191,7 +191,8 @@ class LocalMapper:
             return
         self._rig.offset.learn(result.offset)
         self._write_back(adjustment, result)
-        self._drop_outliers(adjustment.edge_keyframe, adjustment.edge_row, result.inliers)
+        outliers = ~result.inliers
+        self._map.unlink(adjustment.edge_keyframe[outliers], adjustment.edge_row[outliers])
         settled = adjustment.newest - SETTLING_KEYFRAMES
         self._map.remove_points(self._map.poor_points(settled, MIN_FOUND_RATIO))
         retire_redundant(self._map, adjustment.free)
@@ -229,16 +230,6 @@ class LocalMapper:
                 invert(T_camera_world) @ keyframe.T_camera_world, self._map.xyz_world[carried]
             )
             keyframe.T_camera_world = T_camera_world
-
-    def _drop_outliers(
-        self,
-        edge_keyframe: NDArray[np.int32],
-        edge_row: NDArray[np.int32],
-        inliers: NDArray[np.bool_],
-    ) -> None:
-        for k in np.unique(edge_keyframe[~inliers]):
-            rows = edge_row[~inliers & (edge_keyframe == k)]
-            self._map.unlink(self._map.keyframes[k], rows)
 
 
 def _linked(sparse_map: SparseMap, keyframe: KeyframeRecord) -> NDArray[np.intp]:
@@ -329,9 +320,9 @@ def redundant_share(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
     octave = np.empty(len(edge_row))
     for k in np.unique(edge_keyframe):
         mine = edge_keyframe == k
-        octave[mine] = sparse_map.keyframes[k].features.octave[edge_row[mine]]
+        octave[mine] = sparse_map.keyframes[k].octave[edge_row[mine]]
     slot = np.searchsorted(ids, edge_point)
-    own_octave = keyframe.features.octave[rows].astype(np.float64)
+    own_octave = keyframe.octave[rows].astype(np.float64)
     # A level further counts as the same: corners jump between neighbouring levels.
     as_fine = (edge_keyframe != keyframe.index) & (octave <= own_octave[slot] + 1)
     return float((np.bincount(slot[as_fine], minlength=len(ids)) >= PROOF).mean())

@@ -37,7 +37,7 @@ from segfloor_ros.slam.mapping.normal_equations import solve_symmetric
 from segfloor_ros.slam.places.loops import LoopDetector, PlaceMatcher, drift
 from segfloor_ros.slam.places.place_recognition import FloorIndex, PlaceRecognition, Relocaliser
 from segfloor_ros.slam.results import NO_POINT, PROOF, Track
-from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit
+from segfloor_ros.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit, is_gated
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
 from segfloor_ros.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
 from segfloor_ros.slam.tracking.images import Features
@@ -62,6 +62,12 @@ class Closing:
     matches: list[Match]
     edges: list[LoopEdge]
     graph: PoseGraph
+
+    @property
+    def is_far(self) -> bool:
+        """Whether the latest keyframe that sees the place is off by more than what loops err."""
+        error = _errors(self.graph, self.graph.T_camera_world)[-1]
+        return not is_gated(error, np.eye(6))
 
 
 def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:
@@ -334,7 +340,7 @@ def merge_slam(first: Arrays, second: Arrays, rig: Rig) -> Arrays | None:
     fill_map(merged, second)
     known = KnownMap(merged, first, of_drive=False)
     alive = [keyframe for keyframe in merged.keyframes if keyframe.retired is None]
-    if not any(known.recognise(keyframe, keyframe.observations) for keyframe in alive):
+    if not any(known.recognise(keyframe, keyframe.observations.exact()) for keyframe in alive):
         return None
     words = known.merge({name: second[name] for name in ('words', 'word_count')})
     places = PlaceRecognition(merged)
@@ -349,7 +355,7 @@ def _close_loops(merged: SparseMap, places: PlaceRecognition, begin: int) -> Non
     for keyframe in merged.keyframes[begin:]:
         if keyframe.retired is not None:
             continue
-        matches = loops.detect(keyframe, keyframe.observations)
+        matches = loops.detect(keyframe, keyframe.observations.exact())
         if matches:
             closing = plan_closing(merged, matches)
             apply_closing(merged, closing, solve_closing(closing))

@@ -201,17 +201,16 @@ class PlaceMatcher:
         which keyframes (K,) of the known map may be of the place, and which are of the view itself.
         """
         own_ids, track = self._known.points_of(np.flatnonzero(near)), None
+        features = self._map.features_of(keyframe)
         if self.matches:
             pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
             depth_m = median_depth_m(self._map, keyframe)
             around = views_near(self._known, pose, depth_m, len(may_show))
             ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
-            track = self._places.confirm(images, keyframe.features, ids, pose)
+            track = self._places.confirm(images, features, ids, pose)
         if track is None:
             is_bounded = self._known is self._map
-            track = self._places.find(
-                images, keyframe.features, may_show, own_ids, is_bounded=is_bounded
-            )
+            track = self._places.find(images, features, may_show, own_ids, is_bounded=is_bounded)
         if track is None:
             return None
         assert track.observed is not None

@@ -70,7 +70,7 @@ class PlaceRecognition:
 
     def add(self, keyframe: KeyframeRecord) -> None:
         """Take in a keyframe."""
-        self._index.add(keyframe.index, self._words(keyframe.features))
+        self._index.add(keyframe.index, self._words(self._map.features_of(keyframe)))
 
     def _words(self, features: Features) -> NDArray[np.int32]:
         """Return the words (N,) of features; those of the latest view are asked for twice."""

@@ -1,6 +1,7 @@
 """Duplicate points: found by pixel, depth and look; merged with all that hangs on them."""
 
 import numpy as np
+import pytest
 from hand_made_maps import add, keyframe
 
 from segfloor_ros.camera.model import StereoCamera
@@ -51,7 +52,7 @@ def test_the_older_id_survives_with_all_observations():
     assert sparse_map.observer_count[0] == 3
     # Two keyframes knew point 0, one point 5: its position stays, the newest look is taken on.
     np.testing.assert_allclose(sparse_map.xyz_world[0], [0, 0, 2])
-    assert sparse_map.viewing_distance_m[0] == np.linalg.norm([0.006, 0.0, 2.05])
+    assert sparse_map.viewing_distance_m[0] == pytest.approx(np.linalg.norm([0.006, 0.0, 2.05]))
     points, keyframes, rows = sparse_map.edges_of(np.array([0, 5]))
     np.testing.assert_array_equal(points, [0, 0, 0])
     np.testing.assert_array_equal(keyframes, [0, 1, 2])

@@ -96,7 +96,8 @@ def test_what_was_mapped_meanwhile_moves_along(bent):
                 COUNT,
                 last.stamp_ns + 1,
                 ahead @ last.T_camera_world,
-                last.features.take(none),
+                None,
+                last.octave[none],
                 last.observations.take(none),
                 np.zeros(0, np.int32),
             )

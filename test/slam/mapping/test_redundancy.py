@@ -63,7 +63,7 @@ def test_a_retired_keyframe_keeps_its_place_beside_the_one_it_follows():
     sparse_map.follow()
     np.testing.assert_allclose(two.T_world_camera[:3, 3], [0.2, 0.0, 5.0], atol=1e-12)
     np.testing.assert_allclose(one.T_world_camera[:3, 3], [0.1, 0.0, 5.0], atol=1e-12)
-    assert len(one.features) == len(one.observations) == len(one.point_id) == 0
+    assert len(one.octave) == len(one.observations) == len(one.point_id) == 0
     order, _ = sparse_map.covisible(np.arange(10))
     assert 1 not in order and 2 not in order
 

@@ -15,8 +15,10 @@ from segfloor_ros.slam.places.loops import PlaceMatcher, objection_to_drift
 from segfloor_ros.slam.places.place_recognition import PlaceRecognition
 from segfloor_ros.slam.results import PROOF, StereoSlamSettings
 from segfloor_ros.slam.saved_slam import fill_map, map_to_arrays, moved
+from segfloor_ros.slam.sensors.body_motion import BodyMotion
 from segfloor_ros.slam.sparse_map import LoopEdge, Match, SparseMap
 from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.slam.tracking.front_end import FrontEnd
 
 SETTINGS = StereoSlamSettings(num_features=600)
 TURN = 52
@@ -145,6 +147,39 @@ def test_a_loop_that_switches_an_earlier_one_off_is_not_closed(
     match = Match(last.index, 0, moved_by(correction_m), none.astype(np.intp), none, none)
     closing = plan_closing(sparse_map, [match])
     assert apply_closing(sparse_map, closing, solve_closing(closing)) == is_closed
+
+
+@pytest.mark.parametrize(
+    ('off_m', 'keyframes', 'is_adjusted'),
+    [(0.03, 1.0, False), (0.3, 1.0, True), (0.03, 0.7, True)],
+    ids=['little', 'far', 'the map has grown'],
+)
+def test_the_whole_map_is_adjusted_again_once_it_has_grown_or_a_loop_moves_it_far(
+    closed, monkeypatch, off_m, keyframes, is_adjusted
+):
+    adjusted, solve = [], back_end.solve_global
+    monkeypatch.setattr(
+        back_end, 'solve_global', lambda *arguments: adjusted.append(1) or solve(*arguments)
+    )
+    sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
+    fill_map(sparse_map, map_to_arrays(closed[0].map))
+    front_end = FrontEnd(SETTINGS, sparse_map, BodyMotion())
+    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background=False)
+    records, last = sparse_map.keyframes, sparse_map.keyframes[-1]
+
+    def close(off_m):
+        off = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        pose = off @ last.T_camera_world
+        closing = plan_closing(sparse_map, [Match(last.index, 0, pose, none, none, none)])
+        mapping._apply(closing, solve_closing(closing))
+        mapping.collect(wait=True)
+
+    close(0.03)
+    assert len(adjusted) == 1, 'after the first loop'
+    mapping._adjusted_keyframes = keyframes * len(records)
+    sparse_map.loops.clear()
+    close(off_m)
+    assert (len(adjusted) == 2) is is_adjusted
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,7 @@ def test_every_visit_that_made_a_keyframe_doubles_the_way_to_the_next(is_retired
 def sparse_map_without(sparse_map, views):
     for index in views:
         view = sparse_map.keyframes[index]
-        sparse_map.unlink(view, np.flatnonzero(view.point_id != NO_POINT))
+        sparse_map.unlink(view.index, np.flatnonzero(view.point_id != NO_POINT))
     return sparse_map
 
 
