@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from segfloor_ros.camera.model import StereoCamera, Up
 from segfloor_ros.geometry import Array, invert, se3_exp, transform_points, without_drift
 from segfloor_ros.slam.mapping.normal_equations import (
-    Factor,
+    Factors,
     Linearisation,
     Step,
     System,
@@ -66,7 +66,7 @@ class BundleProblem:
     point: NDArray[np.intp]
     observations: Observations
     offset: OffsetEstimate = NO_OFFSET
-    factors: tuple[Factor, ...] = ()
+    factors: tuple[Factors, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _evaluate(camera: StereoCamera, problem: BundleProblem, prior: OffsetEstimat
     chi2 = squared_norms(residual, problem.observations.information)
     total = huber_cost(chi2, problem.observations.chi2_limit)
     total += prior.information * (problem.offset.value_px - prior.value_px) ** 2
-    total += sum(cost(factor, problem.T_camera_world) for factor in problem.factors)
+    total += sum(cost(factors, problem.T_camera_world) for factors in problem.factors)
     return _State(points, residual, chi2, front, total)
 
 

@@ -31,7 +31,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import splu
 
 from segfloor_ros.camera.model import StereoCamera, Up
-from segfloor_ros.geometry import Array, adjoint, invert, se3_log
+from segfloor_ros.geometry import Array, adjoint, invert, se3_logs
 from segfloor_ros.slam.rig import (
     LOCAL_KEYFRAMES,
     SMALLEST,
@@ -336,125 +336,161 @@ def solve_symmetric(A: sparse.csc_array, b: Array) -> Array:
     return np.asarray(factors.solve(b))
 
 
-class Factor(Protocol):
-    """Something measured of one or two keyframes, by their place in the problem."""
+class Factors(Protocol):
+    """What is measured alike M times, of one or two keyframes each."""
+
+    @property
+    def keyframes(self) -> NDArray[np.intp]:
+        """The keyframes (M, 1) or (M, 2) by their place in the problem."""
 
     @property
     def information(self) -> Array:
-        """The inverse covariance (D, D) of the error."""
+        """The inverse covariances (M, D, D) of the errors."""
 
-    def error(self, T_camera_world: Array) -> Array:
-        """Return the error (D,) of poses (K, 4, 4)."""
+    def errors(self, T_camera_world: Array) -> Array:
+        """Return the errors (M, D) of poses (K, 4, 4)."""
 
-    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
-        """Return the keyframes, and the derivative (D, 6) of the error by the twist of each."""
-
-
-@dataclass(frozen=True)
-class Link:
-    """The motion of the camera from keyframe `before` to keyframe `now`."""
-
-    before: int
-    now: int
-    motion: RelativeMotion
-
-    @property
-    def information(self) -> Array:
-        """The inverse covariance (6, 6) of the error."""
-        return np.linalg.inv(self.motion.covariance + np.diag(FLOOR_SIGMA**2))
-
-    def error(self, T_camera_world: Array) -> Array:
-        """Return the twist (6,) by which poses (K, 4, 4) miss the measured motion."""
-        moved = T_camera_world[self.now] @ invert(T_camera_world[self.before])
-        return se3_log(moved @ invert(self.motion.T_now_before))
-
-    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
-        """Return the keyframes, and the derivative (6, 6) of the error by the twist of each."""
-        moved = T_camera_world[self.now] @ invert(T_camera_world[self.before])
-        return [(self.before, -adjoint(moved)), (self.now, np.eye(6))]
+    def jacobians(self, T_camera_world: Array) -> Array:
+        """Return the derivatives (M, 1 or 2, D, 6) of the errors by the twist of each keyframe."""
 
 
 @dataclass(frozen=True)
-class Level:
-    """Up in the camera of a keyframe as it was measured, and up_world (3,), as it is in the
+class Links:
+    """The motion T_now_before (M, 4, 4) of the camera from one keyframe to another."""
+
+    keyframes: NDArray[np.intp]
+    T_now_before: Array
+    information: Array
+
+    @staticmethod
+    def of(ends: Sequence[tuple[int, int, RelativeMotion]]) -> tuple[Links, ...]:
+        """Return motions, each with the keyframe before and the one now."""
+        if not ends:
+            return ()
+        before, now, motions = zip(*ends, strict=True)
+        covariance = np.stack([motion.covariance for motion in motions])
+        return (
+            Links(
+                np.column_stack([before, now]),
+                np.stack([motion.T_now_before for motion in motions]),
+                np.linalg.inv(covariance + np.diag(FLOOR_SIGMA**2)),
+            ),
+        )
+
+    def errors(self, T_camera_world: Array) -> Array:
+        """Return the twists (M, 6) by which poses (K, 4, 4) miss the measured motions."""
+        return se3_logs(self._moved(T_camera_world) @ invert(self.T_now_before))
+
+    def jacobians(self, T_camera_world: Array) -> Array:
+        """Return the derivatives (M, 2, 6, 6) of the errors by the twist of each keyframe."""
+        of_before = -adjoint(self._moved(T_camera_world))
+        return np.stack([of_before, np.broadcast_to(np.eye(6), of_before.shape)], axis=1)
+
+    def _moved(self, T_camera_world: Array) -> Array:
+        before, now = self.keyframes.T
+        return np.asarray(T_camera_world[now] @ invert(T_camera_world[before]))
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Up in the camera of a keyframe as it was measured (M, 3), and up_world (3,), as it is in the
     world.
     """
 
-    keyframe: int
-    measured: Up
+    keyframes: NDArray[np.intp]
+    measured: Array
+    information: Array
     up_world: Array
 
-    @property
-    def information(self) -> Array:
-        """The inverse covariance (3, 3) of the error."""
-        return np.eye(3) / self.measured.sigma_rad**2
+    @staticmethod
+    def of(measured: Sequence[tuple[int, Up]], up_world: Array) -> tuple[Levels, ...]:
+        """Return what was measured, each with its keyframe."""
+        if not measured:
+            return ()
+        keyframes, ups = zip(*measured, strict=True)
+        variance = np.array([up.sigma_rad**2 for up in ups])
+        return (
+            Levels(
+                np.array(keyframes)[:, None],
+                np.stack([up.direction for up in ups]),
+                np.eye(3) / variance[:, None, None],
+                up_world,
+            ),
+        )
 
-    def error(self, T_camera_world: Array) -> Array:
-        """Return the tilt (3,) in radians, about the axes of the camera."""
-        up = T_camera_world[self.keyframe, :3, :3] @ self.up_world
-        return np.cross(up, self.measured.direction)
+    def errors(self, T_camera_world: Array) -> Array:
+        """Return the tilts (M, 3) in radians, about the axes of the camera."""
+        return np.cross(self._up(T_camera_world), self.measured)
 
-    def jacobians(self, T_camera_world: Array) -> list[tuple[int, Array]]:
-        """Return the keyframe, and the derivative (3, 6) of the error by its twist."""
-        up = T_camera_world[self.keyframe, :3, :3] @ self.up_world
-        measured = self.measured.direction
-        by_turn = np.outer(up, measured) - float(up @ measured) * np.eye(3)
-        return [(self.keyframe, np.hstack([np.zeros((3, 3)), by_turn]))]
+    def jacobians(self, T_camera_world: Array) -> Array:
+        """Return the derivatives (M, 1, 3, 6) of the errors by the twist of the keyframe."""
+        up = self._up(T_camera_world)
+        jacobians: Array = np.zeros((len(up), 1, 3, 6))
+        along = np.einsum('mi,mi->m', up, self.measured)[:, None, None] * np.eye(3)
+        jacobians[:, 0, :, 3:] = up[:, :, None] * self.measured[:, None] - along
+        return jacobians
+
+    def _up(self, T_camera_world: Array) -> Array:
+        return np.asarray(T_camera_world[self.keyframes[:, 0], :3, :3] @ self.up_world)
 
 
 def factors_of(
     keyframes: Sequence[KeyframeRecord], slot: NDArray[np.intp], up_world: Up | None
-) -> tuple[Factor, ...]:
+) -> tuple[Factors, ...]:
     """Return what is measured of the keyframes of a problem; slot: (K,) their place in it, -1 for
     others.
     """
-    found: list[Factor] = []
+    ends, ups = [], []
     for k in np.flatnonzero(slot >= 0).tolist():
         motion, measured = keyframes[k].motion, keyframes[k].up
         if k > 0 and motion is not None and slot[k - 1] >= 0:
-            found.append(Link(int(slot[k - 1]), int(slot[k]), motion))
+            ends.append((int(slot[k - 1]), int(slot[k]), motion))
         if measured is not None and up_world is not None:
-            found.append(Level(int(slot[k]), measured, up_world.direction))
-    return tuple(found)
+            ups.append((int(slot[k]), measured))
+    levels = () if up_world is None else Levels.of(ups, up_world.direction)
+    return (*Links.of(ends), *levels)
 
 
-def loop_factors(loops: Sequence[LoopEdge], slot: NDArray[np.intp]) -> tuple[Factor, ...]:
+def loop_factors(loops: Sequence[LoopEdge], slot: NDArray[np.intp]) -> tuple[Factors, ...]:
     """Return the loops that were closed by the floor alone: no points hold them together."""
     ends = ((int(slot[loop.j]), int(slot[loop.i]), loop) for loop in loops if loop.by_floor)
-    return tuple(
-        Link(j, i, RelativeMotion(loop.T_i_j, np.diag(loop.sigma**2)))
-        for j, i, loop in ends
-        if min(i, j) >= 0
+    return Links.of(
+        [
+            (j, i, RelativeMotion(loop.T_i_j, np.diag(loop.sigma**2)))
+            for j, i, loop in ends
+            if min(i, j) >= 0
+        ]
     )
 
 
-def chi2(factor: Factor, T_camera_world: Array) -> float:
-    """Return the squared, normalised error."""
-    error = factor.error(T_camera_world)
-    return float(error @ factor.information @ error)
+def squared_errors(factors: Factors, T_camera_world: Array) -> Array:
+    """Return the squared, normalised errors (M,)."""
+    errors = factors.errors(T_camera_world)
+    return np.asarray(np.einsum('mi,mij,mj->m', errors, factors.information, errors))
 
 
-def cost(factor: Factor, T_camera_world: Array) -> float:
-    """Return the Huber cost of the error."""
-    return huber_cost(np.array([chi2(factor, T_camera_world)]), np.array([chi2_limit(6)]))
+def cost(factors: Factors, T_camera_world: Array) -> float:
+    """Return the Huber cost of the errors."""
+    return huber_cost(squared_errors(factors, T_camera_world), np.array(chi2_limit(6)))
 
 
-def with_factors(system: System, T_camera_world: Array, factors: Sequence[Factor]) -> System:
+def with_factors(system: System, T_camera_world: Array, measured: Sequence[Factors]) -> System:
     """Return normal equations with what is measured of keyframes, where those that move come
     first.
     """
-    if not factors:
+    if not measured:
         return system
     U, rhs, between = system.U.copy(), system.camera_rhs.copy(), []
-    for factor in factors:
-        error = factor.error(T_camera_world)
-        squared = np.array(chi2(factor, T_camera_world))
-        weighted = factor.information * float(huber_weights(squared, np.array(chi2_limit(6))))
-        terms = [(k, J) for k, J in factor.jacobians(T_camera_world) if k < len(U)]
-        for k, J in terms:
-            U[k] += J.T @ weighted @ J
-            rhs[k] -= J.T @ weighted @ error
-        if len(terms) == 2:
-            (j, J_j), (k, J_k) = terms
-            between.append((j, k, J_j.T @ weighted @ J_k))
+    for factors in measured:
+        J, errors = factors.jacobians(T_camera_world), factors.errors(T_camera_world)
+        weight = huber_weights(squared_errors(factors, T_camera_world), np.array(chi2_limit(6)))
+        weighted = np.swapaxes(J, 2, 3) @ (weight[:, None, None] * factors.information)[:, None]
+        moves = factors.keyframes < len(U)
+        np.add.at(U, factors.keyframes[moves], (weighted @ J)[moves])
+        slope = (weighted @ errors[:, None, :, None])[..., 0]
+        np.subtract.at(rhs, factors.keyframes[moves], slope[moves])
+        if J.shape[1] > 1:
+            tied = moves.all(axis=1)
+            blocks = (weighted[:, 0] @ J[:, 1])[tied]
+            between += list(zip(*factors.keyframes[tied].T.tolist(), blocks, strict=True))
     return replace(system, U=U, camera_rhs=rhs, between=tuple(between))

@@ -8,7 +8,7 @@ from segfloor_ros.geometry import se3_exp, transform_points
 from segfloor_ros.slam.mapping.bundle_adjustment import BundleProblem, adjust
 from segfloor_ros.slam.mapping.normal_equations import (
     Linearisation,
-    Link,
+    Links,
     inverse_cholesky,
     normal_equations,
     with_factors,
@@ -146,7 +146,7 @@ def test_a_solution_by_the_complement_is_that_of_all_unknowns_at_once():
     )  # fmt: skip
     untied = normal_equations(CAMERA, at).with_prior(100.0, 0.02)
     motion = RelativeMotion(np.eye(4), 1e-3 * np.eye(6))
-    links = (Link(1, 2, motion), Link(4, 3, motion), Link(5, 6, motion))
+    links = Links.of([(1, 2, motion), (4, 3, motion), (5, 6, motion)])
     for system in (untied, with_factors(untied, poses, links)):
         step = system.solve(1e-3)
         expected, information = solved_at_once(system, 1e-3)

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import Up
 from segfloor_ros.geometry import invert, make_transform, se3_exp, se3_log
-from segfloor_ros.slam.mapping.normal_equations import Level, Link, System, chi2, cost, with_factors
+from segfloor_ros.slam.mapping.normal_equations import (
+    Levels,
+    Links,
+    System,
+    cost,
+    squared_errors,
+    with_factors,
+)
 from segfloor_ros.slam.rig import chi2_limit
 from segfloor_ros.slam.sensors.body_motion import RelativeMotion
 
@@ -20,9 +27,9 @@ COVARIANCE = np.diag([4e-4, 9e-4, 4e-4, 1e-4, 1e-4, 4e-4])
 
 
 def link(before, now, error):
-    """A link that its poses miss by a twist."""
+    """A motion that its poses miss by a twist."""
     moved = POSES[now] @ invert(POSES[before])
-    return Link(before, now, RelativeMotion(se3_exp(-np.array(error)) @ moved, COVARIANCE))
+    return before, now, RelativeMotion(se3_exp(-np.array(error)) @ moved, COVARIANCE)
 
 
 def empty_system(count):
@@ -36,18 +43,21 @@ def empty_system(count):
 
 def test_the_error_is_the_twist_by_which_the_poses_miss():
     error = np.array([0.01, -0.02, 0.03, 0.002, 0.001, -0.003])
-    np.testing.assert_allclose(link(0, 1, error).error(POSES), error, atol=1e-9)
+    (links,) = Links.of([link(0, 1, error), link(2, 0, 2 * error)])
+    np.testing.assert_allclose(links.errors(POSES), [error, 2 * error], atol=1e-9)
 
 
 def test_poses_that_move_as_measured_cost_nothing_and_slip_costs_less_than_its_square():
-    assert cost(link(0, 1, np.zeros(6)), POSES) == pytest.approx(0.0, abs=1e-9)
-    small, large = (link(0, 1, [x, 0, 0, 0, 0, 0]) for x in (0.01, 1.0))
+    none, small, large = (Links.of([link(0, 1, [x, 0, 0, 0, 0, 0])])[0] for x in (0, 0.01, 1.0))
+    assert cost(none, POSES) == pytest.approx(0.0, abs=1e-9)
     assert cost(small, POSES) == pytest.approx(0.01**2 / (4e-4 + 1e-6), rel=1e-3)
-    assert cost(large, POSES) < 0.2 * chi2(large, POSES)
+    assert cost(large, POSES) < 0.2 * squared_errors(large, POSES)[0]
 
 
 def test_the_right_hand_side_is_the_slope_of_the_cost():
-    links = (link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0]))
+    links = Links.of(
+        [link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0])]
+    )
     system = with_factors(empty_system(2), POSES, links)
     for k in range(2):
         for axis in range(6):
@@ -64,11 +74,13 @@ def test_the_right_hand_side_is_the_slope_of_the_cost():
 
 
 def test_a_step_brings_free_poses_where_they_were_measured():
-    links = (link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0]))
+    links = Links.of(
+        [link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0])]
+    )
     step = with_factors(empty_system(2), POSES, links).solve(0.0)
     moved = POSES.copy()
     moved[:2] = se3_exp(step.twists) @ moved[:2]
-    assert all(chi2(item, moved) < 1e-3 * chi2_limit(6) for item in links)
+    assert (squared_errors(links[0], moved) < 1e-3 * chi2_limit(6)).all()
     # The third pose was held; both others moved.
     for k in range(2):
         assert np.linalg.norm(se3_log(moved[k] @ invert(POSES[k]))) > 1e-3
@@ -82,12 +94,13 @@ def test_without_links_the_system_stays_as_it_is():
 def test_a_keyframe_that_tilts_is_turned_back():
     tilt = Rotation.from_rotvec([0.02, 0.3, -0.01]).as_matrix()
     poses = np.stack([make_transform(tilt, np.zeros(3))])
-    level = Level(0, Up(Rotation.from_rotvec([0.0, 0.3, 0.0]).apply(UP), 0.01), UP)
-    before = np.linalg.norm(level.error(poses))
+    up = Up(Rotation.from_rotvec([0.0, 0.3, 0.0]).apply(UP), 0.01)
+    levels = Levels.of([(0, up)], UP)
+    before = np.linalg.norm(levels[0].errors(poses))
     assert before > 0.015
     for _ in range(3):
-        step = with_factors(empty_system(1), poses, (level,)).solve(0.0)
+        step = with_factors(empty_system(1), poses, levels).solve(0.0)
         poses = se3_exp(step.twists) @ poses
-    assert np.linalg.norm(level.error(poses)) < 0.01 * before
+    assert np.linalg.norm(levels[0].errors(poses)) < 0.01 * before
     # Turning about up is free.
     assert Rotation.from_matrix(poses[0, :3, :3]).magnitude() == pytest.approx(0.3, abs=0.03)
