@@ -121,28 +121,22 @@ class Costmap:
         blind_m: float,
     ) -> None:
         self.grid = grid
-        trodden = self._discs(driven, radius_m)
+        here = self._discs(driven[-1:], radius_m)
         if np.hypot(*(driven - driven[:1]).T).max(initial=0) <= blind_m:
-            trodden |= self._discs(driven[:1], blind_m)
+            here |= self._discs(driven[:1], blind_m)
+        trodden = here | self._discs(driven, radius_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
         standing = (grid.cells >= OCCUPIED) | marked
         standing &= ~self._discs(driven[-1:], radius_m / 2)
+        self._standing = standing
         self.free = ((grid.cells == FREE) | trodden) & ~standing
-        unknown = np.pad((grid.cells == UNKNOWN) & ~trodden, 1, constant_values=True)
-        half = max(1, round(radius_m / 2 / grid.resolution_m))
-        dark, wide = (
-            cv2.morphologyEx(
-                unknown.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)
-            )
-            for side in (3, 2 * half + 1)  # without slits that the map leaves along walls
-        )
-        self.dark = wide[1:-1, 1:-1] > 0
-        """What is unknown, where half the robot would fit in."""
-        beside = cv2.dilate(wide, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        dark, unseen = (_without_slits((grid.cells == UNKNOWN) & ~m) for m in (trodden, here))
+        self._unseen = unseen[1:-1, 1:-1]
+        beside = cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
         self._edge_m = grid.away_m(beside & self.free)
         standing_m = self._standing_m = grid.away_m(standing)
-        self.room_m = np.minimum(standing_m, grid.away_m(dark > 0)[1:-1, 1:-1])
+        self.room_m = np.minimum(standing_m, grid.away_m(dark)[1:-1, 1:-1])
         self._radius_m = radius_m
         self.places = self.free & (self.room_m > radius_m)
         self.stops = self.places & (self.room_m > radius_m + CELL_M)
@@ -248,15 +242,36 @@ class Costmap:
             cv2.circle(mask, (column, row), round(radius_m / self.grid.resolution_m), 1, -1)
         return mask > 0
 
-    def frontiers(self) -> list[Cells]:
-        """Return the places next to free floor that borders on what is unknown, (N, 2) for each
-        connected stretch of them. Behind a wall there is no such floor, and no way leads on where
-        half the robot would not fit.
+    def frontiers(self) -> Cells:
+        """Return the places (N, 2) next to free floor that borders on unknown floor: none behind a
+        wall.
         """
         near_m = self._radius_m + CELL_M + self.grid.resolution_m
-        border = (self.stops & (self._edge_m <= near_m)).astype(np.uint8)
-        count, labels = cv2.connectedComponents(border, connectivity=8)
-        return [np.argwhere(labels == label) for label in range(1, count)]
+        return np.argwhere(self.stops & (self._edge_m <= near_m))
+
+    def shown(self, point: Array, reach_m: float) -> Array:
+        """Return the unknown points (N, 2), one a cell, that a look around from a point (2,) would
+        show: nothing stands before them.
+        """
+        step_m = self.grid.resolution_m
+        count = int(np.pi * reach_m / step_m)
+        bearing = 2 * np.pi / count * np.arange(count)
+        way_m = np.arange(step_m, reach_m, step_m)[:, None, None]
+        rays = point + way_m * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        cells = self.grid.cells_of(rays)
+        inside = self.grid.holds(cells)
+        at = tuple(np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0))
+        stopped = np.cumsum(inside & self._standing[at], axis=0) > 0
+        seen = ~stopped & (~inside | self._unseen[at])
+        return self.grid.centres_of(np.unique(cells[seen], axis=0))
+
+
+def _without_slits(unknown: Mask) -> Mask:
+    """Return what is unknown (H, W), all around the map as well (H + 2, W + 2), without slits that
+    the map leaves along walls.
+    """
+    padded = np.pad(unknown, 1, constant_values=True).astype(np.uint8)
+    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
 
 
 @dataclass(frozen=True)
@@ -441,30 +456,30 @@ class Explorer:
             self._begin_goals(driven)
 
     def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
-        """Return the frontier to drive to: the soonest, or the present one while it is one that it
-        can reach: of two that are as soon each seems sooner in turn.
+        """Return the frontier to drive to: the soonest that would show as much floor as the robot
+        stands on, or the present one while it is one that it can reach: of two that are as soon
+        each seems sooner in turn.
         """
         least = self.body.radius_m
-        best, best_cost = None, np.inf
-        for cells in costmap.frontiers():
-            points = costmap.grid.centres_of(cells)
-            cost = ways.cost[costmap.numbers_of(cells)] + self.body.turning_m(points, pose)
-            beyond = ~np.isfinite(cost)  # those come last
-            cost[beyond] = FAR_M + np.hypot(*(points[beyond] - pose[:2]).T)
-            for given_up, goals in self._given_up:
-                is_near = np.hypot(*(points - given_up).T) < 2 * least
-                cost = np.where(is_near & (len(self.ended) <= goals), np.inf, cost)
-            if self._target is not None:
-                is_same = np.hypot(*(points - self._target).T) < 2 * least
-                cost = np.where(is_same, cost - FAR_M / 2, cost)
-            nearest = int(np.argmin(cost))
-            if cost[nearest] < best_cost:
-                best, best_cost = points[nearest], cost[nearest]
-        if best is not None:
-            dark = costmap.grid.centres_of(np.argwhere(costmap.dark))
-            near = dark[np.hypot(*(dark - best).T) < 4 * least]
-            self._facing = near.mean(axis=0) if len(near) else best
-        return best
+        cells = costmap.frontiers()
+        points = costmap.grid.centres_of(cells)
+        cost = ways.cost[costmap.numbers_of(cells)] + self.body.turning_m(points, pose)
+        beyond = ~np.isfinite(cost)  # those come last
+        cost[beyond] = FAR_M + np.hypot(*(points[beyond] - pose[:2]).T)
+        for given_up, goals in self._given_up:
+            is_near = np.hypot(*(points - given_up).T) < 2 * least
+            cost = np.where(is_near & (len(self.ended) <= goals), np.inf, cost)
+        if self._target is not None:
+            is_same = np.hypot(*(points - self._target).T) < 2 * least
+            cost = np.where(is_same, cost - FAR_M / 2, cost)
+        while (cost < np.inf).any():
+            best = points[int(np.argmin(cost))]
+            shown = costmap.shown(best, 4 * least)
+            if len(shown) * costmap.grid.resolution_m**2 >= np.pi * least**2:
+                self._facing = shown[np.argmin(np.hypot(*(shown - shown.mean(axis=0)).T))]
+                return best
+            cost[np.hypot(*(points - best).T) < least / 2] = np.inf
+        return None
 
     def _begin_goals(self, driven: Array) -> None:
         """Everything is explored: draw the goals, wherever the map leads; what stands in the way

@@ -106,27 +106,52 @@ def test_what_it_could_not_see_at_its_start_is_unknown_once_it_has_been_further_
     for driven, is_free in (([start, (0.95, 0.55)], True), ([start, (1.15, 0.55), start], False)):
         costmap = Costmap(grid, 0.15, 0.3, NOTHING, np.array(driven), 0.45)
         assert costmap.free[5, 1] == is_free
-        assert is_free or costmap.frontiers()
+        assert is_free or len(costmap.frontiers())
 
 
 def test_frontiers_are_places_to_turn_beside_unknown_floor_but_not_beside_slits() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[1:4, 1] = UNKNOWN
-    assert costmap_of(grid).frontiers() == []
+    assert not len(costmap_of(grid).frontiers())
     grid.cells[1:-1, 18:-1] = UNKNOWN
-    (frontier,) = costmap_of(grid).frontiers()
+    frontier = costmap_of(grid).frontiers()
     assert frontier[:, 1].max() == 15, 'a radius, what its pose is off, and as fine as the map is'
     assert frontier[:, 1].min() >= 14
 
 
-def test_what_is_too_narrow_for_half_the_robot_hides_no_way_but_is_kept_away_from() -> None:
+def test_less_floor_than_the_robot_stands_on_is_not_worth_a_way_but_is_kept_away_from() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[4:8, 20:24] = UNKNOWN
-    driven = np.array([(0.65, 0.55)])
-    for radius_m, count in ((0.15, 1), (0.45, 0)):
-        costmap = Costmap(grid, radius_m, 2 * radius_m, NOTHING, driven, 0.0)
-        assert len(costmap.frontiers()) == count
-        assert costmap.room_m[6, 19] < 2 * CELL_M
+    for radius_m, is_worth_it in ((0.15, True), (0.18, False)):
+        explorer = Explorer(dataclasses.replace(BODY, radius_m=radius_m), 0, grid=grid)
+        explorer.step(0.0, pose_of(1.55, 0.55, 0.0))
+        assert len(explorer._costmap.frontiers())
+        assert (explorer._target is not None) is is_worth_it
+        assert explorer._costmap.room_m[6, 19] < 2.5 * CELL_M
+
+
+def test_a_look_shows_what_nothing_stands_before() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[:, 14:] = UNKNOWN
+    costmap = costmap_of(grid)
+    shown = costmap.shown(np.array([1.15, 0.55]), 0.6)
+    assert (shown[:, 0] > 1.4).all() and (np.hypot(*(shown - (1.15, 0.55)).T) < 0.7).all()
+    assert len(shown) > 10
+    grid.cells[3:6, 13] = OCCUPIED
+    half = costmap_of(grid).shown(np.array([1.15, 0.55]), 0.6)
+    assert 0 < len(half) < len(shown) and (half[:, 1] > 0.55).all()
+    grid.cells[3:8, 13] = OCCUPIED
+    assert not len(costmap_of(grid).shown(np.array([1.15, 0.55]), 0.6))
+
+
+def test_floor_that_it_drove_over_without_seeing_it_is_explored() -> None:
+    grid = grid_of(TWO_ROOMS)
+    grid.cells[1:7, 1:6] = UNKNOWN
+    explorer = Explorer(BODY, 0, grid=grid)
+    for x in (0.35, 0.75, 1.15, 2.15):
+        explorer.step(10 * x, pose_of(x, 0.45, 0.0))
+    assert explorer._target is not None and explorer._target[0] < 1.0
+    assert explorer._facing[0] < 0.6
 
 
 def test_it_goes_on_to_its_frontier_though_another_has_become_nearer_as_long_as_a_way_leads() -> (
@@ -136,8 +161,8 @@ def test_it_goes_on_to_its_frontier_though_another_has_become_nearer_as_long_as_
     grid.cells[1:-1, 1:4] = grid.cells[1:-1, 22:25] = UNKNOWN
     explorer = Explorer(BODY, 0, grid=grid)
     ends = []
-    for time_s, x in ((0.0, 1.75), (2.0, 0.75)):
-        explorer.step(time_s, pose_of(x, 0.55, np.pi))
+    for time_s, x, yaw in ((0.0, 1.75, 0.0), (2.0, 0.75, np.pi)):
+        explorer.step(time_s, pose_of(x, 0.55, yaw))
         ends.append(explorer.path[-1, 0])
     assert min(ends) > 1.75
     explorer.grid = grid_of(TWO_ROOMS)
@@ -177,9 +202,9 @@ def test_what_is_unknown_behind_a_wall_is_no_frontier() -> None:
     grid = grid_of(TWO_ROOMS)
     grid.cells[:, 14:] = UNKNOWN
     grid.cells[3:8, 13] = OCCUPIED
-    assert costmap_of(grid).frontiers() == []
+    assert not len(costmap_of(grid).frontiers())
     grid.cells[3:8, 13] = FREE
-    assert len(costmap_of(grid).frontiers()) == 1
+    assert len(costmap_of(grid).frontiers())
 
 
 def test_a_scan_clears_what_it_passes_and_nothing_else() -> None:
@@ -294,20 +319,20 @@ def test_a_goal_to_which_a_wall_has_come_too_near_is_reached_from_the_place_besi
 
 
 DOORS = """
-##########################
-#............#...........#
-#........................#
-#........................#
-#........................#
-#........................#
-#............#...........#
-#............#...........#
-#........................#
-#........................#
-#........................#
-#........................#
-#............#...........#
-##########################
+######################################
+#............#.......................#
+#....................................#
+#....................................#
+#....................................#
+#....................................#
+#............#.......................#
+#............#.......................#
+#....................................#
+#....................................#
+#....................................#
+#....................................#
+#............#.......................#
+######################################
 """
 LOWER, UPPER = slice(2, 6), slice(8, 12)
 
@@ -350,7 +375,7 @@ def test_what_was_behind_shut_doors_is_explored_once_they_are_open_and_goals_lie
     truth = grid_of(DOORS)
     for rows in (LOWER, UPPER):
         shut(truth, rows)
-    drive = Drive(truth, Explorer(BODY, 4, seed=3), START)
+    drive = Drive(truth, Explorer(dataclasses.replace(BODY, radius_m=0.12), 4, seed=3), START)
     while drive.explorer.phase == 'exploring':
         drive.go_on(drive.time_s + 0.2)
     assert drive.share < 0.6
