@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -332,10 +333,11 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
     can be tracked.
     """
     for side, image in (('left', left), ('right', right)):
-        sampled = image[::4, ::4]
-        if float(sampled.std()) < GREY_NOISE:
-            return f'{side} image without contrast (mean grey level {sampled.mean():.0f})'
-        live = np.ptp(sampled, axis=1) > 0
+        sampled = np.ascontiguousarray(image[::4, ::4])
+        mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(sampled))
+        if spread < GREY_NOISE:
+            return f'{side} image without contrast (mean grey level {mean:.0f})'
+        live = (sampled != sampled[:, :1]).any(axis=1)
         if live.mean() < MOST:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
