@@ -255,9 +255,10 @@ class BackEnd:
         matches = self.loops.detect(keyframe, images)
         if not matches:
             return False
-        # It would bring back the map from before the loop.
-        self._global.reset()
         closing = plan_closing(self._map, matches)
+        if closing.is_far:
+            # What is being adjusted is another map; a loop that moves it little it is added to.
+            self._global.reset()
         self._is_closing = True
         self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
         return True
@@ -270,7 +271,8 @@ class BackEnd:
         if not is_closed:
             return
         self.loop_count += 1
-        if closing.is_far or len(self._map.keyframes) >= GROWN * self._adjusted_keyframes:
+        has_grown = len(self._map.keyframes) >= GROWN * self._adjusted_keyframes
+        if closing.is_far or (has_grown and not self._global.holds_one):
             copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
             self._global.submit(
                 partial(solve_global, self._rig.camera, copied, self._global.is_wanted()),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -161,25 +163,54 @@ def test_the_whole_map_is_adjusted_again_once_it_has_grown_or_a_loop_moves_it_fa
     monkeypatch.setattr(
         back_end, 'solve_global', lambda *arguments: adjusted.append(1) or solve(*arguments)
     )
+    mapping, close = closing_loops(closed, monkeypatch, background=False)
+    close(0.03)
+    assert len(adjusted) == 1, 'after the first loop'
+    mapping._adjusted_keyframes = keyframes * len(mapping._map.keyframes)
+    close(off_m)
+    assert (len(adjusted) == 2) is is_adjusted
+
+
+@pytest.mark.parametrize(('off_m', 'goes_on'), [(0.03, True), (0.3, False)])
+def test_an_adjustment_of_the_whole_map_goes_on_beside_loops_that_move_it_little(
+    closed, monkeypatch, off_m, goes_on
+):
+    begun, end, wanted = threading.Event(), threading.Event(), []
+
+    def solve(_camera, _copied, is_wanted):
+        wanted.append(is_wanted)
+        begun.set()
+        end.wait(30)
+
+    monkeypatch.setattr(back_end, 'solve_global', solve)
+    mapping, close = closing_loops(closed, monkeypatch, background=True)
+    try:
+        close(0.03)
+        assert begun.wait(30)
+        close(off_m)
+        assert wanted[0]() is goes_on
+    finally:
+        end.set()
+        mapping.close()
+
+
+def closing_loops(closed, monkeypatch, background):
+    """Returns the back end of a copy of the map, and what closes a loop that is some way off."""
     sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
     fill_map(sparse_map, map_to_arrays(closed[0].map))
     front_end = FrontEnd(SETTINGS, sparse_map, BodyMotion())
-    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background=False)
-    records, last = sparse_map.keyframes, sparse_map.keyframes[-1]
+    mapping = back_end.BackEnd(SETTINGS, sparse_map, front_end, background)
+    last = sparse_map.keyframes[-1]
 
     def close(off_m):
-        off = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
-        pose = off @ last.T_camera_world
-        closing = plan_closing(sparse_map, [Match(last.index, 0, pose, none, none, none)])
-        mapping._apply(closing, solve_closing(closing))
+        sparse_map.loops.clear()
+        pose = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ last.T_camera_world
+        match = Match(last.index, 0, pose, none, none, none)
+        monkeypatch.setattr(mapping.loops, 'detect', lambda *_: [match])
+        assert mapping._close_loop(last, None)
         mapping.collect(wait=True)
 
-    close(0.03)
-    assert len(adjusted) == 1, 'after the first loop'
-    mapping._adjusted_keyframes = keyframes * len(records)
-    sparse_map.loops.clear()
-    close(off_m)
-    assert (len(adjusted) == 2) is is_adjusted
+    return mapping, close
 
 
 @pytest.mark.parametrize(
