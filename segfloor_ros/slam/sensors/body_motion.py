@@ -26,9 +26,11 @@ from segfloor_ros.slam.sensors.wheel_odometry import (
     SIGMA_ROOT_M,
     SIGMA_ROOT_RAD,
     Stretch,
+    WheelCalibration,
     WheelCalibrator,
     WheelOdometry,
     Window,
+    wheels_m,
     yaw_of,
 )
 
@@ -148,13 +150,14 @@ class BodyMotion:
         seconds = (now_ns - before_ns) * 1e-9
         turn = self.gyroscope.turn(before_ns, now_ns)
         R: Array | None = None if turn is None else R_base_left @ turn[0] @ R_base_left.T
-        way_m, turn_rad = self._calibrator.current.base_motion(
+        calibration = self._calibrator.current.believed()
+        way_m, turn_rad = calibration.base_motion(
             measured.T_before_now, None if R is None else yaw_of(R)
         )
         if R is None:
             R = rotation_from_angles(turn_rad, 0.0, 0.0)
         T_before_now = make_transform(R, np.append(way_m, 0.0))
-        variance = self._variance(measured, None if turn is None else turn[1])
+        variance = _variance(measured, calibration, None if turn is None else turn[1])
         if self._slipped_ns is not None and before_ns < self._slipped_ns + MOMENT_NS:
             variance[:2] += (SPEED_SIGMA * seconds) ** 2
         A = adjoint(invert(self.T_base_left))
@@ -162,21 +165,6 @@ class BodyMotion:
             invert(self.T_base_left) @ invert(T_before_now) @ self.T_base_left,
             A @ np.diag(variance) @ A.T,
         )
-
-    def _variance(self, measured: Stretch, sigma_turn: float | None) -> Array:
-        """Return the variances (6,) of a motion in the base's axes."""
-        calibration = self._calibrator.current
-        length_m = float(np.linalg.norm(measured.T_before_now[:3, 3]))
-        on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
-        up = SIGMA_ROOT_M**2 * length_m
-        tilt = SIGMA_ROOT_RAD**2 * length_m
-        yaw = SIGMA_ROOT_RAD**2 * length_m
-        yaw += (SIGMA_TURN_SHARE * yaw_of(measured.T_before_now)) ** 2
-        yaw += (calibration.lag_sigma_s * measured.turning_up_rad_s) ** 2
-        on_floor += float(calibration.lag_sigma_s * np.linalg.norm(measured.speeding_up_m_s)) ** 2
-        if sigma_turn is not None:
-            tilt = yaw = sigma_turn**2
-        return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
 
     def learn(self, stamp_ns: int, T_odom_camera: Array, R_world_odom: Array) -> None:
         """Learn from the pose of a frame that the images show well."""
@@ -266,3 +254,18 @@ class BodyMotion:
             if what not in self.remarks:
                 logger.warning('%s', remark)
             self.remarks[what] = remark
+
+
+def _variance(measured: Stretch, calibration: WheelCalibration, sigma_turn: float | None) -> Array:
+    """Return the variances (6,) of a motion in the base's axes."""
+    length_m, turn_rad = wheels_m(measured.T_before_now), yaw_of(measured.T_before_now)
+    on_floor = (SIGMA_ROOT_M**2 + calibration.sigma[0] ** 2) * length_m
+    on_floor += (2 * np.sin(turn_rad / 2) * max(calibration.sigma[2:4])) ** 2
+    on_floor += float(calibration.lag_sigma_s * np.linalg.norm(measured.speeding_up_m_s)) ** 2
+    up = SIGMA_ROOT_M**2 * length_m
+    tilt = SIGMA_ROOT_RAD**2 * length_m
+    yaw = SIGMA_ROOT_RAD**2 * length_m + (SIGMA_TURN_SHARE * turn_rad) ** 2
+    yaw += (calibration.lag_sigma_s * measured.turning_up_rad_s) ** 2
+    if sigma_turn is not None:
+        tilt = yaw = sigma_turn**2
+    return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10

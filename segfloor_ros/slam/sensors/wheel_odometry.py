@@ -99,6 +99,9 @@ class Window:
         return yaw_of(self.measured.T_before_now)
 
 
+KNOWN_M = 0.01
+
+
 @dataclass(frozen=True)
 class WheelCalibration:
     """What is wrong with wheel odometry. scale: metres measured per metre driven; turn_scale:
@@ -113,6 +116,17 @@ class WheelCalibration:
     turn_scale: float = 1.0
     lag_s: float = 0.0
     sigma: tuple[float, ...] = (0.05, 0.05, 0.1, 0.1, 0.05, 0.02)
+
+    def believed(self) -> WheelCalibration:
+        """Return what the motion of the base is measured by: an offset only once that is known, for
+        the slip of a first turn looks like one.
+        """
+        sigma_m = max(self.sigma[2:4])
+        if sigma_m < KNOWN_M:
+            return self
+        sigma_m = float(np.hypot(sigma_m, np.hypot(*self.offset_m)))
+        sigma = (*self.sigma[:2], sigma_m, sigma_m, *self.sigma[4:])
+        return replace(self, offset_m=(0.0, 0.0), sigma=sigma)
 
     @property
     def lag_sigma_s(self) -> float:
@@ -171,6 +185,9 @@ SIGMA_REST_M, SIGMA_ROOT_M = 0.003, 0.01
 SIGMA_REST_RAD, SIGMA_ROOT_RAD = 0.003, 0.02
 """Error of the turn: at rest, and per root metre or radian; a floor tilts by as much, and goes up
 as a way errs."""
+
+HALF_TRACK_M = 0.25
+"""Wheels go about so far for each radian that the base turns on the spot."""
 
 ROUNDS = 4
 
@@ -242,7 +259,7 @@ def _equations(window: Window) -> Array:
 
 
 def _sigmas(window: Window) -> Array:
-    way_m = SIGMA_REST_M + SIGMA_ROOT_M * float(np.sqrt(np.linalg.norm(window.measured_m)))
+    way_m = SIGMA_REST_M + SIGMA_ROOT_M * float(np.sqrt(wheels_m(window.measured.T_before_now)))
     turn_rad = SIGMA_REST_RAD + SIGMA_ROOT_RAD * float(np.sqrt(abs(window.measured_rad)))
     return np.array([way_m, way_m, turn_rad])
 
@@ -260,6 +277,11 @@ def _robust(rows: Array, measured: Array, prior: Array, sigma: Array) -> tuple[A
         H = information + weighted.T @ rows
         solution = np.linalg.solve(H, information @ prior + weighted.T @ measured)
     return solution, np.sqrt(np.diag(np.linalg.inv(H)))
+
+
+def wheels_m(T_before_now: Array) -> float:
+    """Return how far the wheels have gone in a motion (4, 4) of the base, which is how they err."""
+    return float(np.linalg.norm(T_before_now[:3, 3])) + HALF_TRACK_M * abs(yaw_of(T_before_now))
 
 
 def rotation_2d(angle_rad: float) -> Array:

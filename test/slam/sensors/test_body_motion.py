@@ -165,8 +165,32 @@ def test_scale_yaw_and_offset_of_the_wheels_are_found():
     assert found.scale == pytest.approx(1.05, abs=2e-3)
     assert found.yaw_rad == pytest.approx(0.04, abs=2e-3)
     assert found.offset_m == pytest.approx((0.15, -0.05), abs=5e-3)
+    assert found.believed() is found
     assert found.turn_scale == pytest.approx(0.96, abs=2e-3)
     assert set(found.remarks()) == {'scale', 'turn_scale', 'yaw', 'offset'}
+
+
+def test_the_slip_of_a_first_turn_is_no_offset_of_the_camera():
+    """The wheels stop on the spot, the base slides on by 15 mm as it begins to turn."""
+    calibrator = WheelCalibrator()
+    windows = [*driven((1.0, 0.0, (0.0, 0.0), 1.0), [((0.13, 0.0), 0.1)] * 6)]
+    sliding = window((0.015, 0.006), 0.19, (0.0, 0.0), 0.19)
+    for one in [*windows, sliding]:
+        calibrator.add(one)
+    turn = base_pose(0.0, 0.0, 0.19)
+    way_m, _ = calibrator.current.believed().base_motion(turn, None)
+    assert np.linalg.norm(way_m) < 1e-3
+    assert calibrator.current.believed().sigma[2] > np.linalg.norm(calibrator.current.offset_m)
+
+
+def test_a_base_that_turns_on_the_spot_may_slip_and_its_offset_may_not_be_known():
+    body = BodyMotion()
+    body.T_base_left = Mount(0.3, 0.2).T_base_left
+    for k in range(40):
+        body.add(WheelPose(100 * k * MS, base_pose(0.0, 0.0, 0.1 * k)))
+    turned = body.between(1000 * MS, 2000 * MS)
+    in_base = adjoint(body.T_base_left) @ turned.covariance @ adjoint(body.T_base_left).T
+    assert 0.005 < np.sqrt(in_base[0, 0]) < 0.15
 
 
 def test_wheels_that_wear_are_known_as_they_are_now():
