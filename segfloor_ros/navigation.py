@@ -121,17 +121,18 @@ class Costmap:
         blind_m: float,
     ) -> None:
         self.grid = grid
-        here = self._discs(driven[-1:], radius_m)
+        at_start = np.zeros(grid.cells.shape, bool)
         if np.hypot(*(driven - driven[:1]).T).max(initial=0) <= blind_m:
-            here |= self._discs(driven[:1], blind_m)
-        trodden = here | self._discs(driven, radius_m)
+            at_start = self._discs(driven[:1], blind_m)
+        trodden = at_start | self._discs(driven, radius_m)
         marked = np.zeros(trodden.shape, bool)
         marked[tuple(self._on_map(obstacles).T)] = True
         standing = (grid.cells >= OCCUPIED) | marked
         standing &= ~self._discs(driven[-1:], radius_m / 2)
-        self._standing = standing
+        # No ray passes between two cells that touch at a corner.
+        self._walls = cv2.dilate(standing.astype(np.uint8), np.ones((2, 2), np.uint8)) > 0
         self.free = ((grid.cells == FREE) | trodden) & ~standing
-        dark, unseen = (_without_slits((grid.cells == UNKNOWN) & ~m) for m in (trodden, here))
+        dark, unseen = (_without_slits((grid.cells == UNKNOWN) & ~m) for m in (trodden, at_start))
         self._unseen = unseen[1:-1, 1:-1]
         beside = cv2.dilate(unseen.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
         self._edge_m = grid.away_m(beside & self.free)
@@ -254,14 +255,14 @@ class Costmap:
         show: nothing stands before them.
         """
         step_m = self.grid.resolution_m
-        count = int(np.pi * reach_m / step_m)
+        count = int(2 * np.pi * reach_m / step_m)
         bearing = 2 * np.pi / count * np.arange(count)
         way_m = np.arange(step_m, reach_m, step_m)[:, None, None]
         rays = point + way_m * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
         cells = self.grid.cells_of(rays)
         inside = self.grid.holds(cells)
         at = tuple(np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0))
-        stopped = np.cumsum(inside & self._standing[at], axis=0) > 0
+        stopped = np.cumsum(inside & self._walls[at], axis=0) > 0
         seen = ~stopped & (~inside | self._unseen[at])
         return self.grid.centres_of(np.unique(cells[seen], axis=0))
 
@@ -457,7 +458,7 @@ class Explorer:
 
     def _frontier(self, costmap: Costmap, ways: Ways, pose: Array) -> Array | None:
         """Return the frontier to drive to: the soonest that would show as much floor as the robot
-        stands on, or the present one while it is one that it can reach: of two that are as soon
+        turns in, or the present one while it is one that it can reach: of two that are as soon
         each seems sooner in turn.
         """
         least = self.body.radius_m
@@ -475,7 +476,7 @@ class Explorer:
         while (cost < np.inf).any():
             best = points[int(np.argmin(cost))]
             shown = costmap.shown(best, 4 * least)
-            if len(shown) * costmap.grid.resolution_m**2 >= np.pi * least**2:
+            if len(shown) * costmap.grid.resolution_m**2 >= (2 * least) ** 2:
                 self._facing = shown[np.argmin(np.hypot(*(shown - shown.mean(axis=0)).T))]
                 return best
             cost[np.hypot(*(points - best).T) < least / 2] = np.inf

@@ -345,10 +345,10 @@ def moved(arrays: Arrays, T_new_old: Array) -> Arrays:
 
 def _keyframes(arrays: Arrays, first: int, first_row: int) -> list[KeyframeRecord]:
     length = arrays['keyframe_features']
-    uvd, sigma, octave, point = (
-        split(arrays[f'feature_{name}'], length)
-        for name in ('uvd_px', 'sigma_px', 'octave', 'point')
-    )
+    features = [arrays[f'feature_{name}'] for name in ('uvd_px', 'sigma_px', 'octave', 'point')]
+    if any(array.shape[1:] != (3,) for array in features[:2]) or (features[3] < 0).any():
+        raise ValueError('features that are measured nowhere, or show no point')
+    uvd, sigma, octave, point = (split(array, length) for array in features)
     links = split(arrays['keyframe_links'], arrays['keyframe_link_count'])
     grounds = [NOTHING] * len(length)
     if 'keyframe_corners' in arrays:  # not in maps of earlier releases

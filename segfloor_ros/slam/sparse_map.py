@@ -196,7 +196,8 @@ class Edges:
 
     def of(self, keyframe: int) -> slice:
         """Return where the observations of a keyframe are."""
-        return slice(*np.searchsorted(self.keyframe, [keyframe, keyframe + 1]).tolist())
+        ends = np.array([keyframe, keyframe + 1], np.int32)  # others would be compared as int64
+        return slice(*np.searchsorted(self.keyframe, ends).tolist())
 
     def drop(self, dropped: NDArray[np.intp]) -> None:
         """Drop observations by number (N,), ascending."""

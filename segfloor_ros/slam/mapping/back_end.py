@@ -256,9 +256,6 @@ class BackEnd:
         if not matches:
             return False
         closing = plan_closing(self._map, matches)
-        if closing.is_far:
-            # What is being adjusted is another map; a loop that moves it little it is added to.
-            self._global.reset()
         self._is_closing = True
         self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
         return True
@@ -272,6 +269,9 @@ class BackEnd:
             return
         self.loop_count += 1
         has_grown = len(self._map.keyframes) >= GROWN * self._adjusted_keyframes
+        if closing.is_far:
+            # What is being adjusted is another map; it goes on beside a loop that moves it little.
+            self._global.reset()
         if closing.is_far or (has_grown and not self._global.holds_one):
             copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
             self._global.submit(

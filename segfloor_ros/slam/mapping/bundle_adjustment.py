@@ -202,6 +202,10 @@ def _apply(problem: BundleProblem, step: Step) -> BundleProblem:
     )
 
 
+UNMOVED_M = 1e-6
+"""What rounding may move a point by, in a keyframe that has been moved."""
+
+
 @dataclass(frozen=True)
 class MapCopy:
     """The map as it was. T_camera_world: (K, 4, 4). xyz_world, stable_ids: (P,). point, keyframe,
@@ -317,7 +321,9 @@ def gather(
 
 
 def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:
-    """Bring an adjusted copy into the map, which may have grown and been adjusted since."""
+    """Bring an adjusted copy into the map, which may have grown and moved since. A point goes to
+    where it was adjusted to in the last keyframe that saw it, unless it has moved there since.
+    """
     if result is None or not result.adjusted.cost_after < result.adjusted.cost_before:
         return
     planned, adjusted, ids = result.planned, result.adjusted, result.ids
@@ -326,11 +332,23 @@ def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:
     holder = np.searchsorted(
         result.chosen[order], np.arange(len(sparse_map.keyframes)), side='right'
     )
+    in_order = np.argsort(result.chosen[planned.keyframe], kind='stable')
+    seen_by: NDArray[np.intp] = np.zeros(len(ids), np.intp)
+    seen_by[planned.point[in_order]] = planned.keyframe[in_order]
     now = np.stack([k.T_camera_world for k in sparse_map.keyframes])
     same = sparse_map.alive[ids] & (sparse_map.stable_id[ids] == result.stable_ids)
-    same &= (sparse_map.xyz_world[ids] == planned.points_world).all(axis=1)
+    before = _each(planned.T_camera_world[seen_by], planned.points_world)
+    here = _each(now[result.chosen[seen_by]], sparse_map.xyz_world[ids])
+    same &= np.abs(here - before).max(axis=1, initial=0.0) < UNMOVED_M
     move_keyframes(sparse_map, now @ correction[order[holder - 1]])
-    sparse_map.xyz_world[ids[same]] = adjusted.points_world[same]
+    T_world_camera = np.stack([sparse_map.keyframes[k].T_world_camera for k in result.chosen])
+    here = _each(adjusted.T_camera_world[seen_by], adjusted.points_world)
+    sparse_map.xyz_world[ids[same]] = _each(T_world_camera[seen_by], here)[same]
+
+
+def _each(T: Array, points: Array) -> Array:
+    """Return points (N, 3), each carried by a transform of its own (N, 4, 4)."""
+    return np.asarray((T[:, :3, :3] @ points[:, :, None])[:, :, 0] + T[:, :3, 3])
 
 
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
@@ -340,11 +358,10 @@ def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
     last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
     last[edges.point] = edges.keyframe
     before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
-    motion = invert(T_camera_world) @ before
-    R, t = motion[last, :3, :3], motion[last, :3, 3]
-    for column in (sparse_map.xyz_world, sparse_map.viewing_direction):
-        column[:] = (R @ column[:, :, None])[:, :, 0]
-    sparse_map.xyz_world[:] += t
+    motion = (invert(T_camera_world) @ before)[last]
+    sparse_map.xyz_world[:] = _each(motion, sparse_map.xyz_world)
+    direction = sparse_map.viewing_direction
+    direction[:] = (motion[:, :3, :3] @ direction[:, :, None])[:, :, 0]
     for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
         keyframe.T_camera_world = pose
     sparse_map.follow()

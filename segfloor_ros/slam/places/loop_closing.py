@@ -25,7 +25,7 @@ from scipy import sparse
 
 from segfloor_ros.camera.model import StereoCamera
 from segfloor_ros.files.results import Arrays
-from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_logs
+from segfloor_ros.geometry import Array, adjoint, invert, se3_exp, se3_log, se3_logs
 from segfloor_ros.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
@@ -66,8 +66,9 @@ class Closing:
     @property
     def is_far(self) -> bool:
         """Whether the latest keyframe that sees the place is off by more than what loops err."""
-        error = _errors(self.graph, self.graph.T_camera_world)[-1]
-        return not is_gated(error, np.eye(6))
+        loop, poses = self.edges[-1], self.graph.T_camera_world
+        off = poses[loop.i] @ invert(poses[loop.j]) @ invert(loop.T_i_j)
+        return not is_gated(se3_log(off), np.diag(loop.sigma**2))
 
 
 def plan_closing(sparse_map: SparseMap, matches: list[Match]) -> Closing:

@@ -122,6 +122,20 @@ def test_what_moved_meanwhile_keeps_its_move(bent):
     np.testing.assert_allclose(error[:3, 3], step[:3, 3], atol=0.006)
 
 
+@pytest.mark.parametrize('moved_m', [0.0, 0.005])
+def test_points_are_where_they_were_adjusted_to_though_a_loop_moved_the_map_meanwhile(
+    bent, moved_m
+):
+    def loop():
+        poses = np.stack([k.T_camera_world for k in bent.keyframes])
+        move_keyframes(bent, poses @ se3_exp(np.array([moved_m, 0.0, 0.0, 0.0, 0.0, 0.0])))
+
+    cost = solve_global(CAMERA, copy_map(bent, NO_OFFSET, None), lambda: True).adjusted.cost_after
+    adjust(bent, loop)
+    after = solve_global(CAMERA, copy_map(bent, NO_OFFSET, None), lambda: False)
+    assert after.adjusted.cost_before == pytest.approx(cost, rel=0.01)
+
+
 def test_an_adjustment_that_is_no_longer_wanted_changes_nothing(bent):
     before = np.stack([k.T_camera_world for k in bent.keyframes])
     copied = copy_map(bent, NO_OFFSET, None)
