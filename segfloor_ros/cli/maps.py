@@ -293,9 +293,9 @@ def merge(first: SavedMap, second: SavedMap) -> SavedMap:
     is in both.
     """
     _check_mounts(first, second)
-    added = _after(first, second)
     camera = saved_camera(first.file, first.name)
     with parts_that_fit(f'{first.name} or {second.name}'):
+        added = _after(first, second)
         slam = merge_slam(first.slam, added.parts[PART], Rig(camera, mount_of(first.file)))
     if slam is None:
         raise MapError(

@@ -244,8 +244,16 @@ def test_a_file_whose_parts_do_not_fit_is_one_line(first, tmp_path):
             open_map(path)
 
 
-def test_a_damaged_map_is_not_merged(first, second):
-    slam = second.slam | {'feature_octave': second.slam['feature_octave'][:-1]}
+@pytest.mark.parametrize(
+    ('column', 'damage'),
+    [
+        ('feature_octave', lambda octave: octave[:-1]),
+        ('feature_uvd_px', lambda uvd: uvd[:, 0]),
+        ('feature_point', lambda point: point - 1),
+    ],
+)
+def test_a_damaged_map_is_not_merged(first, second, column, damage):
+    slam = second.slam | {column: damage(second.slam[column])}
     parts = second.file.parts | {'slam': slam}
     with pytest.raises(InputError, match=r'or broken\.map: parts of the map do not fit'):
         merge(first, SavedMap('broken.map', replace(second.file, parts=parts)))

@@ -194,6 +194,27 @@ def test_an_adjustment_of_the_whole_map_goes_on_beside_loops_that_move_it_little
         mapping.close()
 
 
+def test_an_adjustment_goes_on_beside_a_loop_that_is_not_closed(closed, monkeypatch):
+    end, wanted = threading.Event(), []
+    monkeypatch.setattr(
+        back_end,
+        'solve_global',
+        lambda _camera, _copied, is_wanted: wanted.append(is_wanted) or end.wait(30),
+    )
+    mapping, close = closing_loops(closed, monkeypatch, background=True)
+    try:
+        close(0.03)
+        monkeypatch.setattr(back_end, 'apply_closing', lambda *_: False)
+        close(0.3)
+        assert mapping._global.holds_one
+        end.set()
+        mapping._global.collect(wait=True)
+        assert [is_wanted() for is_wanted in wanted] == [True]
+    finally:
+        end.set()
+        mapping.close()
+
+
 def closing_loops(closed, monkeypatch, background):
     """Returns the back end of a copy of the map, and what closes a loop that is some way off."""
     sparse_map, none = SparseMap(closed[0].rig), np.zeros(0, np.int32)
