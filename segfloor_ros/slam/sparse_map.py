@@ -376,15 +376,6 @@ class SparseMap:
         known[known] = self.alive[rows[known]]
         return np.where(known, rows, NO_POINT).astype(np.int32)
 
-    def features_of(self, keyframe: KeyframeRecord) -> Features:
-        """Return the features of a keyframe; those of an old one look like the points that they
-        show.
-        """
-        if keyframe.features is not None:
-            return keyframe.features
-        uv_px = keyframe.observations.uvd_px[:, :2].astype(np.float32)
-        return Features(uv_px, keyframe.octave, self.descriptor[keyframe.point_id])
-
     def add_keyframe(
         self,
         keyframe: KeyframeRecord,
@@ -418,7 +409,7 @@ class SparseMap:
         ids = keyframe.point_id[rows]
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
-        self.descriptor[ids] = self.features_of(keyframe).descriptor[rows]
+        self.descriptor[ids] = features_of(self, keyframe).descriptor[rows]
         self.points['seen_last'][ids] = keyframe.index
         self.viewing_distance_m[ids] = distance
         self.viewing_octave[ids] = keyframe.octave[rows]
@@ -571,3 +562,11 @@ class SparseMap:
         wanted[ids] = True
         edges = wanted[self.edges.point]
         return (self.edges.point[edges], self.edges.keyframe[edges], self.edges.row[edges])
+
+
+def features_of(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Features:
+    """Return the features of a keyframe; those of an old one look like the points they show."""
+    if keyframe.features is not None:
+        return keyframe.features
+    uv_px = keyframe.observations.uvd_px[:, :2].astype(np.float32)
+    return Features(uv_px, keyframe.octave, sparse_map.descriptor[keyframe.point_id])

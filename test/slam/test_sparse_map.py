@@ -7,7 +7,7 @@ from segfloor_ros.slam.places import loop_closing
 from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import Rig
 from segfloor_ros.slam.saved_slam import map_to_arrays
-from segfloor_ros.slam.sparse_map import Match, PointRows, SparseMap
+from segfloor_ros.slam.sparse_map import Match, PointRows, SparseMap, features_of
 
 
 def two_keyframes():
@@ -89,7 +89,7 @@ def test_features_of_no_point_are_forgotten_and_the_map_is_the_same():
     assert len(first.octave) == len(first.observations) == 3
     assert first.observations.uvd_px.nbytes + first.observations.sigma_px.nbytes == 3 * 18
     np.testing.assert_array_equal(
-        sparse_map.features_of(first).descriptor, sparse_map.descriptor[first.point_id]
+        features_of(sparse_map, first).descriptor, sparse_map.descriptor[first.point_id]
     )
     np.testing.assert_array_equal(first.point_id, [0, 1, 2])
     assert len(second.point_id) == 3, 'another keeps what it has'

@@ -272,16 +272,17 @@ class BackEnd:
         if closing.is_far:
             # What is being adjusted is another map; it goes on beside a loop that moves it little.
             self._global.reset()
-        if closing.is_far or (has_grown and not self._global.holds_one):
-            copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
-            self._global.submit(
-                partial(solve_global, self._rig.camera, copied, self._global.is_wanted()),
-                partial(self._apply_global, len(copied.records)),
-            )
+        if not closing.is_far and (not has_grown or self._global.holds_one):
+            return
+        copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
 
-    def _apply_global(self, num_keyframes: int, result: GlobalResult | None) -> None:
-        self._adjusted_keyframes = num_keyframes
-        apply_global(self._map, result)
+        def apply(result: GlobalResult | None) -> None:
+            self._adjusted_keyframes = len(copied.records)
+            apply_global(self._map, result)
+
+        self._global.submit(
+            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()), apply
+        )
 
 
 class AdjustmentRunner:

@@ -47,6 +47,7 @@ from segfloor_ros.slam.sparse_map import (
     KeyframeRecord,
     Match,
     SparseMap,
+    features_of,
     loop_sigma,
 )
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
@@ -201,7 +202,7 @@ class PlaceMatcher:
         which keyframes (K,) of the known map may be of the place, and which are of the view itself.
         """
         own_ids, track = self._known.points_of(np.flatnonzero(near)), None
-        features = self._map.features_of(keyframe)
+        features = features_of(self._map, keyframe)
         if self.matches:
             pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
             depth_m = median_depth_m(self._map, keyframe)

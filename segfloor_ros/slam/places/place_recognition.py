@@ -33,7 +33,7 @@ from segfloor_ros.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.slam.places.views import COLUMNS, ROWS
 from segfloor_ros.slam.results import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME, Track
 from segfloor_ros.slam.rig import LOCAL_KEYFRAMES
-from segfloor_ros.slam.sparse_map import GroundView, KeyframeRecord, SparseMap
+from segfloor_ros.slam.sparse_map import GroundView, KeyframeRecord, SparseMap, features_of
 from segfloor_ros.slam.tracking.images import Features, hamming
 from segfloor_ros.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
 
@@ -70,7 +70,7 @@ class PlaceRecognition:
 
     def add(self, keyframe: KeyframeRecord) -> None:
         """Take in a keyframe."""
-        self._index.add(keyframe.index, self._words(self._map.features_of(keyframe)))
+        self._index.add(keyframe.index, self._words(features_of(self._map, keyframe)))
 
     def _words(self, features: Features) -> NDArray[np.int32]:
         """Return the words (N,) of features; those of the latest view are asked for twice."""
