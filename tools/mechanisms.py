@@ -93,6 +93,7 @@ SLAM: dict[str, Mechanism] = {
     'retiring of keyframes': Mechanism({'slam.mapping.keyframe_mapping.retire_redundant': _none}),
     'keyframes where few points are found': Mechanism({'slam.places.views.MAJORITY': 0.0}),
     'loops': Mechanism({'slam.mapping.back_end.BackEnd._close_loop': lambda *_: False}),
+    'whole map adjusted after some loops alone': Mechanism({'slam.mapping.back_end.GROWN': 0.0}),
     'places by their floor': Mechanism({'slam.places.loops.PlaceMatcher.look_at_floor': _none}),
     'relocalisation by several frames': Mechanism({'slam.places.place_recognition.PROOF': 1}),
     'map parts': Mechanism({'slam.stereo_slam.LOST_NS': 1 << 62}),
@@ -104,6 +105,9 @@ SLAM: dict[str, Mechanism] = {
         {'slam.tracking.front_end.FrontEnd._weighed': lambda self, track, images: track}
     ),
     'bias of the gyroscope at rest': Mechanism({'slam.sensors.body_motion.AT_REST': (-1.0, -1.0)}),
+    'offset of the camera once it is known': Mechanism(
+        {'slam.sensors.wheel_odometry.KNOWN_M': np.inf}
+    ),
     'begin again': Mechanism({'slam.stereo_slam.HARDLY_BEGUN': -1}),
     'scene flow': Mechanism({'slam.moving.scene_flow.SceneFlow._earlier': lambda *_: []}),
     'points seen through': Mechanism({'slam.sparse_map.PROOF': 1 << 30}),

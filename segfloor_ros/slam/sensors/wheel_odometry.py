@@ -100,6 +100,7 @@ class Window:
 
 
 KNOWN_M = 0.01
+"""An offset of the camera on the base is believed once it is known so well."""
 
 
 @dataclass(frozen=True)
