@@ -243,7 +243,7 @@ def map_to_arrays(sparse_map: SparseMap) -> Arrays:
         'feature_octave': octave,
         'feature_point': point,
         'keyframe_corners': corner_count,
-        'corner_xy_m': corners.astype(np.float16),
+        'corner_xy_m': corners,
         'corner_descriptor': looks,
         'loop_ends': np.array([(e.i, e.j) for e in loops], np.int32).reshape(-1, 2),
         'loop_T_i_j': _stack([e.T_i_j for e in loops]),
@@ -356,9 +356,7 @@ def _keyframes(arrays: Arrays, first: int, first_row: int) -> list[KeyframeRecor
             split(arrays[name], arrays['keyframe_corners'])
             for name in ('corner_xy_m', 'corner_descriptor')
         )
-        grounds = [
-            GroundView(xy_m.astype(np.float32), look) for xy_m, look in zip(*corners, strict=True)
-        ]
+        grounds = [GroundView(xy_m, look) for xy_m, look in zip(*corners, strict=True)]
     records = []
     for k, stamp_ns in enumerate(arrays['keyframe_stamp_ns'].tolist()):
         follows = int(arrays['keyframe_follows'][k])

@@ -129,6 +129,10 @@ class PointRows:
         self.num_ever = int(arrays['num_ever'][0])
 
 
+Observers = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
+"""Observations: rows of points, indices of keyframes, and their features; (E,) each."""
+
+
 class GrowingArray:
     """An array that grows along its first axis; appending is amortised constant time."""
 
@@ -166,43 +170,55 @@ class GrowingArray:
 
 
 class Edges:
-    """Observations (E,): the row of a point, the index of a keyframe, and its feature; keyframe by
-    keyframe.
+    """Who observes whom: point (E,) is the row of the point that each feature of each keyframe
+    shows, keyframe by keyframe, `NO_POINT` where it shows none.
     """
 
     def __init__(self) -> None:
-        self._columns = [GrowingArray((), np.int32) for _ in range(3)]
+        self._point = GrowingArray((), np.int32)
+        self._bounds = GrowingArray((), np.intp)
+        self._bounds.lengthen(1)
 
     @property
     def point(self) -> NDArray[np.int32]:
         """The points, a writable view."""
-        return self._columns[0].rows
+        return self._point.rows
 
-    @property
-    def keyframe(self) -> NDArray[np.int32]:
-        """The keyframes that observe them."""
-        return self._columns[1].rows
+    def of(self, keyframe: int) -> NDArray[np.int32]:
+        """Return what the features of a keyframe show, a writable view until more are added."""
+        first, end = self._bounds.rows[keyframe : keyframe + 2]
+        return self.point[first:end]
 
-    @property
-    def row(self) -> NDArray[np.int32]:
-        """Their features in these."""
-        return self._columns[2].rows
+    def add(self, point: NDArray[np.int32]) -> None:
+        """Add the next keyframe, with what its features show."""
+        self._point.extend(point)
+        self._bounds.extend(np.array([len(self.point)]))
 
-    def add(self, ids: NDArray[np.int32], keyframe: int, rows: NDArray[np.intp]) -> None:
-        """Add what a keyframe observes."""
-        columns: tuple[NDArray[Any], ...] = ids, np.full(len(ids), keyframe, np.int32), rows
-        for column, values in zip(self._columns, columns, strict=True):
-            column.extend(values)
+    def keep(self, keyframe: int, rows: NDArray[np.intp]) -> None:
+        """Drop the features of a keyframe but rows (N,), ascending."""
+        first, end = self._bounds.rows[keyframe : keyframe + 2]
+        dropped = np.delete(np.arange(first, end), rows)
+        self._point.drop(dropped)
+        self._bounds.rows[keyframe + 1 :] -= len(dropped)
 
-    def of(self, keyframe: int) -> slice:
-        """Return where the observations of a keyframe are."""
-        ends = np.array([keyframe, keyframe + 1], np.int32)  # others would be compared as int64
-        return slice(*np.searchsorted(self.keyframe, ends).tolist())
+    def at(self, keyframe: NDArray[np.integer] | int, row: NDArray[np.integer]) -> NDArray[np.intp]:
+        """Return where in `point` features (N,) of keyframes, by index, are."""
+        return np.asarray(self._bounds.rows[keyframe] + row)
 
-    def drop(self, dropped: NDArray[np.intp]) -> None:
-        """Drop observations by number (N,), ascending."""
-        for column in self._columns:
-            column.drop(dropped)
+    def to(self, wanted: NDArray[np.bool_]) -> Observers:
+        """Return the observations of wanted points (P,), keyframe by keyframe."""
+        found = np.flatnonzero(np.append(wanted, False)[self.point])  # `NO_POINT` is the last
+        counts = self._in_each(found)
+        keyframe = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        row = (found - self._bounds.rows[keyframe]).astype(np.int32)
+        return self.point[found], keyframe, row
+
+    def count(self, wanted: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return how many of the wanted points (P,) each keyframe observes."""
+        return self._in_each(np.flatnonzero(np.append(wanted, False)[self.point]))
+
+    def _in_each(self, found: NDArray[np.intp]) -> NDArray[np.intp]:
+        return np.diff(np.searchsorted(found, self._bounds.rows))
 
 
 @dataclass(frozen=True)
@@ -264,11 +280,11 @@ class Match:
 class GroundView:
     """Corners of the floor: xy_m (N, 2) on it in the base frame, descriptor (N, 32) uint8."""
 
-    xy_m: NDArray[np.float32]
+    xy_m: NDArray[np.float16]
     descriptor: NDArray[np.uint8]
 
 
-NOTHING = GroundView(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+NOTHING = GroundView(np.zeros((0, 2), np.float16), np.zeros((0, 32), np.uint8))
 
 
 Covisible = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -354,8 +370,7 @@ class SparseMap:
 
     def restore(self, keyframe: KeyframeRecord) -> None:
         """Add a keyframe whose points are there already."""
-        self.keyframes.append(keyframe)
-        self._add_edges(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT))
+        self._add(keyframe)
         if keyframe.retired is not None:
             self._retired.append(keyframe)
 
@@ -388,24 +403,33 @@ class SparseMap:
         patches: (F, SIDE_PX, SIDE_PX) grey levels around all of its features. The points it
         sees take on its view of them.
         """
-        self.keyframes.append(keyframe)
         keyframe.point_id[new_rows] = self.points.add(
             len(new_xyz_world),
             xyz_world=new_xyz_world,
             born=keyframe.index,
             seen_last=keyframe.index,
         )
-        self._link(keyframe, np.flatnonzero(keyframe.point_id != NO_POINT), patches)
+        self._look(keyframe, self._add(keyframe), patches)
 
-    def _add_edges(self, keyframe: KeyframeRecord, rows: NDArray[np.intp]) -> None:
-        ids = keyframe.point_id[rows]
-        self.edges.add(ids, keyframe.index, rows)
-        self.observer_count[ids] += 1
+    def _add(self, keyframe: KeyframeRecord) -> NDArray[np.intp]:
+        """Add a keyframe; returns its features (N,) that show a point."""
+        before = self.edges.point.base
+        self.keyframes.append(keyframe)
+        self.edges.add(keyframe.point_id)
+        has_moved = self.edges.point.base is not before
+        self._bind(0 if has_moved else keyframe.index)
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        self.observer_count[keyframe.point_id[rows]] += 1
+        return rows
 
-    def _link(
+    def _bind(self, first: int) -> None:
+        """Let keyframes from one on show what `edges` says: there is one truth."""
+        for keyframe in self.keyframes[first:]:
+            keyframe.point_id = self.edges.of(keyframe.index)
+
+    def _look(
         self, keyframe: KeyframeRecord, rows: NDArray[np.intp], patches: NDArray[np.uint8]
     ) -> None:
-        self._add_edges(keyframe, rows)
         ids = keyframe.point_id[rows]
         sight = self.xyz_world[ids] - keyframe.T_world_camera[:3, 3]
         distance = np.linalg.norm(sight, axis=1)
@@ -423,16 +447,11 @@ class SparseMap:
         """Forget observations: features `row` (N,) of a keyframe, or of keyframes (N,), by index. A
         point that nobody observes any more is removed.
         """
-        dropped = [np.zeros(0, np.intp)]
-        keyframe = np.broadcast_to(keyframe, row.shape)
-        for k in np.unique(keyframe):
-            rows, record, own = row[keyframe == k], self.keyframes[k], self.edges.of(k)
-            ids = record.point_id[rows]
-            record.point_id[rows] = NO_POINT
-            dropped.append(own.start + np.flatnonzero(np.isin(self.edges.row[own], rows)))
-            self.observer_count[ids] -= 1
-            self.alive[ids[self.observer_count[ids] <= 0]] = False
-        self.edges.drop(np.concatenate(dropped))
+        at = self.edges.at(keyframe, row)
+        ids = self.edges.point[at]
+        self.edges.point[at] = NO_POINT
+        np.subtract.at(self.observer_count, ids, 1)
+        self.alive[ids[self.observer_count[ids] <= 0]] = False
 
     def retire(self, keyframe: KeyframeRecord, reference: KeyframeRecord) -> None:
         """Take a keyframe's observations out of the map and let its pose follow `reference`; its
@@ -451,14 +470,11 @@ class SparseMap:
         the others as much is kept as in a file.
         """
         rows = np.flatnonzero(keyframe.point_id != NO_POINT)
-        new_row = np.zeros(len(keyframe.point_id), np.int32)
-        new_row[rows] = np.arange(len(rows))
-        mine = self.edges.of(keyframe.index)
-        self.edges.row[mine] = new_row[self.edges.row[mine]]
+        self.edges.keep(keyframe.index, rows)
+        self._bind(keyframe.index)
         keyframe.features = None
         keyframe.octave = keyframe.octave[rows]
         keyframe.observations = keyframe.observations.take(rows).compact()
-        keyframe.point_id = keyframe.point_id[rows]
         keyframe.is_thin = True
 
     def follow(self) -> None:
@@ -472,11 +488,8 @@ class SparseMap:
     def remove_points(self, ids: NDArray[np.integer]) -> None:
         """Take points out of the map; their rows are free for new ones."""
         self.alive[ids] = False
-        dropped = np.flatnonzero(~self.alive[self.edges.point])
-        keyframes, rows = self.edges.keyframe[dropped], self.edges.row[dropped]
-        for k in np.unique(keyframes):
-            self.keyframes[k].point_id[rows[keyframes == k]] = NO_POINT
-        self.edges.drop(dropped)
+        gone = np.append(~self.alive, False)  # `NO_POINT` is the last
+        self.edges.point[gone[self.edges.point]] = NO_POINT
 
     def seen_together(self, a: NDArray[np.integer], b: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return whether a keyframe observes both points of each pair (a[i], b[i]), (N,); no point
@@ -510,19 +523,11 @@ class SparseMap:
             self.points[name][kept] += self.points[name][gone]
         born = self.points['born']
         born[kept] = np.minimum(born[kept], born[gone])
-        self._rename(kept, gone)
         self.alive[gone] = False
+        new_row = np.arange(len(self.alive) + 1, dtype=np.int32)
+        new_row[gone], new_row[NO_POINT] = kept, NO_POINT
+        self.edges.point[:] = new_row[self.edges.point]
         return len(kept)
-
-    def _rename(self, kept: NDArray[np.integer], gone: NDArray[np.integer]) -> None:
-        """Give the observations of points `gone` to points `kept`."""
-        new_row: NDArray[np.int32] = np.full(len(self.alive), NO_POINT, np.int32)
-        new_row[gone] = kept
-        moved = np.flatnonzero((new_row != NO_POINT)[self.edges.point])
-        self.edges.point[moved] = new_row[self.edges.point[moved]]
-        for k in np.unique(self.edges.keyframe[moved]):
-            mine = moved[self.edges.keyframe[moved] == k]
-            self.keyframes[k].point_id[self.edges.row[mine]] = self.edges.point[mine]
 
     def poor_points(self, settled_before: int, min_found_ratio: float) -> NDArray[np.intp]:
         """Return ids of points that tracking seldom finds, that are gone, or that only one keyframe
@@ -538,9 +543,7 @@ class SparseMap:
         """Return the keyframes that observe any of the points (N,)."""
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
-        shared = np.bincount(
-            self.edges.keyframe[wanted[self.edges.point]], minlength=len(self.keyframes)
-        )
+        shared = self.edges.count(wanted)
         order = np.lexsort((-np.arange(len(shared)), -shared))
         order = order[shared[order] > 0]
         return order, shared[order]
@@ -552,16 +555,11 @@ class SparseMap:
             observed[self.keyframes[k].point_id] = True
         return np.flatnonzero(observed[:-1]).astype(np.int32)
 
-    def edges_of(
-        self, ids: NDArray[np.integer]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return all observations of the points: point ids, keyframe indices, feature rows;
-        (E,) each.
-        """
+    def edges_of(self, ids: NDArray[np.integer]) -> Observers:
+        """Return all observations of the points (N,)."""
         wanted = np.zeros(len(self.alive), bool)
         wanted[ids] = True
-        edges = wanted[self.edges.point]
-        return (self.edges.point[edges], self.edges.keyframe[edges], self.edges.row[edges])
+        return self.edges.to(wanted)
 
 
 def features_of(sparse_map: SparseMap, keyframe: KeyframeRecord) -> Features:

@@ -151,17 +151,16 @@ def test_observations_are_those_of_the_keyframes_whatever_is_done_to_them():
         sparse_map.remove_points(chosen[6:])
         if k > 3:
             sparse_map.thin_out(sparse_map.keyframes[k - 3])
-        edges, records = sparse_map.edges, sparse_map.keyframes
+        edges = sparse_map.edges_of(np.flatnonzero(sparse_map.alive))
         observed = [
             (int(record.point_id[row]), record.index, int(row))
-            for record in records
+            for record in sparse_map.keyframes
             for row in np.flatnonzero(record.point_id != NO_POINT)
         ]
-        columns = (edges.point, edges.keyframe, edges.row)
-        listed = list(zip(*(column.tolist() for column in columns), strict=True))
+        listed = list(zip(*(column.tolist() for column in edges), strict=True))
         assert sorted(listed) == sorted(observed)
-        assert (np.diff(edges.keyframe) >= 0).all(), 'keyframe by keyframe'
-        count = np.bincount(edges.point, minlength=len(sparse_map.alive))
+        assert (np.diff(edges[1]) >= 0).all(), 'keyframe by keyframe'
+        count = np.bincount(edges[0], minlength=len(sparse_map.alive))
         np.testing.assert_array_equal(
             count[sparse_map.alive], sparse_map.observer_count[sparse_map.alive]
         )

@@ -242,15 +242,12 @@ class GlobalResult:
 def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None) -> MapCopy:
     """Copy what an adjustment needs out of the map: little time between two frames."""
     keyframes = list(sparse_map.keyframes)
-    edges = sparse_map.edges
     return MapCopy(
         np.stack([k.T_camera_world for k in keyframes]),
         sparse_map.xyz_world.copy(),
         sparse_map.stable_id.copy(),
         sparse_map.observer_count.copy(),
-        edges.point.copy(),
-        edges.keyframe.copy(),
-        edges.row.copy(),
+        *sparse_map.edges.to(sparse_map.alive),
         [k.observations for k in keyframes],
         keyframes,
         list(sparse_map.loops),
@@ -354,14 +351,14 @@ def _each(T: Array, points: Array) -> Array:
 def move_keyframes(sparse_map: SparseMap, T_camera_world: Array) -> None:
     """Move keyframes to poses (K, 4, 4); every point goes along with the last one that sees it."""
     T_camera_world = without_drift(T_camera_world)
-    edges = sparse_map.edges
+    point, keyframe, _ = sparse_map.edges.to(sparse_map.alive)
     last: NDArray[np.intp] = np.zeros(len(sparse_map.alive), np.intp)
-    last[edges.point] = edges.keyframe
+    last[point] = keyframe
     before = np.stack([k.T_camera_world for k in sparse_map.keyframes])
     motion = (invert(T_camera_world) @ before)[last]
     sparse_map.xyz_world[:] = _each(motion, sparse_map.xyz_world)
     direction = sparse_map.viewing_direction
     direction[:] = (motion[:, :3, :3] @ direction[:, :, None])[:, :, 0]
-    for keyframe, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
-        keyframe.T_camera_world = pose
+    for record, pose in zip(sparse_map.keyframes, T_camera_world, strict=True):
+        record.T_camera_world = pose.copy()  # not a part of an array of all
     sparse_map.follow()

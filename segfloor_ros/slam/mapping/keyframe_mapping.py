@@ -224,7 +224,7 @@ class LocalMapper:
     def _write_back(self, adjustment: Adjustment, result: BundleResult) -> None:
         self._map.xyz_world[adjustment.ids] = result.points_world
         for slot, k in enumerate(adjustment.free):
-            keyframe, T_camera_world = self._map.keyframes[k], result.T_camera_world[slot]
+            keyframe, T_camera_world = self._map.keyframes[k], result.T_camera_world[slot].copy()
             carried = adjustment.carried_ids[adjustment.carried_keyframe == k]
             self._map.xyz_world[carried] = transform_points(
                 invert(T_camera_world) @ keyframe.T_camera_world, self._map.xyz_world[carried]

@@ -274,7 +274,7 @@ class GroundViews:
         column, row = cv2.KeyPoint_convert(corners).T
         cell_m = CELL * self._mount.height_m
         xy_m = self._corner_xy_m + cell_m * np.stack([row, column], axis=1)
-        return GroundView(xy_m.astype(np.float32), np.asarray(descriptor, np.uint8))
+        return GroundView(xy_m.astype(np.float16), np.asarray(descriptor, np.uint8))
 
 
 def _projection(

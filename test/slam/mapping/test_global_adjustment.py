@@ -90,7 +90,7 @@ def test_what_was_mapped_meanwhile_moves_along(bent):
 
     def map_on():
         none = np.zeros(0, np.intp)
-        bent.keyframes.append(
+        bent.restore(
             KeyframeRecord(
                 COUNT,
                 COUNT,
