@@ -47,6 +47,7 @@ from segfloor_ros.messages.arrays import (
     cloud_array,
     grey8_image,
     grid_of,
+    moving_points_arrays,
     scan_arrays,
 )
 from segfloor_ros.messages.poses import pose_array
@@ -150,7 +151,7 @@ class Pilot:
         self._waiting: dict[int, float] = {}
         self._scans: dict[int, FloorScan] = {}
         self._poses: dict[int, Array | None] = {}
-        self._obstacles = np.zeros((0, 3))
+        self._obstacles, self._moving = np.zeros((0, 3)), np.zeros((0, 3))
         self._image: Image | None = None
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
@@ -159,6 +160,7 @@ class Pilot:
             ('pose', self._take_pose),
             ('scan', self._take_scan),
             ('obstacle_points', self._take_obstacles),
+            ('moving_points', self._take_moving),
             ('map', self._take_map),
             ('contact', self._take_contact),
             ('left/image_raw', self._take_image),
@@ -203,7 +205,9 @@ class Pilot:
         scan = self._scans.pop(stamp_ns, None)
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
-            self._explorer.take_obstacles(self._obstacles, scan, T_map_base)
+            standing = np.vstack([self._obstacles, self._moving])
+            self._explorer.take_obstacles(standing, scan, T_map_base)
+            self._moving = np.zeros((0, 3))
         ended = len(self._explorer.ended)
         forward, turn = self._explorer.step(1e-9 * stamp_ns, T_map_base)
         for goal in self._explorer.ended[ended:]:
@@ -229,6 +233,10 @@ class Pilot:
     def _take_obstacles(self, message: Any) -> None:
         points = cloud_array(message, MAP_POINT_DTYPE, 'obstacle_points')
         self._obstacles = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float64)
+
+    def _take_moving(self, message: Any) -> None:
+        found = moving_points_arrays(message, 'moving_points')
+        self._moving = found.xyz_map.astype(np.float64)
 
     def _take_map(self, message: Any) -> None:
         grid = self._explorer.grid = grid_of(message)

@@ -2,27 +2,41 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 from moving_drive import MovingDrive
-from node_messages import pose_message_at, publish
+from node_messages import AT_ORIGIN, SCAN, STAMP_NS, pose_message_at, publish
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.camera.calibration.parameters import StereoRectifier
+from segfloor_ros.cli.explore_session import Pilot
+from segfloor_ros.cli.replay_recorder import DriveNotes
+from segfloor_ros.evaluation.exploration import Exploration
 from segfloor_ros.floor.observation import FLOOR
 from segfloor_ros.messages.arrays import (
     FEATURE_DTYPE,
     MOVING_DTYPE,
     camera_info_message,
     cloud_array,
+    free_scan_message,
     grey8_image,
     image_message,
+    moving_points_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.poses import transform_message
+from segfloor_ros.messages.diagnostics import Level, Status
+from segfloor_ros.messages.poses import (
+    odometry_message,
+    pose_with_covariance_message,
+    transform_message,
+)
 from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.navigation import Body, Explorer
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.slam.results import MovingPoints
 from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -100,6 +114,30 @@ def test_moving_points_tell_what_crosses_and_diagnostics_count_it(make_graph):
     x, _ = crossing(round(to_ns(full[-1].header.stamp) * 1e-8) - 8)
     assert abs(np.median(points['x']) - x) < 0.15
     assert np.isfinite(points['vy']).any()
+
+
+def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
+    graph, zeros = make_graph(), np.zeros((6, 6))
+    graph.tester.notes = DriveNotes(lambda: 0.0)
+    explorer = Explorer(Body(0.3, 0.5, 0.3, 1.0), 0)
+    found = Exploration((0.0, 0.0, 0.0))
+    pilot = Pilot(SimpleNamespace(recorder=graph.tester), explorer, found, lambda *_: None)
+    clouds = graph.collect('moving_points')
+    walking = MovingPoints(np.array([[2.0, 0.2, 0.4]]), np.full((1, 3), np.nan))
+    publish(graph, {'moving_points': moving_points_message(STAMP_NS, 'map', walking)})
+    graph.until(lambda: clouds, 'what walks')
+    answer = Status(STAMP_NS, 'stereo_slam', Level.OK, '', {'tracked': '1'})
+    graph.tester.notes.answers[STAMP_NS] = answer
+    publish(
+        graph,
+        {
+            'pose': pose_with_covariance_message(STAMP_NS, 'map', AT_ORIGIN, zeros),
+            'scan': free_scan_message(STAMP_NS, 'base_link', SCAN),
+            'ground_truth': odometry_message(STAMP_NS, 'world', 'base_link', AT_ORIGIN, zeros),
+        },
+    )
+    graph.until(lambda: pilot.answer() or found.poses, 'a command')
+    np.testing.assert_allclose(explorer.obstacles, [[2.0, 0.2]], atol=1e-6)
 
 
 def test_the_floor_is_not_told_of_what_moves(make_graph):
