@@ -29,8 +29,9 @@ from segfloor_ros.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.slam.results import ENOUGH, POINTS_PER_KEYFRAME
+from segfloor_ros.slam.results import ENOUGH, MAJORITY, POINTS_PER_KEYFRAME
 from segfloor_ros.slam.rig import (
+    LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
     NO_OFFSET,
     Observations,
@@ -263,16 +264,19 @@ def solve_global(
     a map of one view.
     """
     keyframe, point, row = _known_best(copied)
-    enough = np.bincount(keyframe, minlength=len(copied.records)) >= ENOUGH
-    enough[0] = True
+    count = np.bincount(keyframe, minlength=len(copied.records))
+    enough = count >= ENOUGH
+    # The map turns about the keyframe that is held: not about one of which little is known.
+    held = int(np.argmax(count >= MAJORITY * count[:LOCAL_KEYFRAMES].max()))
+    enough[held] = True
     kept = enough[keyframe]
     kept &= np.bincount(point[kept], minlength=len(copied.stable_ids))[point] > 1
     keyframe, point, row = keyframe[kept], point[kept], row[kept]
     ids = np.unique(point)
-    free = np.flatnonzero(enough[1:]) + 1
+    free = np.setdiff1d(np.flatnonzero(enough), held)
     if len(ids) == 0 or len(free) == 0:
         return None
-    chosen = np.append(free, 0)
+    chosen = np.append(free, held)
     slot = np.full(len(enough), -1)
     slot[chosen] = np.arange(len(chosen))
     problem = BundleProblem(
@@ -337,7 +341,7 @@ def apply_global(sparse_map: SparseMap, result: GlobalResult | None) -> None:
     before = _each(planned.T_camera_world[seen_by], planned.points_world)
     here = _each(now[result.chosen[seen_by]], sparse_map.xyz_world[ids])
     same &= np.abs(here - before).max(axis=1, initial=0.0) < UNMOVED_M
-    move_keyframes(sparse_map, now @ correction[order[holder - 1]])
+    move_keyframes(sparse_map, now @ correction[order[np.maximum(holder - 1, 0)]])
     T_world_camera = np.stack([sparse_map.keyframes[k].T_world_camera for k in result.chosen])
     here = _each(adjusted.T_camera_world[seen_by], adjusted.points_world)
     sparse_map.xyz_world[ids[same]] = _each(T_world_camera[seen_by], here)[same]

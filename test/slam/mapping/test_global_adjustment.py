@@ -13,6 +13,7 @@ from segfloor_ros.slam.mapping.bundle_adjustment import (
     move_keyframes,
     solve_global,
 )
+from segfloor_ros.slam.results import NO_POINT
 from segfloor_ros.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.slam.saved_slam import fill_map
 from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
@@ -48,6 +49,20 @@ def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
     assert before > 0.1
     assert errors_m(bent).max() < 0.05 * before
     np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
+
+
+def test_a_first_keyframe_that_shows_little_does_not_turn_the_map():
+    sparse_map = SparseMap(Rig(CAMERA))
+    fill_map(sparse_map, made_up_map(COUNT, np.random.default_rng(2)))
+    first = sparse_map.keyframes[0]
+    sparse_map.unlink(0, np.flatnonzero(first.point_id != NO_POINT)[::3])
+    sparse_map.unlink(0, np.flatnonzero(first.point_id != NO_POINT)[::2])
+    first.observations.uvd_px[:, 0] += 5.0  # it seems to look 0.9 deg further to the left
+    adjust(sparse_map)
+    assert errors_m(sparse_map)[1:].max() < 0.02
+    first.observations.uvd_px[:, 0] -= 5.0
+    adjust(sparse_map)
+    assert errors_m(sparse_map).max() < 0.02, 'it goes to where it belongs'
 
 
 def test_a_large_map_is_adjusted_without_a_factor_and_comes_out_the_same(bent, monkeypatch):
