@@ -2,7 +2,7 @@
 
 The row of a point that is gone is given to a new one, so that memory follows the space covered;
 its stable id, which the next stages know it by, is never given twice. Frame `world` is the left
-optical frame of the first frame.
+optical frame of the first frame as it was first; adjustments of the whole map may move that.
 
 In: keyframes and points of mapping. Out: arrays by row or by id, for tracking, files and messages.
 """
@@ -185,7 +185,9 @@ class Edges:
         return self._point.rows
 
     def of(self, keyframe: int) -> NDArray[np.int32]:
-        """Return what the features of a keyframe show, a writable view until more are added."""
+        """Return what the features of a keyframe show, a writable view until keyframes are added or
+        features dropped.
+        """
         first, end = self._bounds.rows[keyframe : keyframe + 2]
         return self.point[first:end]
 
@@ -298,7 +300,8 @@ class KeyframeRecord:
     The pose moves in bundle adjustment. features: None of an old one, of which the levels of the
     pyramid are left, octave (N,) uint8. observations: as measured, the disparity offset of the rig
     not taken off. retired: set when the keyframe has no features any more and only follows another
-    one. point_id: (N,) int32, the row of each feature's map point, not its stable id.
+    one. point_id: (N,) int32, the row of each feature's map point, not its stable id; of a
+    keyframe of a map a view of its `edges`, to be written in place.
     motion: since the keyframe before, by wheels. up: in the camera, as it was measured.
     links: indices of earlier keyframes that it shared many points with when it was made.
     ground: what it shows of the floor. is_thin: whether features that show no point are gone, so
@@ -444,8 +447,8 @@ class SparseMap:
         self.patch_distance_m[ids[stale]] = distance[stale]
 
     def unlink(self, keyframe: int | NDArray[np.integer], row: NDArray[np.integer]) -> None:
-        """Forget observations: features `row` (N,) of a keyframe, or of keyframes (N,), by index. A
-        point that nobody observes any more is removed.
+        """Forget observations: features `row` (N,) that show a point, of a keyframe, or of keyframes
+        (N,), by index. A point that nobody observes any more is removed.
         """
         at = self.edges.at(keyframe, row)
         ids = self.edges.point[at]

@@ -163,6 +163,7 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert (floor['clearing'], floor['marking'], floor['inf_is_valid']) == (True, False, True)
     monitor = nav2_node('collision_monitor')
     assert monitor['source_timeout'] > 2 * FRESH_S
+    assert monitor['moving.source_timeout'] == 0.0, 'nothing comes where nothing is looked for'
     assert nav2_node('planner_server')['planner_plugins'] == ['GridBased']
 
 

@@ -267,7 +267,8 @@ def solve_global(
     count = np.bincount(keyframe, minlength=len(copied.records))
     enough = count >= ENOUGH
     # The map turns about the keyframe that is held: not about one of which little is known.
-    held = int(np.argmax(count >= MAJORITY * count[:LOCAL_KEYFRAMES].max()))
+    early = np.flatnonzero(enough)[:LOCAL_KEYFRAMES]
+    held = int(np.argmax(count >= MAJORITY * count[early].max(initial=0)))
     enough[held] = True
     kept = enough[keyframe]
     kept &= np.bincount(point[kept], minlength=len(copied.stable_ids))[point] > 1

@@ -204,7 +204,7 @@ class LocalMapper:
         self, keyframe: KeyframeRecord
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the covisible keyframes that move and those that hold them; the first one
-        never moves.
+        does not move here.
         """
         own = keyframe.point_id[keyframe.point_id != NO_POINT]
         order, shared = self._map.covisible(own)

@@ -51,18 +51,32 @@ def test_a_bent_ring_is_round_again_and_the_first_keyframe_stays(bent):
     np.testing.assert_allclose(bent.keyframes[0].T_camera_world, first)
 
 
-def test_a_first_keyframe_that_shows_little_does_not_turn_the_map():
+@pytest.mark.parametrize('retired', [0, 9])
+def test_a_first_keyframe_that_shows_little_does_not_turn_the_map(retired):
     sparse_map = SparseMap(Rig(CAMERA))
     fill_map(sparse_map, made_up_map(COUNT, np.random.default_rng(2)))
     first = sparse_map.keyframes[0]
     sparse_map.unlink(0, np.flatnonzero(first.point_id != NO_POINT)[::3])
     sparse_map.unlink(0, np.flatnonzero(first.point_id != NO_POINT)[::2])
+    for k in range(1, 1 + retired):
+        sparse_map.retire(sparse_map.keyframes[k], sparse_map.keyframes[10])
     first.observations.uvd_px[:, 0] += 5.0  # it seems to look 0.9 deg further to the left
     adjust(sparse_map)
     assert errors_m(sparse_map)[1:].max() < 0.02
     first.observations.uvd_px[:, 0] -= 5.0
     adjust(sparse_map)
     assert errors_m(sparse_map).max() < 0.02, 'it goes to where it belongs'
+
+
+def test_a_first_keyframe_that_shows_nothing_stays_beside_the_next(bent):
+    first = bent.keyframes[0]
+    bent.unlink(0, np.flatnonzero(first.point_id != NO_POINT)[3:])
+    step = first.T_camera_world @ bent.keyframes[1].T_world_camera
+    before = bent.keyframes[-1].T_camera_world.copy()
+    adjust(bent)
+    after = first.T_camera_world @ bent.keyframes[1].T_world_camera
+    np.testing.assert_allclose(after, step, atol=1e-9)
+    assert np.abs(bent.keyframes[-1].T_camera_world - before).max() > 0.05
 
 
 def test_a_large_map_is_adjusted_without_a_factor_and_comes_out_the_same(bent, monkeypatch):
