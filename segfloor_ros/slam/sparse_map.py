@@ -447,8 +447,8 @@ class SparseMap:
         self.patch_distance_m[ids[stale]] = distance[stale]
 
     def unlink(self, keyframe: int | NDArray[np.integer], row: NDArray[np.integer]) -> None:
-        """Forget observations: features `row` (N,) that show a point, of a keyframe, or of keyframes
-        (N,), by index. A point that nobody observes any more is removed.
+        """Forget observations: features `row` (N,) that show a point, of a keyframe, or of
+        keyframes (N,), by index. A point that nobody observes any more is removed.
         """
         at = self.edges.at(keyframe, row)
         ids = self.edges.point[at]
