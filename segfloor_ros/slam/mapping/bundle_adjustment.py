@@ -29,7 +29,7 @@ from segfloor_ros.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.slam.results import ENOUGH, MAJORITY, POINTS_PER_KEYFRAME
+from segfloor_ros.slam.results import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
 from segfloor_ros.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
@@ -268,7 +268,7 @@ def solve_global(
     enough = count >= ENOUGH
     # The map turns about the keyframe that is held: not about one of which little is known.
     early = np.flatnonzero(enough)[:LOCAL_KEYFRAMES]
-    held = int(np.argmax(count >= MAJORITY * count[early].max(initial=0)))
+    held = int(np.argmax(count >= NEARLY_ALL * count[early].max(initial=0)))
     enough[held] = True
     kept = enough[keyframe]
     kept &= np.bincount(point[kept], minlength=len(copied.stable_ids))[point] > 1
