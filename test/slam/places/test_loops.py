@@ -120,7 +120,8 @@ def test_what_a_loop_says_is_less_sure_than_what_neighbours_say(closed):
     keyframes = slam.map.keyframes
     relative = keyframes[-1].T_camera_world @ invert(keyframes[0].T_camera_world)
     none = np.zeros(0, np.int32)
-    match = Match(keyframes[-1].index, 0, relative, none.astype(np.intp), none, none)
+    pose = keyframes[-1].T_camera_world
+    match = Match(keyframes[-1].index, 0, pose, none.astype(np.intp), none, none)
     graph = plan_closing(slam.map, [match]).graph
     links = len(slam.map.links()[0])
     assert len(graph.sigma) == links + len(slam.map.loops) + 1
