@@ -53,7 +53,8 @@ MOST = 0.6
 
 NEARLY_ALL = 0.9
 """Share of a keyframe's points that others must see as well, or of a view that they must cover, for
-it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E)."""
+it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E); and what counts as
+much as the best."""
 
 POINTS_PER_KEYFRAME = 300
 """Points of a keyframe that hold the map together where it is adjusted as a whole, those that most
