@@ -96,6 +96,11 @@ ABOUT = {
         'for a costmap to clear; inf: as far as can be told, -inf: blocked right in front, NaN: '
         'not seen. Published while someone listens.'
     ),
+    'obstacle_scan': (
+        'How far away something stands or walks per bearing at every tracked frame, in the '
+        "base's plane (m), for a costmap to mark; inf: nothing within `range_max`, as far as its "
+        'error is half a cell. Published while someone listens.'
+    ),
     'labelled_points': (
         'The sparse map with labels: x y z in map (m), id, confidence (0 to 1), label (0 unknown, '
         '1 floor, 2 obstacle).'

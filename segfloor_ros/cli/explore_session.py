@@ -40,14 +40,13 @@ from segfloor_ros.evaluation.exploration import (
 from segfloor_ros.files.results import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.files.whole import read_json, read_yaml
 from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.geometry import Array, Pose2d, planar
+from segfloor_ros.geometry import Array, Pose2d, planar, transform_points
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.messages.arrays import (
     MAP_POINT_DTYPE,
     cloud_array,
     grey8_image,
     grid_of,
-    moving_points_arrays,
     scan_arrays,
 )
 from segfloor_ros.messages.poses import pose_array
@@ -150,8 +149,9 @@ class Pilot:
         """When the last frame came, in real time."""
         self._waiting: dict[int, float] = {}
         self._scans: dict[int, FloorScan] = {}
+        self._near: dict[int, FloorScan] = {}
         self._poses: dict[int, Array | None] = {}
-        self._obstacles, self._moving = np.zeros((0, 3)), np.zeros((0, 3))
+        self._obstacles: Array = np.zeros((0, 3))
         self._image: Image | None = None
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
@@ -160,7 +160,7 @@ class Pilot:
             ('pose', self._take_pose),
             ('scan', self._take_scan),
             ('obstacle_points', self._take_obstacles),
-            ('moving_points', self._take_moving),
+            ('obstacle_scan', self._take_near),
             ('map', self._take_map),
             ('contact', self._take_contact),
             ('left/image_raw', self._take_image),
@@ -194,20 +194,21 @@ class Pilot:
             return False
         values = status.values
         is_mapped = values.get('keyframe') != '1' or stamp_ns in notes.failed
-        # Of frames that come close together only the newest has a scan.
-        has_pose = stamp_ns in self._poses and max(self._scans, default=0) >= stamp_ns
+        # Of frames that come close together only the newest has scans.
+        newest_ns = min(max(scans, default=0) for scans in (self._scans, self._near))
+        has_pose = stamp_ns in self._poses and newest_ns >= stamp_ns
         return (is_mapped or self._map_ns >= stamp_ns) and (
             values.get('tracked') != '1' or has_pose
         )
 
     def _command(self, stamp_ns: int) -> None:
         T_map_base = self._poses.pop(stamp_ns, None)
-        scan = self._scans.pop(stamp_ns, None)
+        scan, near = (scans.pop(stamp_ns, None) for scans in (self._scans, self._near))
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
-            standing = np.vstack([self._obstacles, self._moving])
+            seen = np.zeros((0, 3)) if near is None else near.ends()
+            standing = np.vstack([self._obstacles, transform_points(T_map_base, seen)])
             self._explorer.take_obstacles(standing, scan, T_map_base)
-            self._moving = np.zeros((0, 3))
         ended = len(self._explorer.ended)
         forward, turn = self._explorer.step(1e-9 * stamp_ns, T_map_base)
         for goal in self._explorer.ended[ended:]:
@@ -234,9 +235,9 @@ class Pilot:
         points = cloud_array(message, MAP_POINT_DTYPE, 'obstacle_points')
         self._obstacles = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float64)
 
-    def _take_moving(self, message: Any) -> None:
-        found = moving_points_arrays(message, 'moving_points')
-        self._moving = found.xyz_map.astype(np.float64)
+    def _take_near(self, message: Any) -> None:
+        self._near[stamp_of(message)] = scan_arrays(message, 'obstacle_scan')
+        self.answer()
 
     def _take_map(self, message: Any) -> None:
         grid = self._explorer.grid = grid_of(message)

@@ -49,6 +49,13 @@ class FloorScan:
         steps = np.arange(len(self.ranges_m), dtype=np.float64)
         return self.angle_min_rad + self.angle_increment_rad * steps
 
+    def ends(self) -> NDArray[np.float64]:
+        """Return where the finite ranges end, (M, 3) in the base's x-y plane."""
+        known = np.isfinite(self.ranges_m)
+        bearings, ranges = self.bearings_rad[known], self.ranges_m[known]
+        x, y = ranges * np.cos(bearings), ranges * np.sin(bearings)
+        return np.stack([x, y, np.zeros_like(x)], axis=1)
+
     @property
     def error_per_m(self) -> float:
         """The error of a range, one sigma, is this times the square of the range."""
@@ -101,6 +108,16 @@ def free_ranges(scan: FloorScan) -> NDArray[np.float32]:
     ranges[scan.ranges_m == 0] = -np.inf
     ranges[(ranges <= 0) & np.isfinite(ranges)] = -np.inf
     return ranges.astype(np.float32)
+
+
+def near_obstacles(scan: FloorScan) -> tuple[NDArray[np.float32], float]:
+    """Return how far away something stands or walks per bearing, (N,) in metres, inf where nothing
+    is known to, and how far that is told: as far as its error, one sigma, is half a cell.
+    """
+    reach_m = scan.range_max_m * math.sqrt(CELL_M / 2 / RANGE_MAX_ERROR_M)
+    measured = [one for one in (scan.obstacle_m, scan.movable_m) if one is not None]
+    nearest = np.fmin.reduce([np.full(len(scan.ranges_m), np.inf, np.float32), *measured])
+    return np.where(nearest < reach_m, nearest, np.inf).astype(np.float32), reach_m
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ occupancy grid, saved maps or parts of one, and which map a keyframe belongs to.
 from __future__ import annotations
 
 import array
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -31,7 +32,7 @@ from segfloor_ros.cloud import LabelledPoints
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import Grey
 from segfloor_ros.files.results import FORMAT, MapFile, from_bytes, to_bytes
-from segfloor_ros.floor.observation import FloorObservation, FloorScan, free_ranges
+from segfloor_ros.floor.observation import FloorObservation, FloorScan, free_ranges, near_obstacles
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.messages.topics import make_header, to_ns, to_time
 from segfloor_ros.slam.results import KeyframeFeatures, MovingPoints, SparseCloud
@@ -407,10 +408,17 @@ def free_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserSca
     """Return how far the floor is free per bearing, in the base's plane, for a costmap to clear:
     see `free_ranges`.
     """
-    message = scan_message(stamp_ns, frame_id, scan)
-    message.ranges = array.array('f', free_ranges(scan).tobytes())
-    message.intensities = array.array('f')
-    return message
+    free = replace(scan, ranges_m=free_ranges(scan), obstacle_m=None, movable_m=None)
+    return scan_message(stamp_ns, frame_id, free)
+
+
+def obstacle_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
+    """Return what is near per bearing, in the base's plane, for a costmap to mark: see
+    `near_obstacles`.
+    """
+    ranges, reach_m = near_obstacles(scan)
+    near = replace(scan, ranges_m=ranges, obstacle_m=None, range_max_m=reach_m, movable_m=None)
+    return scan_message(stamp_ns, frame_id, near)
 
 
 def scan_arrays(message: LaserScan, topic: str) -> FloorScan:

@@ -241,6 +241,7 @@ _ALL = [
     Topic('keyframe/v_disparity', Image, KEYFRAMES, FLOOR),
     Topic('keyframe/floor_scan', LaserScan, KEYFRAMES, FLOOR, (GRID, MASKS)),
     Topic('scan', LaserScan, KEYFRAMES, FLOOR),
+    Topic('obstacle_scan', LaserScan, KEYFRAMES, FLOOR),
     Topic('labelled_points', PointCloud2, KEYFRAMES, CLOUD, (GRID,)),
     Topic('floor_points', PointCloud2, KEYFRAMES, CLOUD),
     Topic('obstacle_points', PointCloud2, KEYFRAMES, CLOUD),

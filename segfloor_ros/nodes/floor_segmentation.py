@@ -19,6 +19,7 @@ from segfloor_ros.messages.arrays import (
     free_scan_message,
     grey8_image,
     image_message,
+    obstacle_scan_message,
     right_image,
     scan_message,
 )
@@ -36,11 +37,12 @@ from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
 
 POSE = 'keyframe/odometry'
+FRAME_SCANS = {'scan': free_scan_message, 'obstacle_scan': obstacle_scan_message}
 
 
-class FreeScan:
-    """Publishes `scan` while someone listens: of the newest frame that has come, from small images,
-    so that it keeps up with the camera.
+class FrameScan:
+    """Publishes `scan` and `obstacle_scan` while someone listens: of the newest frame that came,
+    from small images, so that they keep up with the camera.
 
     mount: returns that of the camera and None while it is not known.
     """
@@ -59,7 +61,7 @@ class FreeScan:
         self._newest: tuple[int, dict[str, Any]] | None = None
 
     def _is_wanted(self) -> bool:
-        return self._node.outputs.listeners('scan') > 0
+        return any(self._node.outputs.listeners(name) for name in FRAME_SCANS)
 
     def _take(self, stamp_ns: int, parts: dict[str, Any]) -> None:
         self._newest = stamp_ns, parts
@@ -81,8 +83,8 @@ class FreeScan:
             self._camera = camera
             self._stage = FloorSegmentation(camera, self._node.settings)
         floor = self._stage.process(left, right, mount)
-        message = free_scan_message(stamp_ns, base_frame, floor.scan)
-        self._node.outputs.publish('scan', message)
+        for name, message_of in FRAME_SCANS.items():
+            self._node.outputs.publish(name, message_of(stamp_ns, base_frame, floor.scan))
 
 
 class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
@@ -97,7 +99,7 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
         self.mount: Mount | None = None
         self._mount_stamp_ns = 0
         self._base_frame = ''
-        self._free_scan = FreeScan(self, self._known_mount)
+        self._frame_scan = FrameScan(self, self._known_mount)
         self.inputs.subscribe('camera_mount', self._take_mount)
         parts = (*KEYFRAME_PARTS, POSE)
         self._keyframes = KeyframeJoin(
@@ -110,13 +112,13 @@ class FloorSegmentationNode(StageNode[FloorSegmentationNodeSettings]):
 
     def reset_stage(self) -> None:
         """Begin anew."""
-        self._free_scan.reset()
+        self._frame_scan.reset()
         self._camera: StereoCamera | None = None
         self._stage: FloorSegmentation | None = None
 
     def on_settings_changed(self) -> None:
         """Segment the next keyframe with the new settings, and with what is remembered."""
-        self._free_scan.reset()
+        self._frame_scan.reset()
         if self._stage is not None:
             self._stage.change_settings(self.settings)
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from costmap import Costmap
 from stereo_room import CAMERA, MOUNT, ROOM_MAX, ROOM_MIN, StereoRoom, planar_pose
 
 from segfloor_ros.camera.images import shrink_factor, shrunk_camera, shrunk_image
-from segfloor_ros.floor.observation import CELL_M, FloorScan, FloorSegmentationSettings, free_ranges
+from segfloor_ros.floor.observation import (
+    CELL_M,
+    FloorScan,
+    FloorSegmentationSettings,
+    free_ranges,
+    near_obstacles,
+)
 from segfloor_ros.floor.segmentation import FloorSegmentation
 
 NAN, INF = float('nan'), float('inf')
@@ -24,6 +32,23 @@ def test_ranges_are_as_rep_117_has_them() -> None:
     sigma_m = 0.3 * (2.0 / 4.0) ** 2
     expected = [2.0, 2.0 - sigma_m - CELL_M, -INF, NAN, INF, -INF]
     np.testing.assert_allclose(free_ranges(scan), expected, rtol=1e-6)
+
+
+def test_what_is_near_is_told_as_far_as_it_is_known_to_half_a_cell() -> None:
+    scan = FloorScan(
+        0.0, 0.1,
+        np.array([0.0, 0.0, NAN, 1.0, 2.0], np.float32),
+        np.array([1.0, NAN, NAN, 1.4, 1.5], np.float32),
+        range_max_m=5.0,
+        movable_m=np.array([0.8, 0.9, NAN, 1.5, NAN], np.float32),
+    )  # fmt: skip
+    ranges, reach_m = near_obstacles(scan)
+    assert scan.error_per_m * reach_m**2 == pytest.approx(CELL_M / 2)
+    assert 1.4 < reach_m < 1.5
+    np.testing.assert_allclose(ranges, [0.8, 0.9, INF, 1.4, INF], rtol=1e-6)
+    ends = replace(scan, ranges_m=ranges).ends()
+    np.testing.assert_allclose(np.hypot(*ends.T[:2]), [0.8, 0.9, 1.4], rtol=1e-6)
+    np.testing.assert_allclose(ends[2], [1.4 * np.cos(0.3), 1.4 * np.sin(0.3), 0.0], rtol=1e-6)
 
 
 def test_a_shrunk_camera_sees_a_point_where_its_pixel_has_gone() -> None:

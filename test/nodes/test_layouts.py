@@ -150,9 +150,11 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert parameters['static_layer.map_subscribe_transient_local'] is True
         assert parameters['obstacle_layer.obstacles.topic'] == '/obstacle_points'
         assert parameters['obstacle_layer.obstacles.data_type'] == 'PointCloud2'
-        assert parameters['obstacle_layer.moving.topic'] == '/moving_points'
-        assert parameters['obstacle_layer.moving.marking'] is True
-        assert parameters['obstacle_layer.observation_sources'] == 'obstacles moving floor'
+        assert parameters['obstacle_layer.near.topic'] == '/obstacle_scan'
+        near = 'marking', 'clearing', 'data_type'
+        values = [parameters[f'obstacle_layer.near.{name}'] for name in near]
+        assert values == [True, False, 'LaserScan']
+        assert parameters['obstacle_layer.observation_sources'] == 'obstacles near floor'
         floor = {
             name.removeprefix('obstacle_layer.floor.'): value
             for name, value in parameters.items()
@@ -163,7 +165,7 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert (floor['clearing'], floor['marking'], floor['inf_is_valid']) == (True, False, True)
     monitor = nav2_node('collision_monitor')
     assert monitor['source_timeout'] > 2 * FRESH_S
-    assert monitor['moving.source_timeout'] == 0.0, 'nothing comes where nothing is looked for'
+    assert (monitor['near.topic'], monitor['near.type']) == ('/obstacle_scan', 'scan')
     assert nav2_node('planner_server')['planner_plugins'] == ['GridBased']
 
 

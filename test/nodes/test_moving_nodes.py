@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +23,7 @@ from segfloor_ros.messages.arrays import (
     free_scan_message,
     grey8_image,
     image_message,
-    moving_points_message,
+    obstacle_scan_message,
     rectified_calibration,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
@@ -36,7 +37,6 @@ from segfloor_ros.navigation import Body, Explorer
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import MovingPoints
 from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -122,22 +122,23 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
     explorer = Explorer(Body(0.3, 0.5, 0.3, 1.0), 0)
     found = Exploration((0.0, 0.0, 0.0))
     pilot = Pilot(SimpleNamespace(recorder=graph.tester), explorer, found, lambda *_: None)
-    clouds = graph.collect('moving_points')
-    walking = MovingPoints(np.array([[2.0, 0.2, 0.4]]), np.full((1, 3), np.nan))
-    publish(graph, {'moving_points': moving_points_message(STAMP_NS, 'map', walking)})
-    graph.until(lambda: clouds, 'what walks')
+    seen = replace(SCAN, ranges_m=SCAN.ranges_m.copy(), range_max_m=5.0)
+    seen.ranges_m[3] = 1.2
+    legs = replace(seen, obstacle_m=np.where(seen.ranges_m < 1.5, seen.ranges_m, np.nan))
     answer = Status(STAMP_NS, 'stereo_slam', Level.OK, '', {'tracked': '1'})
     graph.tester.notes.answers[STAMP_NS] = answer
     publish(
         graph,
         {
             'pose': pose_with_covariance_message(STAMP_NS, 'map', AT_ORIGIN, zeros),
-            'scan': free_scan_message(STAMP_NS, 'base_link', SCAN),
+            'scan': free_scan_message(STAMP_NS, 'base_link', legs),
+            'obstacle_scan': obstacle_scan_message(STAMP_NS, 'base_link', legs),
             'ground_truth': odometry_message(STAMP_NS, 'world', 'base_link', AT_ORIGIN, zeros),
         },
     )
     graph.until(lambda: pilot.answer() or found.poses, 'a command')
-    np.testing.assert_allclose(explorer.obstacles, [[2.0, 0.2]], atol=1e-6)
+    place = [1.2 * np.cos(0.25), 1.2 * np.sin(0.25)]
+    np.testing.assert_allclose(explorer.obstacles, [place], atol=1e-6)
 
 
 def test_the_floor_is_not_told_of_what_moves(make_graph):

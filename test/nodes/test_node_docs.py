@@ -30,7 +30,10 @@ ALTERNATIVES = (
     ('-p', 'use_depth:=true'),
 )
 ON_DEMAND = {
-    'floor_segmentation': {'scan': 'frame/left/image_rect'},
+    'floor_segmentation': {
+        'scan': 'frame/left/image_rect',
+        'obstacle_scan': 'frame/left/image_rect',
+    },
     'cloud_labelling': {'obstacle_points': 'odometry'},
 }
 """By node: what must be listened to for what to be received."""

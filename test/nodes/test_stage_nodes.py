@@ -29,7 +29,7 @@ from stereo_room import CAMERA, MOUNT
 from segfloor_ros.camera.images import eye_calibration
 from segfloor_ros.camera.model import Mount
 from segfloor_ros.cloud import FLOOR, CloudLabelling, CloudLabellingSettings
-from segfloor_ros.floor.observation import FloorSegmentationSettings, free_ranges
+from segfloor_ros.floor.observation import FloorSegmentationSettings, free_ranges, near_obstacles
 from segfloor_ros.floor.segmentation import FloorSegmentation
 from segfloor_ros.geometry import invert
 from segfloor_ros.grid.map_file import OccupancyGridSettings, load_map
@@ -383,6 +383,20 @@ class TestFreeScan:
         assert to_ns(scans[0].header.stamp) == frame.stamp_ns
         ahead = scans[0].ranges[np.argmin(np.abs(expected.bearings_rad))]
         assert ahead > 3.0, 'the room is open ahead'
+
+    def test_who_only_wants_what_is_near_is_told_it(self, make_graph) -> None:
+        (frame, *_), _ = room_drive(1)
+        graph = make_graph()
+        node, near = graph.add(FloorSegmentationNode()), graph.collect('obstacle_scan')
+        mount = transform_message(0, 'base_link', 'left', MOUNT.T_base_left)
+        publishers = publish(graph, {'camera_mount': mount})
+        graph.until(lambda: node.mount is not None, 'the mount')
+        publish(graph, self.frame_messages(frame), publishers)
+        graph.until(lambda: near, 'what is near')
+        stage = FloorSegmentation(CAMERA, FloorSegmentationSettings())
+        expected, reach_m = near_obstacles(stage.process(frame.left, frame.right, MOUNT).scan)
+        np.testing.assert_array_equal(np.array(near[0].ranges), expected)
+        assert near[0].range_max == pytest.approx(reach_m) and not near[0].intensities
 
     def test_it_follows_the_parameters_as_they_are_now(self, make_graph) -> None:
         (frame, *_), _ = room_drive(1)
