@@ -62,7 +62,7 @@ from segfloor_ros.messages.topics import (
     stamp_of,
     to_ns,
 )
-from segfloor_ros.navigation import Body, Explorer, Goal
+from segfloor_ros.navigation import STOP, Body, Explorer, Goal
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.simulation.robot import DrivenRobot, Robot, open_robot
 from segfloor_ros.simulation.scene_file import open_scene
@@ -76,6 +76,10 @@ FILES = (GOALS, SAVED, 'map.pgm', 'map.yaml', 'true_map.pgm', 'true_map.yaml', '
 
 CRUISE_M_S, TURN_RAD_S = 0.4, 0.6
 """No faster, whatever the robot can: SLAM follows these surely."""
+
+STANDING_S = 3.0
+"""So long the robot stands at first, as any does while it starts: SLAM learns the bias of its
+gyroscope."""
 
 GIVEN = ('height_m', 'pitch_rad', 'roll_rad', 'forward_m', 'left_m')
 """Of the mount of the camera: what SLAM is given."""
@@ -210,7 +214,9 @@ class Pilot:
             standing = np.vstack([self._obstacles, transform_points(T_map_base, seen)])
             self._explorer.take_obstacles(standing, scan, T_map_base)
         ended = len(self._explorer.ended)
-        forward, turn = self._explorer.step(1e-9 * stamp_ns, T_map_base)
+        time_s = 1e-9 * stamp_ns
+        stands = time_s < STANDING_S
+        forward, turn = STOP if stands else self._explorer.step(time_s, T_map_base)
         for goal in self._explorer.ended[ended:]:
             self.found.goals.append((goal, self.found.true_poses[stamp_ns]))
         twist = Twist(linear=Vector3(x=float(forward)), angular=Vector3(z=float(turn)))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from command_line import segfloor
 
+from segfloor_ros.cli.explore_session import STANDING_S
 from segfloor_ros.trajectory import read_trajectory
 
 pytestmark = pytest.mark.skipif(find_spec('mujoco') is None, reason='the extra sim')
@@ -87,6 +88,9 @@ def test_a_robot_maps_a_chamber_and_drives_to_a_goal(tmp_path) -> None:
     assert found['bumps'] == 0
     assert (found['goals_reached'], found['goals_total']) == (1, 1)
     assert found['path_rmse_m'] < 0.02
+    times_s, poses = read_trajectory(out / 'ground_truth.txt')
+    way_m = np.hypot(*(poses[:, :2, 3] - poses[0, :2, 3]).T)
+    assert way_m[times_s <= STANDING_S].max() < 0.005 < way_m.max(), 'it stands at first'
 
 
 @pytest.mark.slow
