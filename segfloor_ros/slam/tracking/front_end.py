@@ -39,7 +39,14 @@ from segfloor_ros.slam.tracking.images import FeatureExtractor, Features, Images
 from segfloor_ros.slam.tracking.map_tracking import Follower, LocalMap, Tracker
 from segfloor_ros.slam.tracking.motion import CameraMotion, ImageRotation, TrackingState, sigma_m
 from segfloor_ros.slam.tracking.patch_alignment import GREY_NOISE, count_firm, with_patch_noise
-from segfloor_ros.slam.tracking.pose import MIN_FOUND, PoseInformation, differ
+from segfloor_ros.slam.tracking.pose import (
+    FIRST_INFORMATION,
+    MIN_FOUND,
+    PoseEstimate,
+    differ,
+    knows_more,
+    refine_pose,
+)
 from segfloor_ros.timing import timed
 
 MIN_EXPECTED_SHIFT = 0.004
@@ -149,8 +156,9 @@ class FrontEnd:
             self.follower.reset()
             return None
         if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
-            covariance = _information(self._map, track, images).covariance(track.T_camera_world)
-            track = replace(track, sigma_m=sigma_m(covariance))
+            nothing = replace(track.estimate, covariance=np.diag(1 / FIRST_INFORMATION))
+            by_patches = self._with_prior(track, images, nothing)
+            track = replace(track, sigma_m=sigma_m(by_patches.covariance))
         T_seen = track.T_camera_world
         track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
         self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
@@ -186,12 +194,16 @@ class FrontEnd:
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
             return replace(track, prior=None, is_prior_better=False)
-        information = _information(self._map, track, images)
-        return replace(
-            track,
-            estimate=information.fused(track.estimate, prior),
-            is_prior_better=information.is_prior_better(track.T_camera_world, prior),
-        )
+        fused = self._with_prior(track, images, prior)
+        return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
+
+    def _with_prior(self, track: Track, images: Images, prior: PoseEstimate) -> PoseEstimate:
+        """Return the pose by what a track shows, as sure as its patches are, and a prior."""
+        seen = track.observations.without_offset(self._map.rig.offset.value_px)
+        seen = with_patch_noise(images.left, seen.with_noise_factor(track.estimate.noise_factor))
+        points = self._map.xyz_world[track.point_ids]
+        found = refine_pose(self._camera, track.T_camera_world, points, seen, prior=prior)
+        return replace(found, inliers=track.estimate.inliers)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -341,16 +353,6 @@ def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
         if live.mean() < MOST:
             return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
     return ''
-
-
-def _information(sparse_map: SparseMap, track: Track, images: Images) -> PoseInformation:
-    return PoseInformation(
-        sparse_map.rig.camera,
-        images.left,
-        sparse_map.xyz_world[track.point_ids],
-        track.observations.without_offset(sparse_map.rig.offset.value_px),
-        track.estimate.noise_factor,
-    )
 
 
 def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:

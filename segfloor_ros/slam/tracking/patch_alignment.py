@@ -401,14 +401,13 @@ def count_firm(image: NDArray[Any], uv_px: Array) -> int:
 
 
 def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observations:
-    """Return observations (N) whose pixels have at least the noise that the patches of a grey image
-    (H, W) around them allow: on an edge, that along it.
+    """Return observations (N) that have at least the noise that the patches of a grey image (H, W)
+    around them allow: on an edge, that along it.
     """
-    shift = _shift_information(image, observations.uvd_px[:, :2])
-    variance = np.linalg.inv(shift + LEAST_SHIFT * np.eye(2))
-    sigma = observations.sigma_px.copy()
-    sigma[:, :2] = np.maximum(sigma[:, :2], np.sqrt(np.einsum('nii->ni', variance)))
-    return replace(observations, sigma_px=sigma)
+    shift = _shift_information(image, observations.uvd_px[:, :2]) + LEAST_SHIFT * np.eye(2)
+    variance = np.einsum('nii->ni', np.linalg.inv(shift))
+    least = np.sqrt(np.column_stack([variance, 1 / shift[:, 0, 0]]))
+    return replace(observations, sigma_px=np.maximum(observations.sigma_px, least))
 
 
 def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -29,11 +28,8 @@ from segfloor_ros.slam.rig import (
     is_gated,
     residuals,
     squared_norms,
-    weighted_jacobian,
-    with_moment,
 )
 from segfloor_ros.slam.sparse_map import SparseMap
-from segfloor_ros.slam.tracking.patch_alignment import LEAST_SHIFT, _shift_information
 from segfloor_ros.timing import timed
 
 ROUNDS, STEPS_PER_ROUND = 3, 6
@@ -117,31 +113,65 @@ def refine_pose(
     points_world: Array,
     observations: Observations,
     max_noise_factor: float = MAX_NOISE_FACTOR,
+    prior: PoseEstimate | None = None,
 ) -> PoseEstimate:
     """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
     between rounds.
 
     points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
     and a poor calibration make errors larger than the sigmas of single measurements; the median
-    residual shows by how much, and the bound on outliers follows it.
+    residual shows by how much, and the bound on outliers follows it. prior: the pose by other
+    sensors; it adds what the points do not determine.
     """
     seen = _Seen.of(camera, points_world, observations)
     inliers = np.ones(len(points_world), bool)
+    if prior is not None and not len(points_world):
+        return replace(prior, inliers=inliers)
+    known = _Prior() if prior is None else _Prior.of(prior)
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
-        pose = _minimise(pose, seen.take(inliers))
+        pose = _minimise(pose, seen.take(inliers), known.among(factor))
         rays, _, chi2 = seen.at(pose)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
         middle = float(np.median(chi2 / seen.median))
         factor = math.sqrt(min(max(middle, 1.0), max_noise_factor**2))
         before, inliers = inliers, chi2 <= factor**2 * seen.limit
-        if inliers.sum() < 4 or (inliers != before).mean() < SAME_INLIERS:
+        is_enough = prior is not None or inliers.sum() >= 4
+        if not is_enough or (inliers != before).mean() < SAME_INLIERS:
             break
-    if inliers.sum() < 4:
+    if not is_enough:
         return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
     # Huber's weight of an inlier is 1.
     J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
-    return PoseEstimate(pose, inliers, np.linalg.pinv(J @ J.T, hermitian=True), factor)
+    covariance = np.linalg.pinv(J @ J.T + known.information, hermitian=True)
+    return PoseEstimate(pose, inliers, covariance, factor)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """What is known of a pose before any point is seen, nothing by default. T_world_camera:
+    (4, 4). information: (6, 6) of the twist.
+    """
+
+    T_world_camera: Array | None = None
+    information: Array | float = 0.0
+
+    @staticmethod
+    def of(estimate: PoseEstimate) -> _Prior:
+        """Return what another estimate tells."""
+        return _Prior(invert(estimate.T_camera_world), np.linalg.inv(estimate.covariance))
+
+    def among(self, noise_factor: float) -> _Prior:
+        """Return what it counts among points whose standard deviations are too small."""
+        return replace(self, information=self.information * noise_factor**2)
+
+    def at(self, T_camera_world: Array) -> tuple[Array | float, float]:
+        """Return the gradient (6,) of half the squared error of a pose, and that squared error."""
+        if self.T_world_camera is None:
+            return 0.0, 0.0
+        error = se3_log(T_camera_world @ self.T_world_camera)
+        gradient = self.information @ error
+        return gradient, float(error @ gradient)
 
 
 def squared_distances(
@@ -232,14 +262,15 @@ class _Seen:
         return J.reshape(6, -1)
 
 
-def _minimise(pose: Array, seen: _Seen) -> Array:
+def _minimise(pose: Array, seen: _Seen, prior: _Prior) -> Array:
     damping = 1e-4
     rays, residual, chi2 = seen.at(pose)
-    cost = huber_cost(chi2, seen.limit)
+    pull, strain = prior.at(pose)
+    cost = huber_cost(chi2, seen.limit) + strain
     for _ in range(STEPS_PER_ROUND):
         root = np.sqrt(huber_weights(chi2, seen.limit))
         J = seen.jacobian(rays, root)
-        H, g = J @ J.T, J @ (residual * root).ravel()
+        H, g = J @ J.T + prior.information, J @ (residual * root).ravel() + pull
         diagonal = H.ravel()[::7]
         diagonal += damping * (diagonal + 1e-9)
         step = np.linalg.solve(H, -g)
@@ -247,10 +278,11 @@ def _minimise(pose: Array, seen: _Seen) -> Array:
         if -g @ step < CONVERGED * cost:
             return candidate
         trial = seen.at(candidate)
-        trial_cost = huber_cost(trial[2], seen.limit)
+        trial_pull, strain = prior.at(candidate)
+        trial_cost = huber_cost(trial[2], seen.limit) + strain
         if trial_cost <= cost:
             converged = cost - trial_cost < CONVERGED * cost
-            pose, (rays, residual, chi2), cost = candidate, trial, trial_cost
+            pose, (rays, residual, chi2), pull, cost = candidate, trial, trial_pull, trial_cost
             damping *= 0.2
             if converged:
                 break
@@ -259,64 +291,13 @@ def _minimise(pose: Array, seen: _Seen) -> Array:
     return pose
 
 
-class PoseInformation:
-    """What points (N, 3) of the world, seen in a grey image (H, W), say of its pose."""
-
-    def __init__(
-        self,
-        camera: StereoCamera,
-        image: NDArray[Any],
-        points_world: Array,
-        observations: Observations,
-        noise_factor: float = 1.0,
-    ) -> None:
-        self._camera = camera
-        self._points = points_world
-        self._observations = observations
-        shift = _shift_information(image, observations.uvd_px[:, :2])
-        variance = np.where(np.isnan(observations.uvd_px), np.inf, observations.sigma_px**2)
-        self._weight: Array = np.zeros((len(points_world), 3, 3))
-        self._weight[:, :2, :2] = shift @ np.linalg.inv(np.eye(2) + variance[:, :2, None] * shift)
-        self._weight[:, 2, 2] = 1 / (1 / np.maximum(shift[:, 0, 0], LEAST_SHIFT) + variance[:, 2])
-        self._weight /= noise_factor**2
-
-    def covariance(self, T_camera_world: Array) -> Array:
-        """Return the covariance (6, 6) of the twist of a pose (4, 4), translation first."""
-        information, _ = self._normal_equations(T_camera_world)
-        return np.asarray(np.linalg.inv(information + np.diag(FIRST_INFORMATION)))
-
-    def is_prior_better(self, T_camera_world: Array, prior: PoseEstimate) -> bool:
-        """Whether a prior knows some direction of a pose (4, 4) better than the points do."""
-        covariance, known = self.covariance(T_camera_world), np.linalg.inv(prior.covariance)
-        return bool(np.linalg.eigvals(covariance @ known).real.max() > 1)
-
-    def fused(self, seen: PoseEstimate, prior: PoseEstimate) -> PoseEstimate:
-        """Return the likeliest pose with a prior, near the one of the points alone: the prior
-        adds what edges do not determine.
-        """
-        pose, known = seen.T_camera_world, np.linalg.inv(prior.covariance)
-        for _ in range(ROUNDS):
-            information, gradient = self._normal_equations(pose)
-            gradient += known @ se3_log(pose @ invert(prior.T_camera_world))
-            covariance = np.linalg.inv(information + known)
-            pose = se3_exp(-covariance @ gradient) @ pose
-        return replace(seen, T_camera_world=pose, covariance=covariance)
-
-    def _normal_equations(self, T_camera_world: Array) -> tuple[Array, Array]:
-        """Return the information (6, 6) of the twist of a pose (4, 4), and the gradient (6,) of
-        half the squared error.
-        """
-        points = transform_points(T_camera_world, self._points)
-        points[:, 2] = np.maximum(points[:, 2], MIN_DEPTH_M)
-        J = with_moment(
-            points.T, weighted_jacobian(self._camera, points, np.ones((3, len(points))))
-        )
-        weighted = np.einsum('ian,nab->ibn', J, self._weight)
-        residual = residuals(self._camera, points, self._observations)
-        return (
-            np.einsum('ibn,jbn->ij', weighted, J, optimize=True),
-            np.einsum('ibn,nb->i', weighted, residual),
-        )
+def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
+    """Whether a prior knows some direction of a pose better than the points with which it was
+    fused.
+    """
+    known = np.linalg.inv(prior.covariance)
+    by_points = np.linalg.inv(fused.covariance) - known + np.diag(FIRST_INFORMATION)
+    return bool(np.linalg.eigvals(np.linalg.solve(by_points, known)).real.max() > 1)
 
 
 @dataclass(frozen=True)

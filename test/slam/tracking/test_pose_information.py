@@ -11,7 +11,7 @@ from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.stereo_slam import StereoSlam
 from segfloor_ros.slam.tracking.patch_alignment import with_patch_noise
-from segfloor_ros.slam.tracking.pose import PoseEstimate, PoseInformation
+from segfloor_ros.slam.tracking.pose import FIRST_INFORMATION, PoseEstimate, knows_more, refine_pose
 
 RNG = np.random.default_rng(3)
 START = RNG.bit_generator.state
@@ -30,17 +30,21 @@ def noisy(image):
     return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
 
-def information(image, uv_px, depth_m=2.0):
-    """Return what points in one plane measure, seen where they are from the origin."""
+NOTHING = PoseEstimate(np.eye(4), np.zeros(0, bool), np.diag(1 / FIRST_INFORMATION), 1.0)
+
+
+def fused(image, uv_px, prior=NOTHING, depth_m=2.0):
+    """Return the pose by points in one plane, seen where they are from the origin, and a prior."""
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
     sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
-    return PoseInformation(CAMERA, image, points, sure)
+    noisy = with_patch_noise(image, sure)
+    return refine_pose(CAMERA, np.eye(4), points, noisy, prior=prior)
 
 
 def sigmas_m(image, uv_px):
     """Return the standard deviations of the place along x, y and z."""
-    return np.sqrt(np.diag(information(image, uv_px).covariance(np.eye(4))))[:3]
+    return np.sqrt(np.diag(fused(image, uv_px).covariance))[:3]
 
 
 def anywhere(count):
@@ -53,7 +57,7 @@ def test_points_on_an_edge_determine_nothing_along_it(contrast, slope):
     image = noisy(np.where(U - MIDDLE[0] > slope * (V - MIDDLE[1]), 100 + contrast, 100.0))
     rows = np.arange(30, CAMERA.height - 30, 2)
     on_edge = np.stack([MIDDLE[0] + slope * (rows - MIDDLE[1]), rows], axis=1)
-    covariance = information(image, on_edge).covariance(np.eye(4))[:3, :3]
+    covariance = fused(image, on_edge).covariance[:3, :3]
     along = np.array([slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
     assert np.sqrt(along @ covariance @ along) > 0.03
 
@@ -87,29 +91,27 @@ def test_what_edges_do_not_determine_the_prior_does():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
     rows = np.arange(30.0, CAMERA.height - 30, 12)
     on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
-    measured = information(image, on_edge)
     off = np.eye(4)
     off[:3, 3] = 0.01, 0.01, 0.0
     prior = PoseEstimate(off, np.zeros(0, bool), np.diag([0.005] * 3 + [1e-4] * 3) ** 2, 1.0)
-    seen = PoseEstimate(np.eye(4), np.ones(len(rows), bool), 1e-8 * np.eye(6), 1.0)
-    fused = measured.fused(seen, prior)
-    across_m, along_m = fused.T_camera_world[:2, 3]
+    found = fused(image, on_edge, prior)
+    across_m, along_m = found.T_camera_world[:2, 3]
     assert abs(across_m) < 0.001 and along_m == pytest.approx(0.01, abs=0.002)
-    sigma_m = np.sqrt(np.diag(fused.covariance))
+    sigma_m = np.sqrt(np.diag(found.covariance))
     assert sigma_m[0] < 0.001 and sigma_m[1] > 0.004
 
 
 def test_a_prior_is_outdone_where_points_know_every_direction_better():
     rows = np.arange(30.0, CAMERA.height - 30, 12)
     on_edge = np.stack([np.full(len(rows), MIDDLE[0]), rows], axis=1)
-    edge = information(noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge)
-    texture = information(noisy(RNG.uniform(60, 160, U.shape)), anywhere(300))
+    edge = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0)), on_edge
+    texture = noisy(RNG.uniform(60, 160, U.shape)), anywhere(300)
     none, wide = np.zeros(0, bool), np.diag([0.02] * 6) ** 2
     sure_of_turns = np.diag([0.02] * 3 + [1e-5] * 3) ** 2
     of_wheels, of_gyroscope = (PoseEstimate(np.eye(4), none, P, 1.0) for P in (wide, sure_of_turns))
-    assert edge.is_prior_better(np.eye(4), of_wheels)
-    assert not texture.is_prior_better(np.eye(4), of_wheels)
-    assert texture.is_prior_better(np.eye(4), of_gyroscope)
+    assert knows_more(of_wheels, fused(*edge, of_wheels))
+    assert not knows_more(of_wheels, fused(*texture, of_wheels))
+    assert knows_more(of_gyroscope, fused(*texture, of_gyroscope))
 
 
 def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
@@ -145,8 +147,10 @@ def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeyp
     seen = [result.state for frame in frames[:2] for result in slam.process(frame)]
     monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.PLENTY', 10_000)
     seen += [result.state for result in slam.process(frames[2])]
-    covariance = np.eye(6) * 0.02**2
-    monkeypatch.setattr(PoseInformation, 'covariance', lambda *_: covariance)
+    monkeypatch.setattr(
+        'segfloor_ros.slam.tracking.front_end.with_patch_noise',
+        lambda image, seen: seen.with_noise_factor(200.0),
+    )
     seen += [result.state for result in slam.process(frames[3])]
     assert seen[:3] == ['tracking'] * 3
-    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
+    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by')
