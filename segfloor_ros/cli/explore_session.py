@@ -207,7 +207,10 @@ class Pilot:
 
     def _command(self, stamp_ns: int) -> None:
         T_map_base = self._poses.pop(stamp_ns, None)
-        scan, near = (scans.pop(stamp_ns, None) for scans in (self._scans, self._near))
+        scan, near = (scans.get(stamp_ns) for scans in (self._scans, self._near))
+        for scans in (self._scans, self._near):
+            for older_ns in [ns for ns in scans if ns < stamp_ns]:
+                del scans[older_ns]
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
             seen = np.zeros((0, 3)) if near is None else near.ends()

@@ -115,9 +115,11 @@ def near_obstacles(scan: FloorScan) -> tuple[NDArray[np.float32], float]:
     is known to, and how far that is told: as far as its error, one sigma, is half a cell.
     """
     reach_m = scan.range_max_m * math.sqrt(CELL_M / 2 / RANGE_MAX_ERROR_M)
-    measured = [one for one in (scan.obstacle_m, scan.movable_m) if one is not None]
-    nearest = np.fmin.reduce([np.full(len(scan.ranges_m), np.inf, np.float32), *measured])
-    return np.where(nearest < reach_m, nearest, np.inf).astype(np.float32), reach_m
+    nearest = np.full(len(scan.ranges_m), np.inf, np.float32)
+    if scan.obstacle_m is not None:
+        near = scan.obstacle_m < reach_m
+        nearest[near] = scan.obstacle_m[near]
+    return nearest, reach_m
 
 
 @dataclass(frozen=True)

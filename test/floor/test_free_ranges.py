@@ -38,9 +38,8 @@ def test_what_is_near_is_told_as_far_as_it_is_known_to_half_a_cell() -> None:
     scan = FloorScan(
         0.0, 0.1,
         np.array([0.0, 0.0, NAN, 1.0, 2.0], np.float32),
-        np.array([1.0, NAN, NAN, 1.4, 1.5], np.float32),
+        np.array([0.8, 0.9, NAN, 1.4, 1.5], np.float32),
         range_max_m=5.0,
-        movable_m=np.array([0.8, 0.9, NAN, 1.5, NAN], np.float32),
     )  # fmt: skip
     ranges, reach_m = near_obstacles(scan)
     assert scan.error_per_m * reach_m**2 == pytest.approx(CELL_M / 2)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 from moving_drive import MovingDrive
 from node_messages import AT_ORIGIN, SCAN, STAMP_NS, pose_message_at, publish
-from stereo_room import CAMERA, MOUNT
+from stereo_room import CAMERA, MOUNT, planar_pose
 
 from segfloor_ros.camera.calibration.parameters import StereoRectifier
 from segfloor_ros.cli.explore_session import Pilot
@@ -117,7 +117,7 @@ def test_moving_points_tell_what_crosses_and_diagnostics_count_it(make_graph):
 
 
 def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
-    graph, zeros = make_graph(), np.zeros((6, 6))
+    graph, zeros, T_map_base = make_graph(), np.zeros((6, 6)), planar_pose(0.5, 0.0, 0.3)
     graph.tester.notes = DriveNotes(lambda: 0.0)
     explorer = Explorer(Body(0.3, 0.5, 0.3, 1.0), 0)
     found = Exploration((0.0, 0.0, 0.0))
@@ -130,14 +130,14 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
     publish(
         graph,
         {
-            'pose': pose_with_covariance_message(STAMP_NS, 'map', AT_ORIGIN, zeros),
+            'pose': pose_with_covariance_message(STAMP_NS, 'map', T_map_base, zeros),
             'scan': free_scan_message(STAMP_NS, 'base_link', legs),
             'obstacle_scan': obstacle_scan_message(STAMP_NS, 'base_link', legs),
             'ground_truth': odometry_message(STAMP_NS, 'world', 'base_link', AT_ORIGIN, zeros),
         },
     )
     graph.until(lambda: pilot.answer() or found.poses, 'a command')
-    place = [1.2 * np.cos(0.25), 1.2 * np.sin(0.25)]
+    place = [0.5 + 1.2 * np.cos(0.55), 1.2 * np.sin(0.55)]
     np.testing.assert_allclose(explorer.obstacles, [place], atol=1e-6)
 
 

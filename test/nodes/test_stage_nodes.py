@@ -352,7 +352,7 @@ def test_obstacles_are_published_while_the_robot_stands_and_is_tracked(make_grap
         assert message.data == obstacles[0].data
 
 
-class TestFreeScan:
+class TestFrameScan:
     """The scan of every tracked frame."""
 
     def frame_messages(self, frame):

@@ -199,11 +199,12 @@ class FrontEnd:
 
     def _with_prior(self, track: Track, images: Images, prior: PoseEstimate) -> PoseEstimate:
         """Return the pose by what a track shows, as sure as its patches are, and a prior."""
+        by_images, points = track.estimate, self._map.xyz_world[track.point_ids]
         seen = track.observations.without_offset(self._map.rig.offset.value_px)
-        seen = with_patch_noise(images.left, seen.with_noise_factor(track.estimate.noise_factor))
-        points = self._map.xyz_world[track.point_ids]
-        found = refine_pose(self._camera, track.T_camera_world, points, seen, prior=prior)
-        return replace(found, inliers=track.estimate.inliers)
+        seen = seen.with_noise_factor(by_images.noise_factor)
+        seen = with_patch_noise(images.left, seen, not images.depth_scale)
+        found = refine_pose(self._camera, by_images.T_camera_world, points, seen, 1.0, prior)
+        return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -332,7 +333,8 @@ def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) 
     """
     if not track.is_prior_better:
         return observed
-    return replace(observed, observations=with_patch_noise(images.left, observed.observations))
+    noisy = with_patch_noise(images.left, observed.observations, not images.depth_scale)
+    return replace(observed, observations=noisy)
 
 
 def _recognised(track: Track, ratio: float) -> bool:

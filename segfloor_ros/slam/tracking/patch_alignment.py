@@ -400,22 +400,17 @@ def count_firm(image: NDArray[Any], uv_px: Array) -> int:
     return int(np.minimum(counts, PER_CELL).sum())
 
 
-def with_patch_noise(image: NDArray[Any], observations: Observations) -> Observations:
+def with_patch_noise(
+    image: NDArray[Any], observations: Observations, is_matched: bool = True
+) -> Observations:
     """Return observations (N) that have at least the noise that the patches of a grey image (H, W)
-    around them allow: on an edge, that along it.
+    around them allow: on an edge, that along it; disparities only where they are matched.
     """
-    shift = _shift_information(image, observations.uvd_px[:, :2]) + LEAST_SHIFT * np.eye(2)
+    known, axes = _known_shift(image, observations.uvd_px[:, :2])
+    shift = (axes * known[:, None]) @ np.swapaxes(axes, 1, 2) + LEAST_SHIFT * np.eye(2)
     variance = np.einsum('nii->ni', np.linalg.inv(shift))
-    least = np.sqrt(np.column_stack([variance, 1 / shift[:, 0, 0]]))
+    least = np.sqrt(np.column_stack([variance, is_matched / shift[:, 0, 0]]))
     return replace(observations, sigma_px=np.maximum(observations.sigma_px, least))
-
-
-def _shift_information(image: NDArray[Any], uv_px: Array) -> Array:
-    """Return the information (N, 2, 2) in 1/px² that patches around pixels (N, 2) give of their
-    shift.
-    """
-    known, axes = _known_shift(image, uv_px)
-    return np.asarray((axes * known[:, None]) @ np.swapaxes(axes, 1, 2), np.float64)
 
 
 def _known_shift(image: NDArray[Any], uv_px: Array) -> tuple[Array, Array]:

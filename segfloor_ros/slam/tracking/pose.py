@@ -130,7 +130,7 @@ def refine_pose(
     known = _Prior() if prior is None else _Prior.of(prior)
     pose, factor = T_camera_world, 1.0
     for _ in range(ROUNDS):
-        pose = _minimise(pose, seen.take(inliers), known.among(factor))
+        pose = _minimise(pose, seen.take(inliers), known)
         rays, _, chi2 = seen.at(pose)
         chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
         middle = float(np.median(chi2 / seen.median))
@@ -160,10 +160,6 @@ class _Prior:
     def of(estimate: PoseEstimate) -> _Prior:
         """Return what another estimate tells."""
         return _Prior(invert(estimate.T_camera_world), np.linalg.inv(estimate.covariance))
-
-    def among(self, noise_factor: float) -> _Prior:
-        """Return what it counts among points whose standard deviations are too small."""
-        return replace(self, information=self.information * noise_factor**2)
 
     def at(self, T_camera_world: Array) -> tuple[Array | float, float]:
         """Return the gradient (6,) of half the squared error of a pose, and that squared error."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
@@ -10,6 +12,7 @@ from segfloor_ros.camera.model import WheelPose
 from segfloor_ros.slam.results import StereoSlamSettings
 from segfloor_ros.slam.rig import Observations
 from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.slam.tracking.front_end import FrontEnd
 from segfloor_ros.slam.tracking.patch_alignment import with_patch_noise
 from segfloor_ros.slam.tracking.pose import FIRST_INFORMATION, PoseEstimate, knows_more, refine_pose
 
@@ -38,8 +41,8 @@ def fused(image, uv_px, prior=NOTHING, depth_m=2.0):
     points = CAMERA.back_project(uv_px, np.full(len(uv_px), depth_m))
     disparity = np.full(len(uv_px), CAMERA.disparity_times_depth / depth_m)
     sure = Observations(np.column_stack([uv_px, disparity]), np.full((len(uv_px), 3), 0.01))
-    noisy = with_patch_noise(image, sure)
-    return refine_pose(CAMERA, np.eye(4), points, noisy, prior=prior)
+    measured = with_patch_noise(image, sure)
+    return refine_pose(CAMERA, np.eye(4), points, measured, 1.0, prior)
 
 
 def sigmas_m(image, uv_px):
@@ -133,6 +136,33 @@ def test_pixels_are_as_sure_with_wheels_as_without_where_the_images_know_more():
     assert median_sigma_px(wheels) < 1.1 * median_sigma_px([])
 
 
+def test_measured_depth_is_as_sure_on_an_edge_as_elsewhere():
+    image = noisy(np.where(V - MIDDLE[1] > 0, 150.0, 100.0))
+    sure = Observations(np.array([[*MIDDLE, 10.0]]), np.full((1, 3), 0.5))
+    by_images, by_depth = (with_patch_noise(image, sure, matched) for matched in (True, False))
+    assert by_images.sigma_px[0, 2] > 3.0 and by_depth.sigma_px[0, 2] == 0.5
+
+
+def test_a_prior_leaves_the_noise_of_the_images_as_it_is(monkeypatch):
+    weigh, weighed = FrontEnd._weighed, []
+
+    def weigh_blurred(front_end, track, images):
+        blurred = replace(track, estimate=replace(track.estimate, noise_factor=3.0))
+        weighed.append(weigh(front_end, blurred, images))
+        return weighed[-1]
+
+    monkeypatch.setattr(FrontEnd, '_weighed', weigh_blurred)
+    room, slam = StereoRoom(), StereoSlam(CAMERA, StereoSlamSettings(num_features=800), MOUNT)
+    frames = [room.frame(k, planar_pose(0.04 * k, 0, 0)) for k in range(4)]
+    for k in range(10):
+        slam.add(WheelPose(k * frames[1].stamp_ns // 2, planar_pose(0.02 * k, 0, 0)))
+    for frame in frames:
+        slam.process(frame)
+    fused = [track for track in weighed if track.prior is not None]
+    assert fused and all(track.estimate.noise_factor == 3.0 for track in fused)
+    assert all(track.estimate.covariance.trace() < 0.05**2 for track in fused)
+
+
 def test_a_pixel_on_an_edge_is_sure_across_it_alone():
     image = noisy(np.where(U - MIDDLE[0] > 0, 150.0, 100.0))
     uvd_px = np.array([[MIDDLE[0], MIDDLE[1], np.nan]])
@@ -149,7 +179,7 @@ def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeyp
     seen += [result.state for result in slam.process(frames[2])]
     monkeypatch.setattr(
         'segfloor_ros.slam.tracking.front_end.with_patch_noise',
-        lambda image, seen: seen.with_noise_factor(200.0),
+        lambda image, seen, is_matched: seen.with_noise_factor(200.0),
     )
     seen += [result.state for result in slam.process(frames[3])]
     assert seen[:3] == ['tracking'] * 3
