@@ -364,6 +364,8 @@ class SparseMap:
     def reset(self, num_ever: int = 0) -> None:
         """Begin again with an empty map. num_ever: the first stable id."""
         self.keyframes: list[KeyframeRecord] = []
+        self.first_poses: list[Array] = []
+        """T_camera_world (4, 4) of the keyframes as they came into the map."""
         self.loops: list[LoopEdge] = []
         self._retired: list[KeyframeRecord] = []
         self.points = PointRows(num_ever)
@@ -418,6 +420,7 @@ class SparseMap:
         """Add a keyframe; returns its features (N,) that show a point."""
         before = self.edges.point.base
         self.keyframes.append(keyframe)
+        self.first_poses.append(keyframe.T_camera_world.copy())
         self.edges.add(keyframe.point_id)
         has_moved = self.edges.point.base is not before
         self._bind(0 if has_moved else keyframe.index)

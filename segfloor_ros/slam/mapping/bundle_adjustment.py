@@ -15,9 +15,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from segfloor_ros.camera.model import StereoCamera, Up
-from segfloor_ros.geometry import Array, invert, se3_exp, transform_points, without_drift
+from segfloor_ros.geometry import (
+    Array,
+    invert,
+    make_transform,
+    se3_exp,
+    transform_points,
+    without_drift,
+)
 from segfloor_ros.slam.mapping.normal_equations import (
     Factors,
     Linearisation,
@@ -209,11 +217,13 @@ UNMOVED_M = 1e-6
 
 @dataclass(frozen=True)
 class MapCopy:
-    """The map as it was. T_camera_world: (K, 4, 4). xyz_world, stable_ids: (P,). point, keyframe,
-    row: (N,) observations. features: (K,) of the keyframes as measured.
+    """The map as it was. T_camera_world: (K, 4, 4), and first_poses, as they came into the map.
+    xyz_world, stable_ids: (P,). point, keyframe, row: (N,) observations. features: (K,) of the
+    keyframes as measured.
     """
 
     T_camera_world: Array
+    first_poses: list[Array]
     xyz_world: Array
     stable_ids: NDArray[np.int32]
     observer_count: NDArray[np.int32]
@@ -245,6 +255,7 @@ def copy_map(sparse_map: SparseMap, offset: OffsetEstimate, up_world: Up | None)
     keyframes = list(sparse_map.keyframes)
     return MapCopy(
         np.stack([k.T_camera_world for k in keyframes]),
+        list(sparse_map.first_poses),
         sparse_map.xyz_world.copy(),
         sparse_map.stable_id.copy(),
         sparse_map.observer_count.copy(),
@@ -261,12 +272,13 @@ def solve_global(
     camera: StereoCamera, copied: MapCopy, is_wanted: Callable[[], bool]
 ) -> GlobalResult | None:
     """Adjust the copy; safe on another thread. It ends early when it is no longer wanted. None for
-    a map of one view.
+    a map of one view. What was seen says nothing of where the map as a whole is: it stays where its
+    first ten keyframes that take part came into it, on average, weighted by what they show.
     """
     keyframe, point, row = _known_best(copied)
     count = np.bincount(keyframe, minlength=len(copied.records))
     enough = count >= ENOUGH
-    # The map turns about the keyframe that is held: not about one of which little is known.
+    # The one that is held is where all others begin: not one of which little is known.
     early = np.flatnonzero(enough)[:LOCAL_KEYFRAMES]
     held = int(np.argmax(count >= NEARLY_ALL * count[early].max(initial=0)))
     enough[held] = True
@@ -291,7 +303,29 @@ def solve_global(
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)
+    first = slot[early]
+    T_before = np.stack([copied.first_poses[k] for k in early])
+    M = _brought_back(adjusted.T_camera_world[first], T_before, count[early], copied.up_world)
+    adjusted = replace(
+        adjusted,
+        T_camera_world=adjusted.T_camera_world @ invert(M),
+        points_world=transform_points(M, adjusted.points_world),
+    )
     return GlobalResult(problem, adjusted, chosen, ids, copied.stable_ids[ids])
+
+
+def _brought_back(T_after: Array, T_before: Array, weights: Array, up_world: Up | None) -> Array:
+    """Return the motion (4, 4) of the world that brings cameras (N, 4, 4) back to where they were,
+    on average; where up is known, it turns about that alone.
+    """
+    world_after, world_before = invert(T_after), invert(T_before)
+    turns = Rotation.from_matrix(world_before[:, :3, :3] @ T_after[:, :3, :3])
+    turn = turns.mean(weights).as_rotvec()
+    if up_world is not None:
+        turn = turn @ up_world.direction * up_world.direction
+    R = Rotation.from_rotvec(turn).as_matrix()
+    off_m = world_before[:, :3, 3] - world_after[:, :3, 3] @ R.T
+    return make_transform(R, np.average(off_m, axis=0, weights=weights))
 
 
 def _known_best(copied: MapCopy) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
