@@ -303,9 +303,9 @@ def solve_global(
         factors_of(copied.records, slot, copied.up_world) + loop_factors(copied.loops, slot),
     )
     adjusted = adjust(camera, problem, is_wanted=is_wanted)
-    first = slot[early]
     T_before = np.stack([copied.first_poses[k] for k in early])
-    M = _brought_back(adjusted.T_camera_world[first], T_before, count[early], copied.up_world)
+    shown = count[early].astype(np.float64)
+    M = _brought_back(adjusted.T_camera_world[slot[early]], T_before, shown, copied.up_world)
     adjusted = replace(
         adjusted,
         T_camera_world=adjusted.T_camera_world @ invert(M),
