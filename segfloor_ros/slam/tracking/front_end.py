@@ -157,7 +157,7 @@ class FrontEnd:
             return None
         if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
             nothing = replace(track.estimate, covariance=np.diag(1 / FIRST_INFORMATION))
-            by_patches = self._with_prior(track, images, nothing)
+            by_patches = _with_prior(self._map, track, images, nothing)
             track = replace(track, sigma_m=sigma_m(by_patches.covariance))
         T_seen = track.T_camera_world
         track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
@@ -194,17 +194,8 @@ class FrontEnd:
         prior = track.prior
         if prior is None or differ(track.estimate, prior):
             return replace(track, prior=None, is_prior_better=False)
-        fused = self._with_prior(track, images, prior)
+        fused = _with_prior(self._map, track, images, prior)
         return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
-
-    def _with_prior(self, track: Track, images: Images, prior: PoseEstimate) -> PoseEstimate:
-        """Return the pose by what a track shows, as sure as its patches are, and a prior."""
-        by_images, points = track.estimate, self._map.xyz_world[track.point_ids]
-        seen = track.observations.without_offset(self._map.rig.offset.value_px)
-        seen = seen.with_noise_factor(by_images.noise_factor)
-        seen = with_patch_noise(images.left, seen, not images.depth_scale)
-        found = refine_pose(self._camera, by_images.T_camera_world, points, seen, 1.0, prior)
-        return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
 
     def bridge(self, frame: StereoFrame, fault: str) -> None:
         """Go on without the images, where the sensors allow it."""
@@ -325,6 +316,19 @@ class FrontEnd:
         self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
         self.local.move_to(ids, keyframe.T_camera_world)
         self.frames_since_keyframe = 0
+
+
+def _with_prior(
+    sparse_map: SparseMap, track: Track, images: Images, prior: PoseEstimate
+) -> PoseEstimate:
+    """Return the pose by what a track shows, as sure as its patches are, and a prior."""
+    by_images, points = track.estimate, sparse_map.xyz_world[track.point_ids]
+    seen = track.observations.without_offset(sparse_map.rig.offset.value_px)
+    seen = seen.with_noise_factor(by_images.noise_factor)
+    seen = with_patch_noise(images.left, seen, not images.depth_scale)
+    start, camera = by_images.T_camera_world, sparse_map.rig.camera
+    found = refine_pose(camera, start, points, seen, 1.0, prior)
+    return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
 
 
 def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) -> ObservedFeatures:
