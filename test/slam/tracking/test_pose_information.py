@@ -178,9 +178,9 @@ def test_a_pose_that_the_images_hardly_determine_is_said_to_be_uncertain(monkeyp
     monkeypatch.setattr('segfloor_ros.slam.tracking.front_end.PLENTY', 10_000)
     seen += [result.state for result in slam.process(frames[2])]
     monkeypatch.setattr(
-        'segfloor_ros.slam.tracking.front_end.with_patch_noise',
-        lambda image, seen, is_matched: seen.with_noise_factor(200.0),
+        'segfloor_ros.slam.tracking.front_end._with_prior',
+        lambda _, track, *__: replace(track.estimate, covariance=np.eye(6) * 0.02**2),
     )
     seen += [result.state for result in slam.process(frames[3])]
     assert seen[:3] == ['tracking'] * 3
-    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by')
+    assert seen[3].startswith('tracking: what is seen leaves the place uncertain by 2')
