@@ -54,6 +54,8 @@ PATIENCE_S, MOST_TRIES = 8.0, 3
 GOAL_TRIES = 6
 """A goal may lie where people come and go."""
 
+NOWHERE: Array = np.zeros((0, 3))
+
 OBSTACLE_REACH_M = 3.0
 """As `raytrace_max_range` of params/nav2.yaml."""
 
@@ -329,6 +331,7 @@ class Explorer:
         self._rng = np.random.default_rng(self.seed)
         self._ahead: list[Goal] = [] if isinstance(self.goals, int) else list(self.goals)
         self._driven: list[Array] = []
+        self._remembered = NOWHERE[:, :2]
         self._explores, self._is_drawn = self.phase == 'exploring', False
         self._given_up: list[tuple[Array, float]] = []
         self._target: Array | None = None
@@ -359,11 +362,14 @@ class Explorer:
         """The goal that is driven to."""
         return self._ahead[0] if self.phase == 'driving' and self._ahead else None
 
-    def take_obstacles(self, points: Array, scan: FloorScan | None, T_map_base: Array) -> None:
+    def take_obstacles(
+        self, points: Array, scan: FloorScan | None, T_map_base: Array, near: Array = NOWHERE
+    ) -> None:
         """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
         drop those on floor that a scan from a pose has seen to be free since, or under the robot.
+        near: points (M, 3) that are in the way now, and not remembered: some are wrong.
         """
-        known = np.vstack([self.obstacles, points[:, :2]])
+        known = np.vstack([self._remembered, points[:, :2]])
         cells = np.floor(known / CELL_M).astype(np.int64)
         known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
@@ -375,7 +381,8 @@ class Explorer:
             seen = (ray >= 0) & (ray < len(scan.ranges_m))
             free_m = np.nan_to_num(scan.ranges_m[np.clip(ray, 0, len(scan.ranges_m) - 1)])
             kept &= ~(seen & (away_m < free_m))
-        self.obstacles = known[kept]
+        self._remembered = known[kept]
+        self.obstacles = np.vstack([self._remembered, near[:, :2]])
 
     def step(self, time_s: float, T_map_base: Array | None) -> tuple[float, float]:
         """Return how to drive from now on, m/s and rad/s, by the pose (4, 4) of the base, None

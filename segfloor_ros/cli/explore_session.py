@@ -62,7 +62,7 @@ from segfloor_ros.messages.topics import (
     stamp_of,
     to_ns,
 )
-from segfloor_ros.navigation import STOP, Body, Explorer, Goal
+from segfloor_ros.navigation import NOWHERE, STOP, Body, Explorer, Goal
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.simulation.robot import DrivenRobot, Robot, open_robot
 from segfloor_ros.simulation.scene_file import open_scene
@@ -213,9 +213,8 @@ class Pilot:
                 del scans[older_ns]
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
-            seen = np.zeros((0, 3)) if near is None else near.ends()
-            standing = np.vstack([self._obstacles, transform_points(T_map_base, seen)])
-            self._explorer.take_obstacles(standing, scan, T_map_base)
+            now = NOWHERE if near is None else transform_points(T_map_base, near.ends())
+            self._explorer.take_obstacles(self._obstacles, scan, T_map_base, now)
         ended = len(self._explorer.ended)
         time_s = 1e-9 * stamp_ns
         stands = time_s < STANDING_S

@@ -150,11 +150,9 @@ def test_nav2_gets_its_parameters_under_the_names_of_its_nodes(nav2_node) -> Non
         assert parameters['static_layer.map_subscribe_transient_local'] is True
         assert parameters['obstacle_layer.obstacles.topic'] == '/obstacle_points'
         assert parameters['obstacle_layer.obstacles.data_type'] == 'PointCloud2'
-        assert parameters['obstacle_layer.near.topic'] == '/obstacle_scan'
-        near = 'marking', 'clearing', 'data_type'
-        values = [parameters[f'obstacle_layer.near.{name}'] for name in near]
-        assert values == [True, False, 'LaserScan']
-        assert parameters['obstacle_layer.observation_sources'] == 'obstacles near floor'
+        assert parameters['obstacle_layer.moving.topic'] == '/moving_points'
+        assert parameters['obstacle_layer.moving.marking'] is True
+        assert parameters['obstacle_layer.observation_sources'] == 'obstacles moving floor'
         floor = {
             name.removeprefix('obstacle_layer.floor.'): value
             for name, value in parameters.items()

@@ -33,7 +33,7 @@ from segfloor_ros.messages.poses import (
     transform_message,
 )
 from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.navigation import Body, Explorer
+from segfloor_ros.navigation import NOWHERE, Body, Explorer
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -139,6 +139,8 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
     graph.until(lambda: pilot.answer() or found.poses, 'a command')
     place = [0.5 + 1.2 * np.cos(0.55), 1.2 * np.sin(0.55)]
     np.testing.assert_allclose(explorer.obstacles, [place], atol=1e-6)
+    explorer.take_obstacles(NOWHERE, None, T_map_base)
+    assert not len(explorer.obstacles), 'it is not remembered'
 
 
 def test_the_floor_is_not_told_of_what_moves(make_graph):
