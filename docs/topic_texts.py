@@ -98,7 +98,7 @@ ABOUT = {
     ),
     'obstacle_scan': (
         'How far away something stands or walks per bearing at every tracked frame, in the '
-        "base's plane (m), for a costmap to mark; inf: nothing within `range_max`, as far as its "
+        "base's plane (m), for a collision monitor; inf: nothing within `range_max`, as far as its "
         'error is half a cell. Published while someone listens.'
     ),
     'labelled_points': (

@@ -413,7 +413,7 @@ def free_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserSca
 
 
 def obstacle_scan_message(stamp_ns: int, frame_id: str, scan: FloorScan) -> LaserScan:
-    """Return what is near per bearing, in the base's plane, for a costmap to mark: see
+    """Return what is near per bearing, in the base's plane, for a collision monitor: see
     `near_obstacles`.
     """
     ranges, reach_m = near_obstacles(scan)
