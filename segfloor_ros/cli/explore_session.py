@@ -31,6 +31,7 @@ from segfloor_ros.configuration import Configuration, resolve
 from segfloor_ros.errors import MapError, SettingsError, about, os_errors
 from segfloor_ros.evaluation.exploration import (
     Exploration,
+    Moment,
     figures,
     mapped_share,
     picture,
@@ -127,7 +128,7 @@ class ExploreSession:
                     raise ReplayError(f'the robot has not moved on for {STALL_S:g} s')
             self.found.wall_s = time.monotonic() - start_s
             self.found.cpu_s = {**cpu_s(graph.processes), 'planner': sum(os.times()[:2])}
-            if self.found.maps:
+            if self.found.moments:
                 graph.call(Trigger, f'{SLAM}/save_map', Trigger.Request(), STALL_S)
 
     def _parameters(self, folder: Path) -> dict[str, Any]:
@@ -250,10 +251,10 @@ class Pilot:
     def _take_map(self, message: Any) -> None:
         grid = self._explorer.grid = grid_of(message)
         self._map_ns = to_ns(message.header.stamp)
-        self.found.maps.append((self._map_ns, grid))
+        image = None
         if self._image is not None:
-            image = grey8_image(self._image, 'left/image_raw')
-            self.found.seen[stamp_of(self._image)] = np.asarray(cv2.pyrDown(image), np.uint8)
+            image = np.asarray(cv2.pyrDown(grey8_image(self._image, 'left/image_raw')), np.uint8)
+        self.found.take(Moment(self._map_ns, grid, image))
         self._on_map(self.time_s, grid, self._explorer.phase)
         self.answer()
 
@@ -340,7 +341,7 @@ def explore_scene(options: ExploreOptions) -> None:
             configuration, options.params, robot, task.slam, task.robot.size_m[1] / 2, explorer,
             found, most_s, made / SAVED, show, interrupt,
         ).execute()  # fmt: skip
-        if not found.maps:
+        if not found.moments:
             raise MapError(f'{options.scene}: no map came of {len(found.true_poses)} frames')
         summary = {
             **figures(found, task.truth, task.robot.radius_m),
@@ -368,7 +369,7 @@ def _write(
     named: dict[str, Any],
 ) -> None:
     """Write what an exploration came to. named: goals of earlier ones by name."""
-    save_map(found.maps[-1][1], folder / 'map.yaml')
+    save_map(found.moments[-1].grid, folder / 'map.yaml')
     save_map(truth, folder / 'true_map.yaml')
     for name, poses in (('trajectory', found.poses), ('ground_truth', found.true_poses)):
         stamps = sorted(poses)

@@ -29,23 +29,43 @@ FILM_FRAMES = 60
 STRIP_IMAGES = 8
 
 
+@dataclass(frozen=True)
+class Moment:
+    """A map, its stamp, and what the left camera saw: a small image (H, W) uint8."""
+
+    stamp_ns: int
+    grid: OccupancyGrid
+    image: NDArray[np.uint8] | None
+
+
 @dataclass
 class Exploration:
     """An exploration as it went. start: where the frame of the map truly lies. Poses by stamp in
-    ns: where SLAM had the base in the map at the time, and where it truly was in the scene. maps:
-    with their stamps. goals: with the true pose at the end of each. seen: small left images (H, W)
-    uint8 by stamp.
+    ns: where SLAM had the base in the map at the time, and where it truly was in the scene.
+    moments: the newest and of those before enough for a film, evenly. goals: with the true pose at
+    the end of each.
     """
 
     start: Pose2d
     poses: dict[int, Array] = field(default_factory=dict)
     true_poses: dict[int, Array] = field(default_factory=dict)
-    maps: list[tuple[int, OccupancyGrid]] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
     bumps_ns: list[int] = field(default_factory=list)
     goals: list[tuple[Goal, Array]] = field(default_factory=list)
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
-    seen: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
+    _taken: int = 0
+    _every: int = 1
+
+    def take(self, moment: Moment) -> None:
+        """Take in a moment."""
+        if (self._taken - 1) % self._every:
+            del self.moments[-1]
+        self._taken += 1
+        self.moments.append(moment)
+        if len(self.moments) > 2 * FILM_FRAMES:
+            del self.moments[1::2]
+            self._every *= 2
 
 
 def reachable_floor(truth: OccupancyGrid, radius_m: float, start: Pose2d) -> Mask:
@@ -71,7 +91,7 @@ def mapped_share(grid: OccupancyGrid, truth: OccupancyGrid, floor: Mask, start: 
 
 def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[str, Any]:
     """Return the figures of an exploration by name."""
-    _, grid = found.maps[-1]
+    grid = found.moments[-1].grid
     floor = reachable_floor(truth, radius_m, found.start)
     maps = compare(grid, MapTruth(truth, found.start))
     cells = score_cells(maps)
@@ -110,7 +130,7 @@ def _is_at(goal: Goal, T_world_base: Array, start: Pose2d) -> bool:
 def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
     """Draw the map on the truth with way, bumps and goals, below it what was seen, as PNG."""
     figure, show = _canvas(found, truth)
-    show(len(found.maps) - 1)
+    show(len(found.moments) - 1)
     axes = figure.axes[0]
     bumps = np.array([_true_at(found, t) for t in found.bumps_ns]).reshape(-1, 2)
     axes.plot(*bumps.T, 'x', color='red', markersize=9, mew=2.5, label=f'{len(bumps)} bumps')
@@ -131,10 +151,10 @@ def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
 
 def _strip(found: Exploration, width: int) -> list[NDArray[np.uint8]]:
     """Return rows of images seen on the way, evenly over the time, each with its time."""
-    stamps = sorted(found.seen)
-    chosen = np.unique(np.linspace(0, len(stamps) - 1, min(STRIP_IMAGES, len(stamps))).astype(int))
     beside = STRIP_IMAGES // 2
-    images = [_with_time(found.seen[stamps[i]], stamps[i], width // beside) for i in chosen]
+    seen = [moment for moment in found.moments if moment.image is not None]
+    chosen = np.unique(np.linspace(0, len(seen) - 1, min(STRIP_IMAGES, len(seen))).astype(int))
+    images = [_with_time(seen[i], width // beside) for i in chosen]
     rows = [np.hstack(images[i : i + beside]) for i in range(0, len(images), beside)]
     white = 3 * [255]
     return [
@@ -143,10 +163,11 @@ def _strip(found: Exploration, width: int) -> list[NDArray[np.uint8]]:
     ]
 
 
-def _with_time(grey: NDArray[np.uint8], stamp_ns: int, width: int) -> NDArray[np.uint8]:
+def _with_time(moment: Moment, width: int) -> NDArray[np.uint8]:
+    grey = np.asarray(moment.image)
     size = width, width * grey.shape[0] // grey.shape[1]
     image = cv2.cvtColor(cv2.resize(grey, size), cv2.COLOR_GRAY2BGR)
-    text, font = f'{stamp_ns * 1e-9:.0f} s', cv2.FONT_HERSHEY_SIMPLEX
+    text, font = f'{moment.stamp_ns * 1e-9:.0f} s', cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(image, text, (6, size[1] - 8), font, 0.5, (0, 255, 255), 1, cv2.LINE_AA)
     return np.asarray(image, np.uint8)
 
@@ -154,7 +175,8 @@ def _with_time(grey: NDArray[np.uint8], stamp_ns: int, width: int) -> NDArray[np
 def write_film(path: Path, found: Exploration, truth: OccupancyGrid) -> None:
     """Write the map as it grew as an animated GIF."""
     figure, show = _canvas(found, truth)
-    steps = np.linspace(0, len(found.maps) - 1, min(FILM_FRAMES, len(found.maps))).astype(int)
+    count = len(found.moments)
+    steps = np.linspace(0, count - 1, min(FILM_FRAMES, count)).astype(int)
     FuncAnimation(figure, show, frames=steps.tolist()).save(
         path, writer=PillowWriter(fps=10), dpi=60
     )
@@ -172,14 +194,14 @@ def _canvas(found: Exploration, truth: OccupancyGrid) -> tuple[Figure, Any]:
     path = np.array([found.true_poses[t][:2, 3] for t in stamps.tolist()])
 
     def show(number: int) -> None:
-        stamp_ns, grid = found.maps[number]
-        picture = coloured(compare(grid, MapTruth(truth, found.start)))
+        moment = found.moments[number]
+        picture = coloured(compare(moment.grid, MapTruth(truth, found.start)))
         shown.set_data(picture[..., ::-1])
-        count = int(np.searchsorted(stamps, stamp_ns, side='right'))
-        count = len(path) if number == len(found.maps) - 1 else count
+        count = int(np.searchsorted(stamps, moment.stamp_ns, side='right'))
+        count = len(path) if number == len(found.moments) - 1 else count
         way.set_data(*path[:count].T)
         robot.set_data(*path[max(count - 1, 0) : count].T)
-        axes.set_title(f'{stamp_ns * 1e-9:.0f} s', fontsize=10)
+        axes.set_title(f'{moment.stamp_ns * 1e-9:.0f} s', fontsize=10)
 
     return figure, show
 

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.evaluation.exploration import Exploration, figures, picture, reachable_floor
+from segfloor_ros.evaluation.exploration import (
+    FILM_FRAMES,
+    Exploration,
+    Moment,
+    figures,
+    picture,
+    reachable_floor,
+)
 from segfloor_ros.evaluation.maps import from_frame
 from segfloor_ros.files.images import decode_colour
 from segfloor_ros.geometry import Array, make_transform
@@ -51,7 +58,7 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     reached = Goal(in_map[2], is_reached=True)
     goals = [(reached, pose(*in_scene[2])), (reached, pose(*in_scene[0]))]
     grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
-    found = Exploration(START, poses, true, [(2 * 10**9, grid)], [], goals, 4.0)
+    found = Exploration(START, poses, true, [Moment(2 * 10**9, grid, None)], [], goals, 4.0)
     told = figures(found, two_rooms(), 0.2)
     assert (told['goals_reached'], told['goals_total']) == (1, 2)
     assert told['path_rmse_m'] == pytest.approx(0.0, abs=1e-4)
@@ -65,9 +72,11 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
 def test_the_picture_has_a_strip_of_what_was_seen_below_the_map() -> None:
     grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
     stamps = [10**9 * i for i in range(20)]
-    found = Exploration(START, {}, {t: pose(*START) for t in stamps}, [(stamps[-1], grid)])
+    found = Exploration(START, {}, {t: pose(*START) for t in stamps})
+    found.take(Moment(stamps[-1], grid, None))
     bare = decode_colour(picture(found, two_rooms()), 'bare')
-    found.seen = {t: np.full((60, 80), 10 * i, np.uint8) for i, t in enumerate(stamps)}
+    images = [np.full((60, 80), 10 * i, np.uint8) for i in range(20)]
+    found.moments = [Moment(t, grid, image) for t, image in zip(stamps, images, strict=True)]
     drawn = decode_colour(picture(found, two_rooms()), 'drawn')
     np.testing.assert_array_equal(drawn[: len(bare)], bare)
     strip = drawn[len(bare) :]
@@ -77,3 +86,15 @@ def test_the_picture_has_a_strip_of_what_was_seen_below_the_map() -> None:
         int(row[10, width * i + width // 2, 0]) for row in np.split(strip, 2) for i in range(4)
     ]
     assert levels == sorted(levels) and (levels[0], levels[-1]) == (0, 190)
+
+
+def test_of_a_long_exploration_moments_are_kept_evenly_and_the_newest() -> None:
+    found, count = Exploration(START), 0
+    for count in range(1, 1001):
+        grid = OccupancyGrid(np.full((1, 1), FREE, np.int8), 0.1, (0.0, 0.0))
+        found.take(Moment(count, grid, None))
+        assert found.moments[-1].stamp_ns == count
+        assert min(count, FILM_FRAMES) <= len(found.moments) <= 2 * FILM_FRAMES
+    kept = [moment.stamp_ns for moment in found.moments]
+    assert kept[0] == 1
+    assert len(np.unique(np.diff(kept[:-1]))) == 1
