@@ -68,9 +68,10 @@ keyframe, what was measured in them."""
 MIN_VIEW_COSINE = 0.5
 """A point is recognised up to 60 degrees from the direction it was last seen from."""
 
-TRACKED_POINTS = 250
-"""Map points, spread over the image, that are measured in a frame between keyframes; of more in
-the frame before, so many are followed."""
+TRACKED_POINTS = 400
+"""Map points, spread over the image, that are measured in a frame between keyframes."""
+
+MAX_FOLLOWED = 250
 
 
 class Tracker:
@@ -415,7 +416,7 @@ class Follower:
         """Find the pose to about a pixel from where the last frame's points went."""
         if self._small is None or len(self._ids) < ENOUGH:
             return None
-        step = -(-len(self._ids) // TRACKED_POINTS)
+        step = -(-len(self._ids) // MAX_FOLLOWED)
         ids, uv_last = self._ids[::step], self._uv_px[::step]
         points = transform_points(T_predicted, self._map.xyz_world[ids])
         front = points[:, 2] > MIN_DEPTH_M
