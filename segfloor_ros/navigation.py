@@ -324,14 +324,14 @@ class Explorer:
     ended: list[Goal] = field(default_factory=list)
     """Goals that were reached, or given up."""
     path: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Points (N, 2) of the way ahead in the map, and of `obstacles` on it."""
+    """Points (N, 2) of the way ahead in the map, of `obstacles` on it, and `near` the robot now."""
     obstacles: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    near: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
         self._ahead: list[Goal] = [] if isinstance(self.goals, int) else list(self.goals)
         self._driven: list[Array] = []
-        self._remembered = NOWHERE[:, :2]
         self._explores, self._is_drawn = self.phase == 'exploring', False
         self._given_up: list[tuple[Array, float]] = []
         self._target: Array | None = None
@@ -367,9 +367,10 @@ class Explorer:
     ) -> None:
         """Add points (N, 3) of obstacles in the map, one a cell, and, as Nav2's local costmap does,
         drop those on floor that a scan from a pose has seen to be free since, or under the robot.
-        near: points (M, 3) that are in the way now, and not remembered: some are wrong.
+        near: points (M, 3) that the robot does not drive into now; some are wrong, so ways lead
+        through them.
         """
-        known = np.vstack([self._remembered, points[:, :2]])
+        known = np.vstack([self.obstacles, points[:, :2]])
         cells = np.floor(known / CELL_M).astype(np.int64)
         known = known[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         in_base = transform_points(invert(T_map_base), np.pad(known, ((0, 0), (0, 1))))
@@ -381,8 +382,7 @@ class Explorer:
             seen = (ray >= 0) & (ray < len(scan.ranges_m))
             free_m = np.nan_to_num(scan.ranges_m[np.clip(ray, 0, len(scan.ranges_m) - 1)])
             kept &= ~(seen & (away_m < free_m))
-        self._remembered = known[kept]
-        self.obstacles = np.vstack([self._remembered, near[:, :2]])
+        self.obstacles, self.near = known[kept], near[:, :2]
 
     def step(self, time_s: float, T_map_base: Array | None) -> tuple[float, float]:
         """Return how to drive from now on, m/s and rad/s, by the pose (4, 4) of the base, None
@@ -401,7 +401,10 @@ class Explorer:
             self._planned_s = time_s
             self._plan(time_s, pose)
         # What is commanded now takes effect at the next frame.
-        forward, turn = self._drive(time_s, driven_on(pose, self._under_way, self._period_s))
+        then = driven_on(pose, self._under_way, self._period_s)
+        forward, turn = self._drive(time_s, then)
+        if runs_into(self.near, then, (forward, turn), self._period_s + BRAKING_S, self.body):
+            forward = 0.0
         self._turned = float(np.sign(turn)) or self._turned
         self._under_way = forward, turn
         return forward, turn
@@ -630,6 +633,17 @@ class Explorer:
         turn = 2 * body.speed_m_s * np.sin(off) / max(away_m[ahead], ARRIVED_M)
         slower = min(1.0, body.turn_rad_s / max(abs(turn), 1e-9), stop_m / most_m)
         return body.speed_m_s * slower, float(turn) * slower
+
+
+def runs_into(
+    points: Array, pose: Array, command: tuple[float, float], until_s: float, body: Body
+) -> bool:
+    """Whether a command at a pose x, y, yaw brings a robot within its radius of one of some points
+    (N, 2), and nearer than it is, as Nav2's collision monitor asks.
+    """
+    ways = [driven_on(pose, command, share * until_s)[:2] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    away_m = np.hypot(*(points[:, None] - ways).T).min(axis=1, initial=FAR_M)
+    return bool(away_m.min() < min(away_m[0], body.radius_m))
 
 
 def driven_on(pose: Array, command: tuple[float, float], period_s: float) -> Array:

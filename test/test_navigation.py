@@ -268,6 +268,18 @@ def test_obstacles_out_of_view_are_remembered_until_it_sees_their_floor_or_is_th
         assert not len(explorer.obstacles)
 
 
+def test_it_does_not_drive_into_what_it_sees_now_but_its_way_leads_through() -> None:
+    cases = {(0.25, 0.0): False, (0.8, 0.0): True, (0.1, 0.2): True, (-0.2, 0.0): True}
+    for (ahead_m, aside_m), drives in cases.items():
+        explorer = Explorer(BODY, [Goal(np.array([1.1, 0.55]))], phase='driving')
+        explorer.grid = grid_of(TWO_ROOMS)
+        near = np.array([[0.45 + ahead_m, 0.55 + aside_m, 0.0]])
+        explorer.take_obstacles(np.zeros((0, 3)), None, pose_of(0.45, 0.55, 0.0), near)
+        forward, _ = explorer.step(0.0, pose_of(0.45, 0.55, 0.0))
+        assert (forward > 0) == drives, (ahead_m, aside_m)
+        assert len(explorer.path) and not len(explorer.obstacles)
+
+
 class Drive:
     """A robot on a true map, of which it sees what lies before it within some metres.
     is_known: all of it was seen before.

@@ -48,6 +48,7 @@ from segfloor_ros.messages.arrays import (
     cloud_array,
     grey8_image,
     grid_of,
+    moving_points_arrays,
     scan_arrays,
 )
 from segfloor_ros.messages.poses import pose_array
@@ -156,7 +157,7 @@ class Pilot:
         self._scans: dict[int, FloorScan] = {}
         self._near: dict[int, FloorScan] = {}
         self._poses: dict[int, Array | None] = {}
-        self._obstacles: Array = np.zeros((0, 3))
+        self._obstacles, self._moving = NOWHERE, NOWHERE
         self._image: Image | None = None
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
@@ -165,6 +166,7 @@ class Pilot:
             ('pose', self._take_pose),
             ('scan', self._take_scan),
             ('obstacle_points', self._take_obstacles),
+            ('moving_points', self._take_moving),
             ('obstacle_scan', self._take_near),
             ('map', self._take_map),
             ('contact', self._take_contact),
@@ -215,7 +217,9 @@ class Pilot:
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
             now = NOWHERE if near is None else transform_points(T_map_base, near.ends())
-            self._explorer.take_obstacles(self._obstacles, scan, T_map_base, now)
+            standing = np.vstack([self._obstacles, self._moving])
+            self._explorer.take_obstacles(standing, scan, T_map_base, now)
+            self._moving = NOWHERE
         ended = len(self._explorer.ended)
         time_s = 1e-9 * stamp_ns
         stands = time_s < STANDING_S
@@ -243,6 +247,10 @@ class Pilot:
     def _take_obstacles(self, message: Any) -> None:
         points = cloud_array(message, MAP_POINT_DTYPE, 'obstacle_points')
         self._obstacles = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float64)
+
+    def _take_moving(self, message: Any) -> None:
+        found = moving_points_arrays(message, 'moving_points')
+        self._moving = found.xyz_map.astype(np.float64)
 
     def _take_near(self, message: Any) -> None:
         self._near[stamp_of(message)] = scan_arrays(message, 'obstacle_scan')

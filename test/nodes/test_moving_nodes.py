@@ -23,6 +23,7 @@ from segfloor_ros.messages.arrays import (
     free_scan_message,
     grey8_image,
     image_message,
+    moving_points_message,
     obstacle_scan_message,
     rectified_calibration,
 )
@@ -33,10 +34,11 @@ from segfloor_ros.messages.poses import (
     transform_message,
 )
 from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.navigation import NOWHERE, Body, Explorer
+from segfloor_ros.navigation import Body, Explorer
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
+from segfloor_ros.slam.results import MovingPoints
 from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -125,6 +127,10 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
     seen = replace(SCAN, ranges_m=SCAN.ranges_m.copy(), range_max_m=5.0)
     seen.ranges_m[3] = 1.2
     legs = replace(seen, obstacle_m=np.where(seen.ranges_m < 1.5, seen.ranges_m, np.nan))
+    clouds = graph.collect('moving_points')
+    walking = MovingPoints(np.array([[2.0, 0.2, 0.4]]), np.full((1, 3), np.nan))
+    publish(graph, {'moving_points': moving_points_message(STAMP_NS, 'map', walking)})
+    graph.until(lambda: clouds, 'what walks')
     answer = Status(STAMP_NS, 'stereo_slam', Level.OK, '', {'tracked': '1'})
     graph.tester.notes.answers[STAMP_NS] = answer
     publish(
@@ -137,10 +143,9 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
         },
     )
     graph.until(lambda: pilot.answer() or found.poses, 'a command')
+    np.testing.assert_allclose(explorer.obstacles, [[2.0, 0.2]], atol=1e-6)
     place = [0.5 + 1.2 * np.cos(0.55), 1.2 * np.sin(0.55)]
-    np.testing.assert_allclose(explorer.obstacles, [place], atol=1e-6)
-    explorer.take_obstacles(NOWHERE, None, T_map_base)
-    assert not len(explorer.obstacles), 'it is not remembered'
+    np.testing.assert_allclose(explorer.near, [place], atol=1e-6)
 
 
 def test_the_floor_is_not_told_of_what_moves(make_graph):
