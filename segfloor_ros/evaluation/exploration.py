@@ -54,8 +54,8 @@ class Exploration:
     goals: list[tuple[Goal, Array]] = field(default_factory=list)
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
-    _taken: int = 0
-    _every: int = 1
+    _taken: int = field(default=0, init=False)
+    _every: int = field(default=1, init=False)
 
     def take(self, moment: Moment) -> None:
         """Take in a moment."""
