@@ -593,8 +593,8 @@ class Explorer:
         self._target, self._planned_s = None, -np.inf
 
     def _postpone_goal(self) -> None:
-        """Drive to the other goals first or, where nothing led to them either, make way: to a place
-        drawn at random.
+        """Drive to the other goals first or, where nothing led to them either, look all around and
+        make way: to a place drawn at random.
         """
         goal = self._ahead[0]
         goal.blocked += 1
@@ -604,6 +604,9 @@ class Explorer:
         self._ahead.append(self._ahead.pop(0))
         if all(goal.blocked for goal in self._ahead) and len(self._in_reach):
             self._aside = self._rng.choice(self._in_reach)
+            # What is remembered beside and behind it may have gone.
+            self._turn_until_s = self._stepped_s + 2 * np.pi / self.body.turn_rad_s
+            self._progress_s = self._turn_until_s
 
     def _end_goal(self, is_reached: bool) -> None:
         goal = self._ahead.pop(0)

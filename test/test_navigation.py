@@ -355,6 +355,34 @@ def test_a_goal_to_which_a_wall_has_come_too_near_is_reached_from_the_place_besi
     assert drive.nearest_m > BODY.radius_m - CELL_M / 2
 
 
+def test_who_is_hemmed_in_by_what_has_gone_looks_around_and_gets_out() -> None:
+    grid = grid_of(24 * (30 * '.' + '\n'))
+    post = np.array([[1.45, 1.25, 0.1]])
+    bearing = np.radians(np.arange(40, 321, 10))
+    gone = np.stack([1.2 + 0.25 * np.cos(bearing), 1.25 + 0.25 * np.sin(bearing)], axis=1)
+    goal = Goal(np.array([2.5, 1.25]))
+    explorer = Explorer(BODY, [goal], phase='driving')
+    explorer.grid, pose, command = grid, np.array([1.2, 1.25, 0.0]), STOP
+    remembered = np.pad(gone, ((0, 0), (0, 1)), constant_values=0.1)
+    for step in range(600):
+        T_map_base = pose_of(*pose)
+        off, way_m = np.subtract(post[0, :2], pose[:2]), np.full(11, 2.0, np.float32)
+        rays = pose[2] - 0.5 + 0.1 * np.arange(11)
+        across = np.abs(np.cos(rays) * off[1] - np.sin(rays) * off[0])
+        hit = (across < 0.1) & (np.cos(rays) * off[0] + np.sin(rays) * off[1] > 0)
+        way_m[hit] = np.hypot(*off) - 0.1
+        scan = FloorScan(-0.5, 0.1, way_m, None, 4.0)
+        explorer.take_obstacles(
+            np.vstack([post, remembered[: len(gone) * (step == 0)]]), scan, T_map_base
+        )
+        (forward, turn), command = command, explorer.step(0.2 * step, T_map_base)
+        pose += 0.2 * np.array([forward * np.cos(pose[2]), forward * np.sin(pose[2]), turn])
+        assert np.hypot(*(post[0, :2] - pose[:2])) > BODY.radius_m
+        if explorer.is_done:
+            break
+    assert goal.is_reached
+
+
 DOORS = """
 ######################################
 #............#.......................#
