@@ -324,9 +324,11 @@ class Explorer:
     ended: list[Goal] = field(default_factory=list)
     """Goals that were reached, or given up."""
     path: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Points (N, 2) of the way ahead in the map, of `obstacles` on it, and `near` the robot now."""
+    """Points (N, 2) of the way ahead in the map."""
     obstacles: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Points (N, 2) that ways lead around, beside what the map has."""
     near: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Points (N, 2) that stand near the robot now."""
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
@@ -519,7 +521,8 @@ class Explorer:
             and np.hypot(*(target - self._target)) < ARRIVED_M
         )
         if not is_same:
-            self._target, self._faced_s, self._progress_s = target, None, time_s
+            self._target, self._faced_s = target, None
+            self._progress_s = max(time_s, self._turn_until_s)
 
     def _drive(self, time_s: float, pose: Array) -> tuple[float, float]:
         """Return how to drive along the way, or how to get on where there is none."""
@@ -593,8 +596,8 @@ class Explorer:
         self._target, self._planned_s = None, -np.inf
 
     def _postpone_goal(self) -> None:
-        """Drive to the other goals first or, where nothing led to them either, look all around and
-        make way: to a place drawn at random.
+        """Drive to the other goals first or, where nothing led to them either, make way: to a place
+        drawn at random, and who is hemmed in looks all around before.
         """
         goal = self._ahead[0]
         goal.blocked += 1
@@ -604,9 +607,10 @@ class Explorer:
         self._ahead.append(self._ahead.pop(0))
         if all(goal.blocked for goal in self._ahead) and len(self._in_reach):
             self._aside = self._rng.choice(self._in_reach)
-            # What is remembered beside and behind it may have gone.
-            self._turn_until_s = self._stepped_s + 2 * np.pi / self.body.turn_rad_s
-            self._progress_s = self._turn_until_s
+            reach_m2 = len(self._in_reach) * self._costmap.grid.resolution_m**2
+            if reach_m2 < (2 * self.body.radius_m) ** 2:
+                # What is remembered beside and behind it may have gone.
+                self._turn_until_s = self._stepped_s + 2 * np.pi / self.body.turn_rad_s
 
     def _end_goal(self, is_reached: bool) -> None:
         goal = self._ahead.pop(0)
@@ -642,11 +646,11 @@ def runs_into(
     points: Array, pose: Array, command: tuple[float, float], until_s: float, body: Body
 ) -> bool:
     """Whether a command at a pose x, y, yaw brings a robot within its radius of one of some points
-    (N, 2), and nearer than it is, as Nav2's collision monitor asks.
+    (N, 2), and nearer to that than it is: what Nav2 has its collision monitor for.
     """
     ways = [driven_on(pose, command, share * until_s)[:2] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    away_m = np.hypot(*(points[:, None] - ways).T).min(axis=1, initial=FAR_M)
-    return bool(away_m.min() < min(away_m[0], body.radius_m))
+    away_m = np.hypot(*(points[:, None] - ways).T)
+    return bool((away_m.min(axis=0) < np.minimum(away_m[0], body.radius_m)).any())
 
 
 def driven_on(pose: Array, command: tuple[float, float], period_s: float) -> Array:

@@ -270,6 +270,7 @@ def test_obstacles_out_of_view_are_remembered_until_it_sees_their_floor_or_is_th
 
 def test_it_does_not_drive_into_what_it_sees_now_but_its_way_leads_through() -> None:
     cases = {(0.25, 0.0): False, (0.8, 0.0): True, (0.1, 0.2): True, (-0.2, 0.0): True}
+    cases |= {(0.12, 0.0): False, (-0.12, 0.0): True}
     for (ahead_m, aside_m), drives in cases.items():
         explorer = Explorer(BODY, [Goal(np.array([1.1, 0.55]))], phase='driving')
         explorer.grid = grid_of(TWO_ROOMS)
