@@ -211,20 +211,24 @@ class Costmap:
         near = room_m < min(self._radius_m, room_m[0]) if len(room_m) else room_m > 0
         return float(way_m[max(int(np.argmax(near)) - 1, 0)]) if near.any() else reach_m
 
-    def way_out(self, pose: Array) -> float:
+    def way_out(self, pose: Array, near: Array = NOWHERE[:, :2]) -> float:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
         at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
         sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there
-        by more than half a cell.
+        by more than half a cell. near: points (N, 2) that stand near the robot now.
         """
-        if self.standing_m(pose[:2]) >= self._radius_m - self.grid.resolution_m / 2:
+        play_m = self.grid.resolution_m / 2
+        if self.standing_m(pose[:2]) >= self._radius_m - play_m:
             return 0.0
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
         best, soonest = 0.0, len(ways_m)
         for sign in (1.0, -1.0):
-            room_m = np.array([self.standing_m(pose[:2] + sign * m * ahead) for m in ways_m])
-            ends = (room_m >= self._radius_m) | (room_m < room_m[0] - self.grid.resolution_m)
+            places = pose[:2] + sign * ways_m[:, None] * ahead
+            room_m = np.array([self.standing_m(place) for place in places])
+            away_m = np.hypot(*(near[:, None] - places).T).min(axis=1, initial=np.inf)
+            room_m = np.minimum(room_m, away_m)
+            ends = (room_m >= self._radius_m) | (room_m < room_m[0] - play_m)
             first = int(np.argmax(ends))
             if first < soonest and room_m[first] >= self._radius_m:
                 best, soonest = sign, first
@@ -538,7 +542,7 @@ class Explorer:
             return STOP
         if self._target is None or time_s > self._progress_s + PATIENCE_S:
             return self._recover(time_s)
-        way_out = self._costmap.way_out(pose)
+        way_out = self._costmap.way_out(pose, self.near)
         if way_out:
             return way_out * self.body.speed_m_s / 2, 0.0
         left_m = np.hypot(*(self.path[-1:] - pose[:2]).T)

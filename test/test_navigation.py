@@ -500,6 +500,19 @@ def test_from_what_stands_beside_it_it_drives_on_one_way_until_it_may_turn(x) ->
     assert costmap.standing_m(np.array([x, 0.55])) >= 0.3 - CELL_M / 2
 
 
+def test_it_does_not_back_out_past_what_would_come_nearer() -> None:
+    posts = np.array([(0.85, 0.85), (1.55, 0.55)])
+    costmap = Costmap(grid_of(13 * (24 * '.' + '\n')), 0.45, 0.9, posts, NOTHING, 0.0)
+    assert costmap.way_out(np.array([1.05, 0.55, 0.0])) == 0
+
+
+def test_it_does_not_drive_out_towards_what_is_near_now() -> None:
+    pose, beside = np.array([0.65, 0.55, 0.0]), np.array([[0.55, 0.75]])
+    costmap = Costmap(grid_of(13 * (24 * '.' + '\n')), 0.3, 0.6, beside, NOTHING, 0.0)
+    assert costmap.way_out(pose) == 1
+    assert costmap.way_out(pose, np.array([[0.95, 0.55]])) == -1
+
+
 @pytest.mark.parametrize('yaw', [0.0, np.pi])
 def test_along_a_wall_that_it_might_touch_it_turns_as_neither_way_leads_off(yaw) -> None:
     body = dataclasses.replace(BODY, radius_m=0.35)
