@@ -143,7 +143,7 @@ class FrontEnd:
         """Find the pose of a frame: from the one before, else by its features. found: where
         it is in this map, as that was found while the camera was in a submap.
         """
-        self._rotation.see(images.left)
+        self._rotation.see(images.small)
         if found is not None:
             features = self.extractor.extract(frame.left, images.excluded)
             track = self._relocalise(images, features, frame.stamp_ns, found)

@@ -346,18 +346,17 @@ class ImageRotation:
     """Compares each image with the one before."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        self._scale = SMALL_WIDTH_PX / 4 / camera.width
-        height = max(8, round(camera.height * self._scale))
+        scale = SMALL_WIDTH_PX / 4 / camera.width
+        height = max(8, round(camera.height * scale))
         self._size = (SMALL_WIDTH_PX // 4, height)
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        self._focal = (camera.fx * self._scale, camera.fy * height / camera.height)
-        self._last: NDArray[np.float32] | None = None
-        self._now: NDArray[np.float32] | None = None
+        self._focal = (camera.fx * scale, camera.fy * height / camera.height)
+        self._last: NDArray[np.uint8] | None = None
+        self._now: NDArray[np.uint8] | None = None
 
-    def see(self, image: NDArray[np.float32]) -> None:
-        """Take in the next image (H, W)."""
-        small = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
-        self._last, self._now = self._now, np.asarray(cv2.GaussianBlur(small, (0, 0), 0.75))
+    def see(self, image: NDArray[np.uint8]) -> None:
+        """Take in the next image (H, W), shrunk as optical flow takes it."""
+        self._last, self._now = self._now, image
 
     def turn_since_last(self) -> Array:
         """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
@@ -367,7 +366,15 @@ class ImageRotation:
         """
         if self._last is None or self._now is None:
             return np.eye(4)
-        (du, dv), response = cv2.phaseCorrelate(self._last, self._now, self._window)
+        last, now = (
+            cv2.GaussianBlur(
+                cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32),
+                (0, 0),
+                0.75,
+            )
+            for image in (self._last, self._now)
+        )
+        (du, dv), response = cv2.phaseCorrelate(last, now, self._window)
         if response < MIN_RESPONSE:
             return np.eye(4)
         # A scene point that moves right by du lies further to the right now: it turned about +y.
