@@ -35,10 +35,8 @@ _LABEL_LOG_ODDS = 0.8
 """A label is given, or changed, when the evidence exceeds this."""
 _ENOUGH_POINTS = 3
 """So many points above a place of the size of a cell are something that stands there."""
-_NEWS_KEYFRAMES = 5
-"""What was seen before the last so many keyframes is in the map by now, or is seen to be gone: as
-many mark a cell that was surely free.
-"""
+_RECENT_KEYFRAMES = 5
+"""Points that so many keyframes have seen are company for those of the newest."""
 
 _COLUMNS = {
     'mask_log_odds': np.float32,
@@ -78,7 +76,7 @@ class CloudLabelling:
         self.settings = settings
         self._judged_by = settings
         self._table = PointTable()
-        self._news: deque[NDArray[np.int32]] = deque(maxlen=_NEWS_KEYFRAMES)
+        self._seen: deque[NDArray[np.int32]] = deque([_NO_IDS], maxlen=_RECENT_KEYFRAMES)
 
     def update(
         self,
@@ -96,7 +94,7 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
-        self._news.append(features.point_id[seen])
+        self._seen.append(features.point_id[seen])
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
         floor_z, distance_m = local_floor_m(xyz, T_map_base)
@@ -117,16 +115,17 @@ class CloudLabelling:
     def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Go on with what is known of the points of a map."""
         self._table.from_arrays(arrays)
-        self._news.append(self._table.point_id)
+        self._seen.append(self._table.point_id)
 
     def standing(self, points: LabelledPoints) -> NDArray[np.intp]:
-        """Return the rows (M,) of obstacles for a costmap, which lays them over the map: those that
-        the latest keyframes have seen. What stands somewhere has several corners: a lone point
-        above the floor is a wrong match.
+        """Return the rows (M,) of obstacles for a costmap, which remembers them: those that the
+        newest keyframe has seen, for who was there before may have gone. What stands somewhere has
+        several corners: a lone point above the floor is a wrong match.
         """
         row = np.flatnonzero(points.label == OBSTACLE)
-        row = row[np.isin(points.point_id[row], np.concatenate([*self._news, _NO_IDS]))]
-        return row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
+        row = row[np.isin(points.point_id[row], np.concatenate(self._seen))]
+        row = row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
+        return row[np.isin(points.point_id[row], self._seen[-1])]
 
     def labelled(self, cloud: SparseCloud) -> LabelledPoints:
         """Return a cloud with the labels known of its points, which are all in the table."""

@@ -219,7 +219,7 @@ class Pilot:
             now = NOWHERE if near is None else transform_points(T_map_base, near.ends())
             standing = np.vstack([self._obstacles, self._moving])
             self._explorer.take_obstacles(standing, scan, T_map_base, now)
-            self._moving = NOWHERE
+            self._obstacles = self._moving = NOWHERE
         ended = len(self._explorer.ended)
         time_s = 1e-9 * stamp_ns
         stands = time_s < STANDING_S

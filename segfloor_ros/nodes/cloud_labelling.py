@@ -89,7 +89,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             cloud = SparseCloud(points['point_id'], points['xyz_map'])
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
-            # Also for those who listen later: without keyframes it stays as it is.
+            # Also for those who listen in a moment.
             self._obstacles = arrays.points_at(*at, labelled, self._stage.standing(labelled))
 
     def find_problems(self) -> None:
@@ -112,6 +112,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         message = arrays.labelled_message(stamp_ns, frame_id, labelled)
         self.outputs.publish('labelled_points', message)
         self._publish_by_label(stamp_ns, frame_id, labelled)
+        self._obstacles = _no_points(stamp_ns, frame_id)
         self._part.note(stamp_ns, frame_id)
         return {'points': len(labelled.point_id)}
 
@@ -122,18 +123,18 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
         if self._obstacles_are_wanted():
-            self._obstacles = arrays.points_at(
-                stamp_ns, frame_id, labelled, self._stage.standing(labelled)
-            )
-            self.outputs.publish('obstacle_points', self._obstacles)
+            rows = self._stage.standing(labelled)
+            obstacles = arrays.points_at(stamp_ns, frame_id, labelled, rows)
+            self.outputs.publish('obstacle_points', obstacles)
 
     def _obstacles_are_wanted(self) -> bool:
         return self.outputs.listeners('obstacle_points') > 0
 
     def _keep_alive(self, message: Odometry) -> None:
-        """Publish the obstacles again at the time of a tracked frame when they have become old. A
-        robot that stands makes no keyframes, and who depends on the points, e.g. Nav2's collision
-        monitor, must know that somebody still looks.
+        """Publish that nothing is new at the time of a tracked frame when the last points have
+        become old. A robot that stands makes no keyframes, and who depends on the points, e.g.
+        Nav2's collision monitor, must know that somebody still looks. The points themselves are
+        not repeated: who was there may have gone, and costmaps remember them until they see that.
         """
         obstacles, stamp_ns = self._obstacles, to_ns(message.header.stamp)
         if obstacles is not None:
@@ -141,6 +142,12 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             if not 0 <= age_s < FRESH_S:
                 obstacles.header.stamp = message.header.stamp
                 self.outputs.publish('obstacle_points', obstacles)
+                self._obstacles = _no_points(stamp_ns, obstacles.header.frame_id)
+
+
+def _no_points(stamp_ns: int, frame_id: str) -> PointCloud2:
+    nothing = SparseCloud(np.zeros(0, np.int32), np.zeros((0, 3)))
+    return arrays.sparse_cloud_message(stamp_ns, frame_id, nothing)
 
 
 def main() -> None:

@@ -37,11 +37,13 @@ from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.messages.arrays import (
     camera_info_message,
     compressed_message,
+    features_message,
     grey8_image,
     image_message,
     labelled_arrays,
     rectified_calibration,
     sparse_cloud_arrays,
+    sparse_cloud_message,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array, transform_message
@@ -51,7 +53,7 @@ from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import KeyframePath
+from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 CALIBRATION = rectified_calibration(CAMERA)
 
@@ -334,22 +336,29 @@ def test_the_grid_is_the_stage_and_is_saved_on_request(make_graph, tmp_path) -> 
     np.testing.assert_array_equal(load_map(file).cells, expected.cells)
 
 
-def test_obstacles_are_published_while_the_robot_stands_and_is_tracked(make_graph) -> None:
+def test_that_nothing_is_new_is_published_while_a_tracked_robot_stands(make_graph) -> None:
     graph = make_graph()
     obstacles = graph.collect('obstacle_points')
     node = graph.add(CloudLabellingNode())
-    publishers = publish(graph, cloud_messages(STAMP_NS))
+    ids = np.arange(3, dtype=np.int32)
+    post = np.array([[2.0, 0.0, 0.3 + 0.1 * k] for k in ids], np.float32)
+    features = KeyframeFeatures(np.full((3, 2), (5.0, 1.0), np.float32), ids, post)
+    shown = {
+        'map_points': sparse_cloud_message(STAMP_NS, 'map', SparseCloud(ids, post)),
+        'keyframe/features': features_message(STAMP_NS, 'map', features),
+    }
+    publishers = publish(graph, cloud_messages(STAMP_NS) | shown)
     graph.until(lambda: len(obstacles) == 1, 'the keyframe')
+    assert obstacles[0].width == 3
     assert not graph.comes(lambda: len(obstacles) > 1, 1.0), 'nothing while nobody tracks'
     graph.until(lambda: node.count_subscribers('odometry'), 'the subscription')
     later = [STAMP_NS + k * 100_000_000 for k in range(1, 21)]
     for stamp_ns in later:
         publish(graph, {'odometry': pose_message_at(stamp_ns)}, publishers)
-    graph.until(lambda: len(obstacles) == 5, 'the points again')
+    graph.until(lambda: len(obstacles) == 5, 'that nothing is new')
     stamps = [to_ns(message.header.stamp) for message in obstacles]
     assert stamps == [STAMP_NS, *later[4::5]], 'twice a second, at the stamps of tracked frames'
-    for message in obstacles[1:]:
-        assert message.data == obstacles[0].data
+    assert [message.width for message in obstacles[1:]] == 4 * [0], 'who was there may have gone'
 
 
 class TestFrameScan:
