@@ -107,10 +107,9 @@ ABOUT = {
     ),
     'floor_points': 'The floor points alone: x y z id. Published while someone listens.',
     'obstacle_points': (
-        'What the map does not hold yet: the obstacle points that the last five keyframes have '
-        'seen and that do not stand alone (three within a cell): x y z id. Published while someone '
-        'listens: at every keyframe, and twice a second while the camera is tracked but makes '
-        'none.'
+        'What the map may not hold yet: the obstacle points that the newest keyframe has seen and '
+        'that do not stand alone (three within a cell): x y z id. Published while someone listens: '
+        'at every keyframe, and empty twice a second while the camera is tracked but makes none.'
     ),
     'keyframe/done': (
         'The header of every keyframe that goes no further: it is in the map, or a node could not '

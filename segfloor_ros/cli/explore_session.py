@@ -44,12 +44,11 @@ from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, Pose2d, planar, transform_points
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map
 from segfloor_ros.messages.arrays import (
-    MAP_POINT_DTYPE,
-    cloud_array,
     grey8_image,
     grid_of,
     moving_points_arrays,
     scan_arrays,
+    sparse_cloud_arrays,
 )
 from segfloor_ros.messages.poses import pose_array
 from segfloor_ros.messages.topics import (
@@ -157,7 +156,8 @@ class Pilot:
         self._scans: dict[int, FloorScan] = {}
         self._near: dict[int, FloorScan] = {}
         self._poses: dict[int, Array | None] = {}
-        self._obstacles, self._moving = NOWHERE, NOWHERE
+        self._standing = NOWHERE
+        """Points (N, 3) that obstacles and what moves have shown since the last command."""
         self._image: Image | None = None
         self._map_ns = 0
         topic = TOPICS['cmd_vel']
@@ -217,9 +217,8 @@ class Pilot:
         if T_map_base is not None:
             self.found.poses[stamp_ns] = T_map_base
             now = NOWHERE if near is None else transform_points(T_map_base, near.ends())
-            standing = np.vstack([self._obstacles, self._moving])
-            self._explorer.take_obstacles(standing, scan, T_map_base, now)
-            self._obstacles = self._moving = NOWHERE
+            self._explorer.take_obstacles(self._standing, scan, T_map_base, now)
+            self._standing = NOWHERE
         ended = len(self._explorer.ended)
         time_s = 1e-9 * stamp_ns
         stands = time_s < STANDING_S
@@ -245,12 +244,12 @@ class Pilot:
         self.answer()
 
     def _take_obstacles(self, message: Any) -> None:
-        points = cloud_array(message, MAP_POINT_DTYPE, 'obstacle_points')
-        self._obstacles = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float64)
+        found = sparse_cloud_arrays(message, 'obstacle_points')
+        self._standing = np.vstack([self._standing, found.xyz_map])
 
     def _take_moving(self, message: Any) -> None:
         found = moving_points_arrays(message, 'moving_points')
-        self._moving = found.xyz_map.astype(np.float64)
+        self._standing = np.vstack([self._standing, found.xyz_map])
 
     def _take_near(self, message: Any) -> None:
         self._near[stamp_of(message)] = scan_arrays(message, 'obstacle_scan')
