@@ -41,8 +41,8 @@ is measured from the floor the camera sees; until then images and results are he
 them follow.
 
 On tf (REP-105) it broadcasts `map` → `odom` → `base_link` with the stamps of the images it tracked,
-and on `/tf_static` the mount where tf lacks it; where the camera's frame hangs on another one
-already, that one is put on the base. With `publish_odom_tf: false` another node owns `odom` →
+and on `/tf_static` the mount where tf lacks it; where the camera's frame has a parent already,
+the root of that tree is put on the base. With `publish_odom_tf: false` another node owns `odom` →
 `base_link`, e.g. robot_localization with wheels and IMU: `map` → `odom` is then what lies between
 that node's base and the one SLAM sees at the same time, and stays as it was while tracking is lost.
 tf needs tf2_msgs, which ROS has; with pip wheels `make` builds it.""",
@@ -145,7 +145,10 @@ STATUS = {
     'keyframe a pose is relative to), `lost_s` (for how long), `recovered_after_s` (once), '
     '`in_map_s` (for how long the place in the map has been known), `place_sigma_m` and '
     '`place_sigma_rad` (how well, one sigma), '
-    '`submap` (1: mapped in a submap that was merged later), '
+    '`submap` (1: mapped in a submap that was merged later), `blind` (1: no image shows the pose), '
+    '`repeated` (1: the image is the one before), `loops` (closed so far), '
+    '`moving` (how many points are seen to move), '
+    '`input_faults` (JSON), `remarks` (what seems wrong with a sensor), '
     '`processing_ms`, `rss_mb`.',
     FLOOR: 'One status per keyframe: OK, or ERROR with the reason, e.g. which topic has not '
     'delivered. Values: `processing_ms`, `rss_mb`.',

@@ -34,7 +34,7 @@ ABOUT = {
         'again: the same frames, corrected once; and frames that saw the place before it was '
         'certain. For who records.'
     ),
-    'pose/corrected': 'So for pose.',
+    'pose/corrected': 'The same for `pose`.',
     'dynamic_mask': (
         'mono8, 255 where something moves, of the left image that stereo_slam receives, with its '
         'stamp; from a segmentation network. Used when there, never waited for.'
