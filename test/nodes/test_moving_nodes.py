@@ -26,6 +26,7 @@ from segfloor_ros.messages.arrays import (
     moving_points_message,
     obstacle_scan_message,
     rectified_calibration,
+    sparse_cloud_message,
 )
 from segfloor_ros.messages.diagnostics import Level, Status
 from segfloor_ros.messages.poses import (
@@ -38,7 +39,7 @@ from segfloor_ros.navigation import Body, Explorer
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import MovingPoints
+from segfloor_ros.slam.results import MovingPoints, SparseCloud
 from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
@@ -118,12 +119,50 @@ def test_moving_points_tell_what_crosses_and_diagnostics_count_it(make_graph):
     assert np.isfinite(points['vy']).any()
 
 
-def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
-    graph, zeros, T_map_base = make_graph(), np.zeros((6, 6)), planar_pose(0.5, 0.0, 0.3)
+def make_pilot(graph):
     graph.tester.notes = DriveNotes(lambda: 0.0)
-    explorer = Explorer(Body(0.3, 0.5, 0.3, 1.0), 0)
-    found = Exploration((0.0, 0.0, 0.0))
-    pilot = Pilot(SimpleNamespace(recorder=graph.tester), explorer, found, lambda *_: None)
+    explorer, found = Explorer(Body(0.3, 0.5, 0.3, 1.0), 0), Exploration((0.0, 0.0, 0.0))
+    graph_of_pilot = SimpleNamespace(recorder=graph.tester)
+    return explorer, Pilot(graph_of_pilot, explorer, found, lambda *_: None)
+
+
+def command(graph, pilot, stamp_ns, T_map_base, scan):
+    """Send what the nodes make of a frame, and wait for the command that answers it."""
+    zeros = np.zeros((6, 6))
+    answer = Status(stamp_ns, 'stereo_slam', Level.OK, '', {'tracked': '1'})
+    graph.tester.notes.answers[stamp_ns] = answer
+    publish(
+        graph,
+        {
+            'pose': pose_with_covariance_message(stamp_ns, 'map', T_map_base, zeros),
+            'scan': free_scan_message(stamp_ns, 'base_link', scan),
+            'obstacle_scan': obstacle_scan_message(stamp_ns, 'base_link', scan),
+            'ground_truth': odometry_message(stamp_ns, 'world', 'base_link', AT_ORIGIN, zeros),
+        },
+    )
+    graph.until(lambda: pilot.answer() or stamp_ns in pilot.found.poses, 'a command')
+
+
+def test_what_stands_counts_once_for_the_explorer_until_it_is_told_again(make_graph):
+    graph, ahead = make_graph(), planar_pose(0.0, 0.0, 0.0)
+    explorer, pilot = make_pilot(graph)
+    clouds = graph.collect('obstacle_points')
+    posts = np.array([[1.2, 0.0, 0.3], [-1.2, 0.0, 0.3]], np.float32)
+    for k, post in enumerate(posts):
+        cloud = SparseCloud(np.array([k], np.int32), post[None])
+        publish(graph, {'obstacle_points': sparse_cloud_message(STAMP_NS + k, 'map', cloud)})
+        graph.until(lambda k=k: len(clouds) > k, 'a keyframe')
+    command(graph, pilot, STAMP_NS, planar_pose(0.0, 0.0, np.pi / 2), SCAN)
+    np.testing.assert_allclose(explorer.obstacles, posts[:, :2], atol=1e-6)
+    command(graph, pilot, STAMP_NS + 1, ahead, SCAN)
+    np.testing.assert_allclose(explorer.obstacles, posts[1:, :2], atol=1e-6)
+    command(graph, pilot, STAMP_NS + 2, planar_pose(0.0, 0.0, np.pi / 2), SCAN)
+    np.testing.assert_allclose(explorer.obstacles, posts[1:, :2], atol=1e-6)
+
+
+def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
+    graph, T_map_base = make_graph(), planar_pose(0.5, 0.0, 0.3)
+    explorer, pilot = make_pilot(graph)
     seen = replace(SCAN, ranges_m=SCAN.ranges_m.copy(), range_max_m=5.0)
     seen.ranges_m[3] = 1.2
     legs = replace(seen, obstacle_m=np.where(seen.ranges_m < 1.5, seen.ranges_m, np.nan))
@@ -131,18 +170,7 @@ def test_who_walks_by_is_in_the_way_of_the_explorer(make_graph):
     walking = MovingPoints(np.array([[2.0, 0.2, 0.4]]), np.full((1, 3), np.nan))
     publish(graph, {'moving_points': moving_points_message(STAMP_NS, 'map', walking)})
     graph.until(lambda: clouds, 'what walks')
-    answer = Status(STAMP_NS, 'stereo_slam', Level.OK, '', {'tracked': '1'})
-    graph.tester.notes.answers[STAMP_NS] = answer
-    publish(
-        graph,
-        {
-            'pose': pose_with_covariance_message(STAMP_NS, 'map', T_map_base, zeros),
-            'scan': free_scan_message(STAMP_NS, 'base_link', legs),
-            'obstacle_scan': obstacle_scan_message(STAMP_NS, 'base_link', legs),
-            'ground_truth': odometry_message(STAMP_NS, 'world', 'base_link', AT_ORIGIN, zeros),
-        },
-    )
-    graph.until(lambda: pilot.answer() or found.poses, 'a command')
+    command(graph, pilot, STAMP_NS, T_map_base, legs)
     np.testing.assert_allclose(explorer.obstacles, [[2.0, 0.2]], atol=1e-6)
     place = [0.5 + 1.2 * np.cos(0.55), 1.2 * np.sin(0.55)]
     np.testing.assert_allclose(explorer.near, [place], atol=1e-6)
