@@ -224,7 +224,7 @@ class Pilot:
         stands = time_s < STANDING_S
         forward, turn = STOP if stands else self._explorer.step(time_s, T_map_base)
         for goal in self._explorer.ended[ended:]:
-            self.found.goals.append((goal, self.found.true_poses[stamp_ns]))
+            self.found.goals.append((goal, stamp_ns))
         twist = Twist(linear=Vector3(x=float(forward)), angular=Vector3(z=float(turn)))
         self._commands.publish(TwistStamped(header=make_header(stamp_ns, 'base_link'), twist=twist))
 

@@ -42,8 +42,8 @@ class Moment:
 class Exploration:
     """An exploration as it went. start: where the frame of the map truly lies. Poses by stamp in
     ns: where SLAM had the base in the map at the time, and where it truly was in the scene.
-    moments: the newest and of those before enough for a film, evenly. goals: with the true pose at
-    the end of each.
+    moments: the newest and of those before enough for a film, evenly. goals: with the
+    stamp of the frame in which the robot was told to stop there, or gave up.
     """
 
     start: Pose2d
@@ -51,7 +51,7 @@ class Exploration:
     true_poses: dict[int, Array] = field(default_factory=dict)
     moments: list[Moment] = field(default_factory=list)
     bumps_ns: list[int] = field(default_factory=list)
-    goals: list[tuple[Goal, Array]] = field(default_factory=list)
+    goals: list[tuple[Goal, int]] = field(default_factory=list)
     wall_s: float = 0.0
     cpu_s: dict[str, float] = field(default_factory=dict)
     _taken: int = field(default=0, init=False)
@@ -106,7 +106,7 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
     return {
         'mapped_share': round(mapped_share(grid, truth, floor, found.start), 4),
         'bumps': len(found.bumps_ns),
-        'goals_reached': sum(_is_at(goal, pose, found.start) for goal, pose in found.goals),
+        'goals_reached': sum(_is_reached(found, *ended) for ended in found.goals),
         'goals_total': len(found.goals),
         'path_rmse_m': rmse_m,
         'free_precision': round(cells.free_precision, 4),
@@ -120,9 +120,11 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
     }
 
 
-def _is_at(goal: Goal, T_world_base: Array, start: Pose2d) -> bool:
-    (true,) = from_frame(goal.point[None], start)
-    away_m = float(np.hypot(*(true - T_world_base[:2, 3])))
+def _is_reached(found: Exploration, goal: Goal, stamp_ns: int) -> bool:
+    (true,) = from_frame(goal.point[None], found.start)
+    # A command takes effect one frame later.
+    stopped_ns = min((t for t in found.true_poses if t > stamp_ns), default=stamp_ns)
+    away_m = float(np.hypot(*(true - found.true_poses[stopped_ns][:2, 3])))
     # The planner's own reach, and as much again for the map.
     return bool(goal.is_reached) and away_m <= 2 * ARRIVED_M
 
@@ -135,7 +137,7 @@ def picture(found: Exploration, truth: OccupancyGrid) -> bytes:
     bumps = np.array([_true_at(found, t) for t in found.bumps_ns]).reshape(-1, 2)
     axes.plot(*bumps.T, 'x', color='red', markersize=9, mew=2.5, label=f'{len(bumps)} bumps')
     for reached, colour in ((True, 'tab:green'), (False, 'tab:red')):
-        goals = [g.point for g, pose in found.goals if _is_at(g, pose, found.start) == reached]
+        goals = [e[0].point for e in found.goals if _is_reached(found, *e) == reached]
         if goals:
             points = from_frame(np.array(goals), found.start)
             label = 'goals reached' if reached else 'goals missed'
