@@ -77,6 +77,7 @@ class CloudLabelling:
         self._judged_by = settings
         self._table = PointTable()
         self._seen: deque[NDArray[np.int32]] = deque([_NO_IDS], maxlen=_RECENT_KEYFRAMES)
+        self._is_restored = False
 
     def update(
         self,
@@ -94,6 +95,9 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
+        if self._is_restored:
+            self._seen.clear()
+            self._is_restored = False
         self._seen.append(features.point_id[seen])
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
@@ -116,6 +120,7 @@ class CloudLabelling:
         """Go on with what is known of the points of a map."""
         self._table.from_arrays(arrays)
         self._seen.append(self._table.point_id)
+        self._is_restored = True
 
     def standing(self, points: LabelledPoints) -> NDArray[np.intp]:
         """Return the rows (M,) of obstacles for a costmap, which remembers them: those that the

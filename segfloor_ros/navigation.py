@@ -215,24 +215,25 @@ class Costmap:
         """Return 1 for ahead or -1 for back where something stands within the radius of the robot
         at a pose x, y, yaw, which might touch it in a turn: whichever leads out of its reach
         sooner, by no place that is nearer to anything; 0 where neither does, or nothing is there
-        by more than half a cell. near: points (N, 2) that stand near the robot now.
+        by more than half a cell. near: points (N, 2) that stand near the robot now, and leave one
+        of two ways; where they leave none they are passed over, as some are wrong.
         """
         play_m = self.grid.resolution_m / 2
         if self.standing_m(pose[:2]) >= self._radius_m - play_m:
             return 0.0
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
-        best, soonest = 0.0, len(ways_m)
+        best, soonest = [0.0, 0.0], [len(ways_m)] * 2
         for sign in (1.0, -1.0):
             places = pose[:2] + sign * ways_m[:, None] * ahead
-            room_m = np.array([self.standing_m(place) for place in places])
+            known_m = np.array([self.standing_m(place) for place in places])
             away_m = np.hypot(*(near[:, None] - places).T).min(axis=1, initial=np.inf)
-            room_m = np.minimum(room_m, away_m)
-            ends = (room_m >= self._radius_m) | (room_m < room_m[0] - play_m)
-            first = int(np.argmax(ends))
-            if first < soonest and room_m[first] >= self._radius_m:
-                best, soonest = sign, first
-        return best
+            for k, room_m in enumerate((np.minimum(known_m, away_m), known_m)):
+                ends = (room_m >= self._radius_m) | (room_m < room_m[0] - play_m)
+                first = int(np.argmax(ends))
+                if first < soonest[k] and room_m[first] >= self._radius_m:
+                    best[k], soonest[k] = sign, first
+        return best[0] or best[1]
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""

@@ -234,3 +234,15 @@ def test_a_costmap_gets_what_the_newest_keyframe_has_seen_others_may_have_gone()
     again = CloudLabelling(CloudLabellingSettings())
     again.from_arrays(labelling.to_arrays())
     assert len(again.standing(again.labelled(cloud(old | new)))) == 6
+    labelled = again.update(cloud(old | new), features({0: ON_OBSTACLE}), MASK, HERE)
+    assert len(again.standing(labelled)) == 0, 'what the saved map has is no company'
+
+
+def test_what_few_keyframes_before_have_seen_is_company() -> None:
+    labelling = CloudLabelling(CloudLabellingSettings())
+    post = cloud({i: (1.0, 0.01 * i, 0.3) for i in range(3)})
+    counts = []
+    for seen in (0, 1, 2, 2, 2, 2, 2):
+        labelled = labelling.update(post, features({seen: ON_OBSTACLE}), MASK, HERE)
+        counts.append(len(labelling.standing(labelled)))
+    assert counts == [0, 0, 1, 1, 1, 0, 0]

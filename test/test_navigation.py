@@ -511,6 +511,7 @@ def test_it_does_not_drive_out_towards_what_is_near_now() -> None:
     costmap = Costmap(grid_of(13 * (24 * '.' + '\n')), 0.3, 0.6, beside, NOTHING, 0.0)
     assert costmap.way_out(pose) == 1
     assert costmap.way_out(pose, np.array([[0.95, 0.55]])) == -1
+    assert costmap.way_out(pose, np.array([[0.95, 0.55], [0.35, 0.55]])) == 1, 'one may be wrong'
 
 
 @pytest.mark.parametrize('yaw', [0.0, np.pi])

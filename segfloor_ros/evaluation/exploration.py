@@ -122,9 +122,9 @@ def figures(found: Exploration, truth: OccupancyGrid, radius_m: float) -> dict[s
 
 def _is_reached(found: Exploration, goal: Goal, stamp_ns: int) -> bool:
     (true,) = from_frame(goal.point[None], found.start)
-    # A command takes effect one frame later.
-    stopped_ns = min((t for t in found.true_poses if t > stamp_ns), default=stamp_ns)
-    away_m = float(np.hypot(*(true - found.true_poses[stopped_ns][:2, 3])))
+    # A command takes effect one frame later; from then on the robot brakes.
+    braking_ns = min((t for t in found.true_poses if t > stamp_ns), default=stamp_ns)
+    away_m = float(np.hypot(*(true - found.true_poses[braking_ns][:2, 3])))
     # The planner's own reach, and as much again for the map.
     return bool(goal.is_reached) and away_m <= 2 * ARRIVED_M
 

@@ -10,7 +10,6 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
-from sensor_msgs.msg import PointCloud2
 
 from segfloor_ros.cloud import FLOOR, CloudLabelling, LabelledPoints
 from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
@@ -78,7 +77,9 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         """Begin without points."""
         self._part.reset()
         self._stage = CloudLabelling(self.settings)
-        self._obstacles: PointCloud2 | None = None
+        self._newest: tuple[str, LabelledPoints] | None = None
+        self._told_ns = self._tracked_ns = 0
+        self._listeners = 0
 
     def restore(self, saved: MapFile) -> None:
         """Go on with the labels of a map, and publish its obstacles where they are known."""
@@ -89,8 +90,6 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             cloud = SparseCloud(points['point_id'], points['xyz_map'])
             labelled, at = self._stage.labelled(cloud), (self._part.last_ns, self._part.frame_id)
             self._publish_by_label(*at, labelled)
-            # Also for those who listen in a moment.
-            self._obstacles = arrays.points_at(*at, labelled, self._stage.standing(labelled))
 
     def find_problems(self) -> None:
         """Report when the floor is segmented for another robot."""
@@ -112,7 +111,6 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
         message = arrays.labelled_message(stamp_ns, frame_id, labelled)
         self.outputs.publish('labelled_points', message)
         self._publish_by_label(stamp_ns, frame_id, labelled)
-        self._obstacles = _no_points(stamp_ns, frame_id)
         self._part.note(stamp_ns, frame_id)
         return {'points': len(labelled.point_id)}
 
@@ -122,32 +120,35 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
             rows = np.flatnonzero(labelled.label == FLOOR)
             floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
-        if self._obstacles_are_wanted():
-            rows = self._stage.standing(labelled)
-            obstacles = arrays.points_at(stamp_ns, frame_id, labelled, rows)
-            self.outputs.publish('obstacle_points', obstacles)
+        self._newest, self._listeners = (frame_id, labelled), 0
+        self._publish_obstacles(stamp_ns)
+        self._told_ns = max(stamp_ns, self._tracked_ns)
 
     def _obstacles_are_wanted(self) -> bool:
         return self.outputs.listeners('obstacle_points') > 0
 
     def _keep_alive(self, message: Odometry) -> None:
         """Publish that nothing is new at the time of a tracked frame when the last points have
-        become old. A robot that stands makes no keyframes, and who depends on the points, e.g.
-        Nav2's collision monitor, must know that somebody still looks. The points themselves are
-        not repeated: who was there may have gone, and costmaps remember them until they see that.
+        become old. A robot that stands makes no keyframes, and who depends on the points must know
+        that somebody still looks. The points themselves are repeated for who has begun to listen,
+        and no one else: who was there may have gone.
         """
-        obstacles, stamp_ns = self._obstacles, to_ns(message.header.stamp)
-        if obstacles is not None:
-            age_s = 1e-9 * (stamp_ns - to_ns(obstacles.header.stamp))
-            if not 0 <= age_s < FRESH_S:
-                obstacles.header.stamp = message.header.stamp
-                self.outputs.publish('obstacle_points', obstacles)
-                self._obstacles = _no_points(stamp_ns, obstacles.header.frame_id)
+        self._tracked_ns = to_ns(message.header.stamp)
+        if not 0 <= 1e-9 * (self._tracked_ns - self._told_ns) < FRESH_S:
+            self._publish_obstacles(self._tracked_ns)
+            self._told_ns = self._tracked_ns
 
-
-def _no_points(stamp_ns: int, frame_id: str) -> PointCloud2:
-    nothing = SparseCloud(np.zeros(0, np.int32), np.zeros((0, 3)))
-    return arrays.sparse_cloud_message(stamp_ns, frame_id, nothing)
+    def _publish_obstacles(self, stamp_ns: int) -> None:
+        """Publish the obstacles of the newest keyframe, or of a loaded map, where somebody has
+        begun to listen since they were published last, else that there are none.
+        """
+        before, self._listeners = self._listeners, self.outputs.listeners('obstacle_points')
+        if self._newest is None or not self._listeners:
+            return
+        frame_id, labelled = self._newest
+        rows = self._stage.standing(labelled) if self._listeners > before else np.zeros(0, np.intp)
+        message = arrays.points_at(stamp_ns, frame_id, labelled, rows)
+        self.outputs.publish('obstacle_points', message)
 
 
 def main() -> None:

@@ -56,7 +56,7 @@ def test_goals_and_path_are_where_the_frame_of_the_map_lies() -> None:
     poses = {t: pose(*xy) for t, xy in zip(stamps, in_map, strict=True)}
     true = {t: pose(*xy) for t, xy in zip(stamps, in_scene, strict=True)}
     reached = Goal(in_map[2], is_reached=True)
-    # The robot is where it stops one frame after it is told to.
+    # A command takes effect one frame after it is given.
     goals = [(reached, t) for t in stamps]
     grid = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1, (-0.5, -0.5))
     found = Exploration(START, poses, true, [Moment(2 * 10**9, grid, None)], [], goals, 4.0)

@@ -359,6 +359,32 @@ def test_that_nothing_is_new_is_published_while_a_tracked_robot_stands(make_grap
     stamps = [to_ns(message.header.stamp) for message in obstacles]
     assert stamps == [STAMP_NS, *later[4::5]], 'twice a second, at the stamps of tracked frames'
     assert [message.width for message in obstacles[1:]] == 4 * [0], 'who was there may have gone'
+    late = graph.collect('obstacle_points')
+    graph.until(lambda: node.count_subscribers('obstacle_points') == 2, 'who begins to listen')
+    for k in range(26, 32):
+        at = {'odometry': pose_message_at(STAMP_NS + k * 100_000_000)}
+        publish(graph, at, publishers)
+    graph.until(lambda: len(late) == 2, 'the points for him, then nothing new')
+    assert [message.width for message in late] == [3, 0]
+
+
+def test_a_keyframe_that_took_long_is_not_followed_at_once_by_nothing_new(make_graph) -> None:
+    graph = make_graph()
+    obstacles = graph.collect('obstacle_points')
+    node = graph.add(CloudLabellingNode())
+    first = cloud_messages(STAMP_NS)
+    publishers = publish(graph, first)
+    graph.until(lambda: len(obstacles) == 1, 'the keyframe')
+    graph.until(lambda: node.count_subscribers('odometry'), 'the subscription')
+    slow_ns = STAMP_NS + 1_000_000_000
+    publish(graph, {'odometry': pose_message_at(slow_ns + 700_000_000)}, publishers)
+    graph.until(lambda: len(obstacles) == 2, 'that nothing is new')
+    publish(graph, cloud_messages(slow_ns), publishers)
+    graph.until(lambda: len(obstacles) == 3, 'the keyframe, 0.7 s late')
+    publish(graph, {'odometry': pose_message_at(slow_ns + 800_000_000)}, publishers)
+    assert not graph.comes(lambda: len(obstacles) > 3, 0.5)
+    publish(graph, {'odometry': pose_message_at(slow_ns + 1_200_000_000)}, publishers)
+    graph.until(lambda: len(obstacles) == 4, 'that nothing is new')
 
 
 class TestFrameScan:
