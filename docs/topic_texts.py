@@ -109,7 +109,8 @@ ABOUT = {
     'obstacle_points': (
         'What the map may not hold yet: the obstacle points that the newest keyframe has seen and '
         'that do not stand alone (three within a cell): x y z id. Published while someone listens: '
-        'at every keyframe, and empty twice a second while the camera is tracked but makes none.'
+        'at every keyframe, and empty twice a second while the camera is tracked but makes none; '
+        'again for who begins to listen. With a loaded map that is not driven on, those of the map.'
     ),
     'keyframe/done': (
         'The header of every keyframe that goes no further: it is in the map, or a node could not '
