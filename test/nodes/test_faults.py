@@ -72,6 +72,7 @@ class Drive:
             return [m for m in self._odometry if to_ns(m.header.stamp) == found]
 
         self.chain.graph.until(poses, 'the last pose')
+        self.chain.graph.until(lambda: self.paths, 'the keyframes')
         first = int(path_arrays(self.paths[-1]).stamp_ns[0])
         truth = invert(self._truth[first]) @ self._truth[found]
         error = pose_array(poses()[0].pose.pose)[:3, 3] - truth[:3, 3]
