@@ -86,6 +86,7 @@ def drive(tmp_path_factory):
         try:
             drive = Drive(chain)
             chain.start(*CHAIN)
+            graph.until(lambda: graph.tester.count_publishers('keyframe/path'), 'the keyframes')
             yield drive
         finally:
             chain.stop()
