@@ -65,7 +65,6 @@ VERTEX = np.dtype(
         ('confidence', '<f4'),
     ]
 )
-_NO_IDS = np.zeros(0, np.int32)
 _PLY_TYPES = {'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
@@ -76,8 +75,7 @@ class CloudLabelling:
         self.settings = settings
         self._judged_by = settings
         self._table = PointTable()
-        self._seen: deque[NDArray[np.int32]] = deque([_NO_IDS], maxlen=_RECENT_KEYFRAMES)
-        self._is_restored = False
+        self._seen: deque[NDArray[np.int32]] = deque(maxlen=_RECENT_KEYFRAMES)
 
     def update(
         self,
@@ -95,9 +93,6 @@ class CloudLabelling:
         table, settings = self._table, self.settings
         table.follow(cloud.point_id)
         seen, row = table.rows_of(features.point_id)
-        if self._is_restored:
-            self._seen.clear()
-            self._is_restored = False
         self._seen.append(features.point_id[seen])
         looks = mask_evidence(mask, features.uv_px[seen]) * _MASK_LOG_ODDS
         xyz = cloud.xyz_map[row].astype(np.float64)
@@ -119,18 +114,19 @@ class CloudLabelling:
     def from_arrays(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Go on with what is known of the points of a map."""
         self._table.from_arrays(arrays)
-        self._seen.append(self._table.point_id)
-        self._is_restored = True
+        self._seen.clear()
 
     def standing(self, points: LabelledPoints) -> NDArray[np.intp]:
         """Return the rows (M,) of obstacles for a costmap, which remembers them: those that the
-        newest keyframe has seen, for who was there before may have gone. What stands somewhere has
-        several corners: a lone point above the floor is a wrong match.
+        newest keyframe has seen, for who was there before may have gone; of a loaded map all, until
+        one comes. What stands somewhere has several corners: a lone point above the floor is a
+        wrong match.
         """
+        seen = list(self._seen) or [points.point_id]
         row = np.flatnonzero(points.label == OBSTACLE)
-        row = row[np.isin(points.point_id[row], np.concatenate(self._seen))]
+        row = row[np.isin(points.point_id[row], np.concatenate(seen))]
         row = row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
-        return row[np.isin(points.point_id[row], self._seen[-1])]
+        return row[np.isin(points.point_id[row], seen[-1])]
 
     def labelled(self, cloud: SparseCloud) -> LabelledPoints:
         """Return a cloud with the labels known of its points, which are all in the table."""

@@ -223,17 +223,20 @@ class Costmap:
             return 0.0
         ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
         ways_m = np.arange(0, 2 * self._radius_m, self.grid.resolution_m)
-        best, soonest = [0.0, 0.0], [len(ways_m)] * 2
-        for sign in (1.0, -1.0):
-            places = pose[:2] + sign * ways_m[:, None] * ahead
-            known_m = np.array([self.standing_m(place) for place in places])
-            away_m = np.hypot(*(near[:, None] - places).T).min(axis=1, initial=np.inf)
-            for k, room_m in enumerate((np.minimum(known_m, away_m), known_m)):
+        for points in (near, near[:0]):
+            best, soonest = 0.0, len(ways_m)
+            for sign in (1.0, -1.0):
+                places = pose[:2] + sign * ways_m[:, None] * ahead
+                room_m = np.array([self.standing_m(place) for place in places])
+                away_m = np.hypot(*(points[:, None] - places).T).min(axis=1, initial=np.inf)
+                room_m = np.minimum(room_m, away_m)
                 ends = (room_m >= self._radius_m) | (room_m < room_m[0] - play_m)
                 first = int(np.argmax(ends))
-                if first < soonest[k] and room_m[first] >= self._radius_m:
-                    best[k], soonest[k] = sign, first
-        return best[0] or best[1]
+                if first < soonest and room_m[first] >= self._radius_m:
+                    best, soonest = sign, first
+            if best:
+                return best
+        return 0.0
 
     def numbers_of(self, cells: Cells) -> NDArray[np.int64]:
         """Return the numbers (N,) of places at cells (N, 2)."""
