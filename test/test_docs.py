@@ -86,6 +86,24 @@ def test_what_a_page_links_to_is_there(page) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize('page', PAGES, ids=lambda path: str(path.relative_to(DOCS.parent)))
+def test_the_heading_that_a_page_links_to_is_there(page) -> None:
+    links = re.findall(r'\]\((?!https?:)([^)#]*\.md|)#([^)]+)\)', page.read_text())
+    missing = [
+        (name, anchor)
+        for name, anchor in links
+        if anchor not in anchors((page.parent / name) if name else page)
+    ]
+    assert missing == []
+
+
+def anchors(page) -> set[str]:
+    """Return the names that headings of a page have in links."""
+    headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
+    plain = (re.sub(r'\[([^]]*)\]\([^)]*\)', r'\1', heading).lower() for heading in headings)
+    return {re.sub(r'[^\w -]', '', heading).replace(' ', '-') for heading in plain}
+
+
 def test_the_lifecycle_manager_of_the_page_manages_nodes_that_there_are() -> None:
     page = (DOCS / 'robot.md').read_text()
     manager = yaml.safe_load(page.partition('```yaml\n')[2].partition('```')[0])
