@@ -18,7 +18,12 @@ from typing import Any
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
-VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
+VARIABLES = (
+    'OPENBLAS_NUM_THREADS',
+    'OMP_NUM_THREADS',
+    'MKL_NUM_THREADS',
+    'OPENCV_FOR_THREADS_NUM',
+)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -34,11 +39,13 @@ def end_with_parent(parent_id: int) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def limit_blas_threads() -> None:
-    """Use one BLAS thread unless the environment says otherwise; call it before NumPy is imported.
+def limit_threads() -> None:
+    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it before
+    they are imported.
 
-    The matrices here are small: a second thread gains little on an idle machine, and on a busy one
-    the two wait for each other. The stages run side by side instead.
+    Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
+    time while it waits for work, and on a busy one the two wait for each other. The stages run side
+    by side instead.
     """
     for variable in VARIABLES:
         os.environ.setdefault(variable, '1')

@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from segfloor_ros.processes import limit_blas_threads
+from segfloor_ros.processes import limit_threads
 
 # Message fields of a wrong type must fail instead of being sent as garbage; read on import.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-limit_blas_threads()
+limit_threads()
 if 'PYTEST_XDIST_WORKER' in os.environ:
     import cv2  # not before the line above: it imports NumPy
 

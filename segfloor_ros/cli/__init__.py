@@ -2,9 +2,9 @@
 
 import sys
 
-from segfloor_ros.processes import limit_blas_threads
+from segfloor_ros.processes import limit_threads
 
-limit_blas_threads()
+limit_threads()
 
 
 def start() -> None:
