@@ -212,7 +212,7 @@ class StereoSlam:
             elif self.map.keyframes:
                 self.front_end.bridge(frame, fault)
                 self._search_on(frame, images, fault)
-        is_wanted = not fault and self.back_end.wants_keyframe(track)
+        is_wanted = not fault and self.back_end.wants_keyframe(track, frame.stamp_ns)
         searched = None
         if self._moving is not None and self._moving.is_due(
             frame.stamp_ns, is_wanted, track is not None

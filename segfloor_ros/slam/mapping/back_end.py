@@ -113,7 +113,7 @@ class BackEnd:
         """Whether there is an adjustment of a neighbourhood that is not in the map yet."""
         return self._local.holds_one
 
-    def wants_keyframe(self, track: Track | None) -> bool:
+    def wants_keyframe(self, track: Track | None, stamp_ns: int) -> bool:
         """Whether a frame is to become a keyframe: not while a loop is being closed."""
         front_end = self._front_end
         frames_since = front_end.frames_since_keyframe
@@ -123,7 +123,8 @@ class BackEnd:
             return not self._map.keyframes or front_end.is_new_place()
         if track.is_poor and frames_since < self._longest_frames // 3:
             return False
-        return front_end.local.wants_keyframe(track, frames_since, self.idle)
+        since_ns = stamp_ns - front_end.keyframe_ns
+        return front_end.local.wants_keyframe(track, frames_since, since_ns, self.idle)
 
     def take_in(self, keyframe: KeyframeRecord, images: Images, up_world: Up | None) -> bool:
         """Adjust the map to a new keyframe: close a loop where it sees a place again, and fit its

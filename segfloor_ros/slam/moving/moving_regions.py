@@ -32,14 +32,11 @@ from segfloor_ros.slam.moving.scene_flow import (
     SmallCamera,
     static_scale,
 )
-from segfloor_ros.slam.places.views import MIN_FRAMES
+from segfloor_ros.slam.places.views import is_due
 from segfloor_ros.slam.results import CHANCE_SHARE, MAJORITY, MovingPoints
 from segfloor_ros.slam.rig import MIN_DEPTH_M
 from segfloor_ros.slam.sparse_map import KeyframeRecord
 from segfloor_ros.slam.tracking.pose import FLOOR_M
-
-MIN_SINCE_NS = 200_000_000
-"""Frames are searched so far apart at least, or as keyframes."""
 
 DISPARITIES = 64
 BLOCK_PX = 5
@@ -122,8 +119,8 @@ class MovingRegions:
     def is_due(self, stamp_ns: int, is_keyframe: bool, is_tracked: bool) -> bool:
         """Whether to search a frame."""
         self._frames_since += 1
-        is_late = stamp_ns - self._searched_ns >= MIN_SINCE_NS
-        return is_keyframe or (is_tracked and is_late and self._frames_since >= MIN_FRAMES)
+        is_late = is_due(self._frames_since, stamp_ns - self._searched_ns)
+        return is_keyframe or (is_tracked and is_late)
 
     def search(
         self, frame: StereoFrame, T_camera_world: Array, T_odom_camera: Array, mount: Mount | None

@@ -41,9 +41,10 @@ NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06
 """Motion that makes a view new, as a share of the depth of what is seen, and turn: points move by
 some tens of pixels, and their patches still look alike."""
 
-MIN_FRAMES = 3
-"""Frames between keyframes while the mapper is idle (condition A2), and between two searches for
-what moves where no keyframe asks for one, e.g. while the robot stands."""
+MIN_FRAMES, MIN_NS = 3, 250_000_000
+"""Frames, and time, between keyframes while the mapper is idle (condition A2), and between two
+searches for what moves where no keyframe asks for one, e.g. while the robot stands: a camera that
+sends more images makes no more of them than one of 10 Hz."""
 
 REACH = 0.5, 0.5
 """Up to which a keyframe sees much the same: distance, as a share of the depth of what is seen, and
@@ -167,7 +168,7 @@ def covered_share(
 class View:
     """What the policy looks at.
 
-    frames_since: frames since the last keyframe. num_tracked: points tracked now. num_reliable:
+    frames_since, since_ns: frames and time since the last keyframe. num_tracked: points tracked now. num_reliable:
     points that several keyframes see, of the keyframe that shares most with this view. novelty: how
     far the view is from known ones, in units of what makes it new. mapper_idle: whether the mapper
     could take a keyframe at once. found_share: of the points that were looked for.
@@ -179,6 +180,12 @@ class View:
     novelty: float
     mapper_idle: bool = True
     found_share: float = 1.0
+    since_ns: int = MIN_NS
+
+
+def is_due(frames_since: int, since_ns: int) -> bool:
+    """Whether enough frames and time have gone by since a frame was looked at closely."""
+    return frames_since >= MIN_FRAMES and since_ns >= MIN_NS
 
 
 def is_keyframe(view: View, max_frames: int) -> bool:
@@ -186,7 +193,7 @@ def is_keyframe(view: View, max_frames: int) -> bool:
     robot that stands still adds nothing. max_frames: after which one is due (A1).
     """
     new_view = view.novelty > 1
-    due = view.frames_since >= MIN_FRAMES
+    due = is_due(view.frames_since, view.since_ns)
     due |= view.novelty > MUCH_NEW or view.found_share < MAJORITY
     a1 = view.frames_since >= max_frames and new_view
     a2 = view.mapper_idle and due and new_view

@@ -75,7 +75,7 @@ class FrontEnd:
         self.extractor = FeatureExtractor(settings)
         self.places = PlaceRecognition(sparse_map)
         self.is_fixed = False
-        self.frames_since_keyframe = 0
+        self.frames_since_keyframe = self.keyframe_ns = 0
         self._camera = sparse_map.rig.camera
         self._map = sparse_map
         self.relocaliser = Relocaliser(sparse_map, self.places)
@@ -315,7 +315,7 @@ class FrontEnd:
         ids = keyframe.point_id[rows]
         self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
         self.local.move_to(ids, keyframe.T_camera_world)
-        self.frames_since_keyframe = 0
+        self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
 
 
 def _with_prior(

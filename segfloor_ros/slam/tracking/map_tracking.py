@@ -296,8 +296,10 @@ class LocalMap:
         self.point_ids = self.point_ids[self._map.alive[self.point_ids]]
 
     @timed
-    def wants_keyframe(self, track: Track, frames_since: int, mapper_idle: bool) -> bool:
-        """Whether a frame shows enough that is new. frames_since: since the last keyframe."""
+    def wants_keyframe(
+        self, track: Track, frames_since: int, since_ns: int, mapper_idle: bool
+    ) -> bool:
+        """Whether a frame shows enough that is new. frames_since, since_ns: since the last one."""
         covisible = self._covisible(track.point_ids)
         reference = self._map.keyframes[covisible[0][0]]
         known = reference.point_id[reference.point_id != NO_POINT]
@@ -307,7 +309,7 @@ class LocalMap:
         num_reliable = min(len(reliable), TRACKED_POINTS)
         found = len(track.point_ids)
         share = found / max(1, len(track.visible_ids))
-        view = View(frames_since, found, num_reliable, novelty, mapper_idle, share)
+        view = View(frames_since, found, num_reliable, novelty, mapper_idle, share, since_ns)
         return is_keyframe(view, self._max_frames)
 
     def is_new_view(self, T_camera_world: Array) -> bool:
