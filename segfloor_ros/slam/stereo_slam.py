@@ -388,14 +388,14 @@ class StereoSlam:
         self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
     ) -> Keyframe | None:
         """Make the frame a keyframe; None where its features do not show what was tracked."""
-        observed = self.front_end.observe(frame, images, track)
-        if observed is None:
-            return None
         self._take_adjustment(wait=True)
         is_public = self._held.is_empty and not self.back_end.submap.is_beside
         if self.announce is not None and track is not None and self.mount is not None and is_public:
             result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
             self.announce(result, frame, images.excluded)
+        observed = self.front_end.observe(frame, images, track)
+        if observed is None:
+            return None
         self.back_end.mapper.measure_stereo(frame, images, observed)
         motion = self.front_end.motion
         keyframe = KeyframeRecord(

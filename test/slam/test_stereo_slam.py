@@ -116,10 +116,20 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
 
     def announce(result, frame, moving):
         assert slam.map.keyframes[-1].stamp_ns < result.stamp_ns  # not yet in the map
+        assert not observed  # nor measured
         announced[result.stamp_ns] = result, frame, moving
 
-    slam.announce = announce
-    results = [result for frame in frames for result in slam.process(frame)]
+    observe, observed = slam.front_end.observe, []
+
+    def note_observed(frame, images, track):
+        observed.append(frame.stamp_ns)
+        return observe(frame, images, track)
+
+    slam.announce, slam.front_end.observe = announce, note_observed
+    results = []
+    for frame in frames:
+        observed.clear()
+        results += slam.process(frame)
     slam.close()
     keyframes = [r for r in results if r.keyframe]
     # The first one begins the map.
@@ -127,10 +137,10 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
     for result in keyframes[1:]:
         early, frame, _ = announced[result.stamp_ns]
         np.testing.assert_array_equal(frame.left, result.keyframe.left)
-        np.testing.assert_allclose(early.T_odom_base, result.T_odom_base, atol=1e-12)
+        # By the points tracked alone, not by all features of the keyframe.
+        np.testing.assert_allclose(early.T_odom_base, result.T_odom_base, atol=1e-3)
         T_map_base = early.T_map_odom @ early.T_odom_base
-        np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=1e-12)
-        np.testing.assert_allclose(early.covariance, result.covariance, atol=1e-12)
+        np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=1e-3)
 
 
 def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
