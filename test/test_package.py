@@ -298,3 +298,19 @@ def test_the_command_starts_without_libraries_that_few_of_its_parts_need() -> No
     words = f'import sys, segfloor_ros.cli.main; print(sorted({heavy} & sys.modules.keys()))'
     found = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
     assert found.stdout.strip() == '[]', found.stderr
+
+
+@pytest.mark.parametrize('package', ['segfloor_ros.cli', 'segfloor_ros.nodes'])
+@pytest.mark.parametrize(('given', 'expected'), [(None, 1), ('2', 2)])
+def test_command_and_nodes_use_one_thread_of_opencv_unless_told_otherwise(package, given, expected):
+    environment = {k: v for k, v in os.environ.items() if k != 'OPENCV_FOR_THREADS_NUM'}
+    if given is not None:
+        environment['OPENCV_FOR_THREADS_NUM'] = given
+    printed = subprocess.run(
+        [sys.executable, '-c', f'import {package}, cv2; print(cv2.getNumThreads())'],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(printed.stdout) == expected

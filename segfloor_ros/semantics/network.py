@@ -187,6 +187,8 @@ def _opencv(path: Path) -> Run:
         raise InputError(
             f'{path}: OpenCV cannot read this network ({_first_line(error)}){OR_ELSE}'
         ) from None
+    # All else that uses OpenCV is too short for more than one.
+    cv2.setNumThreads(cv2.getNumberOfCPUs())
 
     def run(given: NDArray[np.float32]) -> list[NDArray[Any]]:
         network.setInput(given)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -31,6 +32,16 @@ def test_a_network_labels_an_image_of_any_size(tmp_path, runtime) -> None:
     assert (found.labels[:, :28] == 0).all()
     assert (found.labels[:, 32:] == 1).all()
     assert not found.instances.any()
+
+
+def test_a_network_of_opencv_has_all_cores(tmp_path) -> None:
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        Network(grey_network(tmp_path / 'grey.onnx', runtime='opencv'))
+        assert cv2.getNumThreads() == cv2.getNumberOfCPUs()
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_onnxruntime_also_runs_a_network_for_one_image_without_a_batch(tmp_path) -> None:
