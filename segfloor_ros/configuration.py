@@ -307,7 +307,8 @@ class StereoSlamNodeSettings(StereoSlamSettings, NodeSettings):
     max_waiting_frames: int = setting(
         3,
         'When more pairs than these wait, the oldest are skipped, so that poses stay fresh where '
-        'tracking is slower than the camera. A lossless stereo_camera sends no more at a time.',
+        'tracking is slower than the camera; while it is not, twice as many may wait for a '
+        'keyframe. A lossless stereo_camera sends no more at a time.',
         within=(3, 100),
         live=True,
     )

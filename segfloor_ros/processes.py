@@ -18,12 +18,7 @@ from typing import Any
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
-VARIABLES = (
-    'OPENBLAS_NUM_THREADS',
-    'OMP_NUM_THREADS',
-    'MKL_NUM_THREADS',
-    'OPENCV_FOR_THREADS_NUM',
-)
+VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -40,8 +35,8 @@ def end_with_parent(parent_id: int) -> None:
 
 
 def limit_threads() -> None:
-    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it before
-    they are imported.
+    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it
+    before they are imported.
 
     Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
     time while it waits for work, and on a busy one the two wait for each other. The stages run side

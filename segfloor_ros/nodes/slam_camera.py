@@ -61,7 +61,7 @@ PLAUSIBLE_ROLL_DEG, PLAUSIBLE_PITCH_DEG = 20.0, 60.0
 
 class PairQueue(deque[StampedPair]):
     """Keeps the newest pairs: a late pose is of no use to a robot. What came before processing
-    could begin is caught up on, not thrown away at once.
+    could begin, or while a keyframe was mapped, is caught up on, not thrown away at once.
     """
 
     def __init__(self) -> None:
@@ -70,10 +70,12 @@ class PairQueue(deque[StampedPair]):
 
     def skip_overdue(self, is_ready: bool, least: int) -> list[StampedPair]:
         """Take out the oldest pairs that are too many and return them. is_ready: processing has
-        begun; then no more than `least` wait for long.
+        begun; then no more than `least` wait for long, and twice as many since none waited.
         """
         if is_ready:
-            self._allowed = max(min(self._allowed - CATCH_UP, len(self)), least)
+            burst = 2 * least
+            allowed = burst if len(self) <= 1 else self._allowed - CATCH_UP
+            self._allowed = max(min(allowed, max(len(self), burst)), least)
         skipped = []
         while len(self) > self._allowed:
             skipped.append(self.popleft())

@@ -168,10 +168,11 @@ def covered_share(
 class View:
     """What the policy looks at.
 
-    frames_since, since_ns: frames and time since the last keyframe. num_tracked: points tracked now. num_reliable:
-    points that several keyframes see, of the keyframe that shares most with this view. novelty: how
-    far the view is from known ones, in units of what makes it new. mapper_idle: whether the mapper
-    could take a keyframe at once. found_share: of the points that were looked for.
+    frames_since, since_ns: frames and time since the last keyframe. num_tracked: points tracked
+    now. num_reliable: points that several keyframes see, of the keyframe that shares most with this
+    view. novelty: how far the view is from known ones, in units of what makes it new. mapper_idle:
+    whether the mapper could take a keyframe at once. found_share: of the points that were looked
+    for.
     """
 
     frames_since: int

@@ -28,9 +28,9 @@ def test_novelty_is_motion_for_the_depth_or_rotation(motion, depth_m, expected):
         (View(10, 200, 300, 0.9), False),
         (View(2, 200, 300, 1.5), False),  # too soon
         (View(3, 200, 300, 1.5), True),
-        (View(6, 200, 300, 1.5, since_ns=int(2e8)), False),  # a camera that sends 30 images a second
+        (View(6, 200, 300, 1.5, since_ns=int(2e8)), False),  # a camera of 30 Hz
         (View(8, 200, 300, 1.5, since_ns=int(27e7)), True),
-        (View(2, 200, 300, 1.5, since_ns=int(4e8)), False),  # and one that sends five
+        (View(2, 200, 300, 1.5, since_ns=int(4e8)), False),  # and one of 5 Hz
         (View(3, 200, 300, 4.0, since_ns=int(1e8)), True),
         (View(1, 200, 300, 4.0), True),  # so new that it waits for no frames
         (View(1, 200, 300, 1.5, found_share=0.4), True),  # the next frame finds fewer still
