@@ -110,22 +110,32 @@ def test_the_background_thread_loses_nothing(frames):
         assert np.linalg.norm((invert(a.T_odom_base) @ b.T_odom_base)[:3, 3]) < 0.05
 
 
-def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(frames):
+@pytest.mark.parametrize('is_late', [False, True])
+def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(frames, is_late):
+    """Before its features are measured; late where an adjustment has still to move the map."""
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
-    announced = {}
+    announced, observed = {}, []
+    observe, take_adjustment = slam.front_end.observe, slam._take_adjustment
 
     def announce(result, frame, moving):
         assert slam.map.keyframes[-1].stamp_ns < result.stamp_ns  # not yet in the map
-        assert not observed  # nor measured
+        # The second one has no adjustment before it.
+        assert len(observed) == (is_late and len(slam.map.keyframes) > 1)
         announced[result.stamp_ns] = result, frame, moving
-
-    observe, observed = slam.front_end.observe, []
 
     def note_observed(frame, images, track):
         observed.append(frame.stamp_ns)
+        # The map is as it was when the frame was tracked in it.
+        if track is not None:
+            pose = slam.front_end.motion.T_camera_world
+            np.testing.assert_allclose(track.T_camera_world, pose, atol=1e-12)
         return observe(frame, images, track)
 
     slam.announce, slam.front_end.observe = announce, note_observed
+    if is_late:
+        slam._take_adjustment = lambda wait: take_adjustment(wait) if wait else None
+    else:
+        slam._take_adjustment = lambda wait: take_adjustment(wait=True)
     results = []
     for frame in frames:
         observed.clear()
@@ -134,13 +144,14 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
     keyframes = [r for r in results if r.keyframe]
     # The first one begins the map.
     assert list(announced) == [r.stamp_ns for r in keyframes[1:]]
-    for result in keyframes[1:]:
+    for result in keyframes[2:]:
         early, frame, _ = announced[result.stamp_ns]
         np.testing.assert_array_equal(frame.left, result.keyframe.left)
-        # By the points tracked alone, not by all features of the keyframe.
-        np.testing.assert_allclose(early.T_odom_base, result.T_odom_base, atol=1e-3)
+        # Early it is by the points tracked alone, not by all features of the keyframe.
+        tolerance = 1e-12 if is_late else 1e-3
+        np.testing.assert_allclose(early.T_odom_base, result.T_odom_base, atol=tolerance)
         T_map_base = early.T_map_odom @ early.T_odom_base
-        np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=1e-3)
+        np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=tolerance)
 
 
 def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
