@@ -303,6 +303,25 @@ def test_what_is_kept_is_found_once_by_the_same_user_and_only_for_a_while(own_fo
     assert not file.exists()
 
 
+def test_what_came_too_soon_after_the_last_is_kept_when_it_is_time(own_folder) -> None:
+    """A robot that stands makes no keyframe that would keep the one before."""
+    kept = KeptState('/robot/stereo_slam', 30.0)
+    keep(kept)
+    keep(kept, 2)
+    deadline_s = time.monotonic() + 20
+    while not kept.is_due and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    kept.catch_up()
+    kept.finish()
+    assert kept_value(kept) == 2
+    kept.catch_up()
+    assert kept_value(kept) is None, 'once'
+    keep(kept, 3)
+    kept.remove()
+    kept.catch_up()
+    assert kept_value(kept) is None, 'what is removed does not come back'
+
+
 def test_what_a_killed_node_leaves_does_not_reach_the_next_graph(monkeypatch) -> None:
     for _ in range(2):
         with surroundings():

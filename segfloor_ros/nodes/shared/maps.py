@@ -229,6 +229,7 @@ class KeptState:
         self._resume_within_s = resume_within_s
         self._next_save_s = -float('inf')
         self._writing: threading.Thread | None = None
+        self._waiting: Callable[[], MapFile] | None = None
 
     @property
     def is_due(self) -> bool:
@@ -251,12 +252,18 @@ class KeptState:
             written.replace(self._note)
 
     def save(self, make: Callable[[], MapFile]) -> None:
-        """Keep what `make` returns in place of the last map, unless that was kept only just now; it
-        is written beside the work of the node. A full disk is no reason to stop: the older map
-        stays.
+        """Keep what `make` returns in place of the last map, later where that was kept only just
+        now (`catch_up`); it is written beside the work of the node. A full disk is no reason to
+        stop: the older map stays.
         """
-        if self.is_due:
-            start_s = time.monotonic()
+        self._waiting = make
+        self.catch_up()
+
+    def catch_up(self) -> None:
+        """Keep what is still to be kept, once it is time."""
+        make = self._waiting
+        if make is not None and self.is_due:
+            self._waiting, start_s = None, time.monotonic()
             self._writing = threading.Thread(target=self._write, args=(make(), start_s))
             self._writing.start()
 
@@ -296,6 +303,7 @@ class KeptState:
 
     def remove(self) -> None:
         """Leave nothing to be taken up; in a folder that is not private, nothing is touched."""
+        self._waiting = None
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()

@@ -305,7 +305,8 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
         super().destroy_node()
 
     def _check(self) -> None:
-        """Report connections and health, and look whether the node is needed."""
+        """Report connections and health, look whether the node is needed, and keep the map."""
+        self.kept_state.catch_up()
         connections, now_s = self._connections, time.monotonic()
         always = not self.works_on_demand or self.states.label != 'active'
         self.states.need(connections.are_needed(always or self.is_needed_otherwise()))
