@@ -388,15 +388,22 @@ class StereoSlam:
         self, frame: StereoFrame, images: Images, track: Track | None, searched: Searched | None
     ) -> Keyframe | None:
         """Make the frame a keyframe; None where its features do not show what was tracked."""
+
+        def announce() -> None:
+            is_public = self._held.is_empty and not self.back_end.submap.is_beside
+            if self.announce and track is not None and self.mount is not None and is_public:
+                result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
+                self.announce(result, frame, images.excluded)
+
         is_late = self.back_end.holds_one  # the map moves when that is brought in
         if not is_late:
-            self._announce(frame, images, track)
+            announce()
         observed = self.front_end.observe(frame, images, track)
         if observed is None:
             return None
         self._take_adjustment(wait=True)
         if is_late:
-            self._announce(frame, images, track)
+            announce()
         self.back_end.mapper.measure_stereo(frame, images, observed)
         motion = self.front_end.motion
         keyframe = KeyframeRecord(
@@ -432,13 +439,6 @@ class StereoSlam:
             self._held.change(in_merged_map(self.map, self.front_end.motion.T_world_odom))
         self.front_end.continue_from(images, keyframe)
         return take_snapshot(self.map, keyframe, frame, images.excluded)
-
-    def _announce(self, frame: StereoFrame, images: Images, track: Track | None) -> None:
-        """Announce a frame that becomes a keyframe, where its results are not held back."""
-        is_public = self._held.is_empty and not self.back_end.submap.is_beside
-        if self.announce is not None and track is not None and self.mount is not None and is_public:
-            result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
-            self.announce(result, frame, images.excluded)
 
     def _look_for_mount(self, frame: StereoFrame, is_new_view: bool) -> None:
         """Look for the floor at a keyframe; at other frames now and then: a camera that stands may
