@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Annotated
 
+import cv2
 import typer
 
 import segfloor_ros
@@ -72,6 +73,7 @@ def _options(
 def main() -> None:
     """Run the command line."""
     use_rosbag2_py()
+    cv2.setNumThreads(-1)  # OpenCV with TBB asks the environment only then
     run_app(app)
 
 

@@ -70,7 +70,7 @@ class PairQueue(deque[StampedPair]):
 
     def skip_overdue(self, is_ready: bool, least: int) -> list[StampedPair]:
         """Take out the oldest pairs that are too many and return them. is_ready: processing has
-        begun; then no more than `least` wait for long, and twice as many since none waited.
+        begun; then no more than `least` wait for long, or twice as many soon after none waited.
         """
         if is_ready:
             burst = 2 * least

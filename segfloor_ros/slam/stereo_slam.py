@@ -135,6 +135,7 @@ class StereoSlam:
         self._moving = MovingRegions(camera) if settings.detect_moving else None
         self._lost_ns: int | None = None
         self._looked_ns = 0
+        self._shows_nothing = False
         self._began_unsure: tuple[Array, Array] | None = None
         self._loaded_ns: int | None = None
         self.late_masks = LateMasks(self.front_end, self.map, settings.mask_dilation_px)
@@ -177,7 +178,7 @@ class StereoSlam:
         """Track one frame and return the results that are ready, oldest first."""
         with self._times.measure('tracking'):
             self._take_adjustment(wait=False)
-            if not self.back_end.holds_one:
+            if not self.back_end.holds_one():
                 self.late_masks.take_points_back()
             self.sensors.T_base_left = self.mount.T_base_left if self.mount else None
             fault = self.front_end.fault(frame)
@@ -395,10 +396,12 @@ class StereoSlam:
                 result = in_map(self._result(frame, track, '', None), self.mount.T_base_left)
                 self.announce(result, frame, images.excluded)
 
-        is_late = self.back_end.holds_one  # the map moves when that is brought in
+        # Not early where the map may move before, nor after a frame that did not become one.
+        is_late = self.back_end.holds_one(of_all=True) or self._shows_nothing
         if not is_late:
             announce()
         observed = self.front_end.observe(frame, images, track)
+        self._shows_nothing = observed is None
         if observed is None:
             return None
         self._take_adjustment(wait=True)

@@ -154,6 +154,46 @@ def test_pose_and_images_of_a_keyframe_are_announced_before_the_map_takes_it_in(
         np.testing.assert_allclose(T_map_base, result.keyframe.T_map_base, atol=tolerance)
 
 
+def test_a_keyframe_is_announced_late_while_the_whole_map_may_move(frames):
+    """And after a frame that did not become one: nobody waits for more than one in vain."""
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT, background=True)
+    take_adjustment, observe = slam._take_adjustment, slam.front_end.observe
+    slam._take_adjustment = lambda wait: take_adjustment(wait=True)
+    observed, early, is_blank = [], [], [False]
+
+    def note_observed(frame, images, track):
+        observed.append(frame.index)
+        return None if is_blank[0] else observe(frame, images, track)
+
+    def announce(result, frame, moving):
+        early.append(frame.index not in observed)
+
+    slam.front_end.observe, slam.announce = note_observed, announce
+    left = iter(frames)
+
+    def drive_on():
+        before = len(early), len(slam.map.keyframes)
+        while (len(early), len(slam.map.keyframes)) == before:
+            slam.process(next(left))
+        return early[-1]
+
+    slam.process(next(left))
+    assert drive_on()
+    slam.back_end._global._apply = lambda result: None
+    assert not drive_on()
+    slam.back_end._global._apply = None
+    is_blank[0] = True
+    assert drive_on()
+    count = len(early)
+    for _ in range(3):
+        slam.process(next(left))
+    assert len(early) == count
+    is_blank[0] = False
+    assert not drive_on()
+    assert drive_on()
+    slam.close()
+
+
 def test_an_adjustment_moves_the_camera_with_its_keyframe_and_leaves_odom(frames):
     slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
     for frame in frames[:12]:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import cv2
 import rclpy
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -121,6 +122,7 @@ def run_nodes(make_nodes: Callable[[], Sequence[Node]]) -> None:
     signal.signal(signal.SIGINT, _interrupt)
     try:
         _share_one_heap()
+        cv2.setNumThreads(-1)  # OpenCV with TBB asks the environment only then
         prepare_middleware()
         _begin_ros(sys.argv)
         executor = SingleThreadedExecutor()

@@ -306,7 +306,10 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
 
     def _check(self) -> None:
         """Report connections and health, look whether the node is needed, and keep the map."""
-        self.kept_state.catch_up()
+        try:
+            self.kept_state.catch_up()
+        except Exception as error:
+            self.reporter.log_fault('kept map', error)
         connections, now_s = self._connections, time.monotonic()
         always = not self.works_on_demand or self.states.label != 'active'
         self.states.need(connections.are_needed(always or self.is_needed_otherwise()))

@@ -108,10 +108,11 @@ class BackEnd:
         known = self._known
         return self.submap is Submap.LOST and known is not None and not known.of_drive
 
-    @property
-    def holds_one(self) -> bool:
-        """Whether there is an adjustment of a neighbourhood that is not in the map yet."""
-        return self._local.holds_one
+    def holds_one(self, of_all: bool = False) -> bool:
+        """Whether there is an adjustment of a neighbourhood that is not in the map yet; of_all: or
+        of the whole map.
+        """
+        return self._local.holds_one or (of_all and self._global.holds_one)
 
     def wants_keyframe(self, track: Track | None, stamp_ns: int) -> bool:
         """Whether a frame is to become a keyframe: not while a loop is being closed."""

@@ -44,7 +44,7 @@ some tens of pixels, and their patches still look alike."""
 MIN_FRAMES, MIN_NS = 3, 250_000_000
 """Frames, and time, between keyframes while the mapper is idle (condition A2), and between two
 searches for what moves where no keyframe asks for one, e.g. while the robot stands: a camera that
-sends more images makes no more of them than one of 10 Hz."""
+sends more images makes hardly more of them than one of 10 Hz."""
 
 REACH = 0.5, 0.5
 """Up to which a keyframe sees much the same: distance, as a share of the depth of what is seen, and
