@@ -18,9 +18,9 @@ from typing import Any
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
-VARIABLES = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
+BLAS_VARIABLES = 'OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def end_with_parent(parent_id: int) -> None:
@@ -35,15 +35,16 @@ def end_with_parent(parent_id: int) -> None:
 
 
 def limit_threads() -> None:
-    """Use one thread of BLAS and one of OpenCV unless the environment says otherwise; call it
-    before they are imported.
+    """Use one thread of BLAS whatever the environment says, since the number of threads changes the
+    last digits of a result, and one of OpenCV unless the environment says otherwise; call it before
+    they are imported.
 
     Matrices and images here are small: a second thread gains little on an idle machine, costs CPU
     time while it waits for work, and on a busy one the two wait for each other. The stages run side
     by side instead.
     """
-    for variable in VARIABLES:
-        os.environ.setdefault(variable, '1')
+    os.environ.update(dict.fromkeys(BLAS_VARIABLES, '1'))
+    os.environ.setdefault('OPENCV_FOR_THREADS_NUM', '1')
 
 
 def start_apart(work: Callable[..., None], *arguments: Any) -> tuple[Connection, SpawnProcess]:
@@ -76,18 +77,20 @@ class Interrupt(threading.Event):
 
 @contextlib.contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Let SIGTERM within the block end what is under way with all its clean-ups, status 143."""
+    """Let SIGTERM and SIGHUP within the block end what is under way with all its clean-ups, status
+    143 and 129.
+    """
 
     def end(number: int, frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
-    with _handled_by(end, (signal.SIGTERM,)):
+    with _handled_by(end, (signal.SIGTERM, signal.SIGHUP)):
         yield
 
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Deliver SIGINT and SIGTERM at the end of the block, so that none falls between the start of a
+    """Deliver SIGINT, SIGTERM and SIGHUP at the end of the block, so that none falls between the start of a
     process and the note that it runs, or into a fork, where exceptions are ignored. A started
     program gets the default handlers again. Beside the main thread, which alone gets signals,
     nothing is done.
@@ -108,7 +111,7 @@ def interrupts_deferred() -> Iterator[None]:
 
 @contextlib.contextmanager
 def first_interrupt_noted() -> Iterator[Interrupt]:
-    """Set an event at the first SIGINT or SIGTERM within the block, so that the work can come to an
+    """Set an event at the first SIGINT, SIGTERM or SIGHUP within the block, so that the work can come to an
     orderly end; the next one takes its usual course.
     """
     event = Interrupt()

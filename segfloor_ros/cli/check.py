@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import tempfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,19 +16,19 @@ from rich.text import Text
 from segfloor_ros.cli.terminal import View, console, figure_table, number_option, print_error
 from segfloor_ros.cli.view import open_view, show_results
 from segfloor_ros.errors import InputError, SettingsError, os_errors
-from segfloor_ros.files.results import add_files, check_target, check_writable
 from segfloor_ros.files.whole import read_json, read_text
+from segfloor_ros.files.writing import add_files, check_output, check_target, folder_in_the_making
 from segfloor_ros.geometry import Pose2d
 from segfloor_ros.results_folder import OUTPUT_NAMES
 from segfloor_ros.suite.description import Suite, read_suite
 from segfloor_ros.suite.job import LOG, SAVED_MAP, Job, Outcome, outcomes, package_digest
 from segfloor_ros.suite.measures import (
+    BASELINE,
     Baseline,
     Checked,
     SuiteResult,
     bounds_of_baseline,
     check,
-    is_baseline,
     known_measures,
     number,
     read_baseline,
@@ -92,11 +91,12 @@ def check_suite(
     known = read_baseline(baseline) if baseline is not None else None
     _check_out(out, described)
     if baseline_to_write is not None:
-        check_writable(baseline_to_write, '--write-baseline', is_baseline)
+        check_output(baseline_to_write, BASELINE, [baseline, suite], '--write-baseline')
     folder = (cache or _default_cache()).absolute()
     todo = _jobs(described, folder, not no_cache)
     found: dict[str, Checked] = {}
     with (
+        folder_in_the_making(out),
         open_view(view) as shown,
         contextlib.closing(_all_outcomes(todo, out, resume, jobs, scheduler)) as results,
     ):
@@ -119,15 +119,11 @@ def check_suite(
 
 
 def _check_out(out: Path, suite: Suite) -> None:
-    """Raise InputError unless all results can be written to a folder, which is made."""
+    """Raise InputError unless all results can be written to a folder."""
     named = [(entry.input, entry.truth, entry.reference_map) for entry in suite.entries]
     check_target(out, (JUNIT, PAGE), [path for paths in named for path in paths])
     for entry in suite.entries:
         check_target(out / entry.name, FILES)
-    with os_errors(f'{out}: cannot be a folder for the results', '; choose another --out'):
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
 
 
 def _jobs(suite: Suite, cache: Path, reuse: bool) -> list[Job]:

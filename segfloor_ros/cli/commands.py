@@ -18,12 +18,12 @@ from segfloor_ros.cli import terminal
 from segfloor_ros.cli.evaluate import map_table
 from segfloor_ros.cli.terminal import DriveOptions, console, number_option
 from segfloor_ros.cli.view import open_view
-from segfloor_ros.configuration import Configuration, StereoCameraNodeSettings
+from segfloor_ros.configuration import StereoCameraNodeSettings
 from segfloor_ros.errors import MapError, SettingsError, about
 from segfloor_ros.evaluation.map_score import compare, overlay_png, score_map
 from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.files.results import add_files
 from segfloor_ros.files.whole import read_yaml
+from segfloor_ros.files.writing import add_files
 from segfloor_ros.grid.map_file import load_map
 from segfloor_ros.lockstep import LockstepRun, SaveMasks
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
@@ -58,9 +58,9 @@ def run(
     maps = options.maps
     sees = None if options.network is None else Network(options.network)
     configuration, source = options.open()
-    with open_view(options.view) as view:
+    with open_view(options.view, options.inputs) as view:
         with (
-            _drive(options, configuration) as (folder, interrupt),
+            _drive(options) as (folder, interrupt),
             terminal.progress_bar('mapping', source.frame_count) as progress,
         ):
             drive = LockstepRun(
@@ -94,17 +94,11 @@ def run(
 
 
 @contextmanager
-def _drive(
-    options: DriveOptions, configuration: Configuration
-) -> Iterator[tuple[OutputFolder, Interrupt]]:
+def _drive(options: DriveOptions) -> Iterator[tuple[OutputFolder, Interrupt]]:
     """The results folder of a drive, and the interrupt that ends it early: where there is no map
     yet, the command ends.
     """
-    camera = configuration.stereo_camera
-    with (
-        OutputFolder(options.out, (camera.input, camera.masks)) as folder,
-        first_interrupt_noted() as interrupt,
-    ):
+    with OutputFolder(options.out, options.inputs) as folder, first_interrupt_noted() as interrupt:
         try:
             yield folder, interrupt
         except MapError:
@@ -144,9 +138,9 @@ def replay(
         camera = dataclasses.replace(configuration.stereo_camera, depth=True)
         configuration = dataclasses.replace(configuration, stereo_camera=camera)
     loaded = maps.read(source.camera)
-    with open_view(options.view) as view:
+    with open_view(options.view, options.inputs) as view:
         with (
-            _drive(options, configuration) as (folder, interrupt),
+            _drive(options) as (folder, interrupt),
             terminal.progress_bar('replaying', source.frame_count) as progress,
         ):
             keep = partial(folder.add_picture, 'floor_masks')

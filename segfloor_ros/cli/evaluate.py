@@ -56,8 +56,8 @@ from segfloor_ros.evaluation.maps import (
     load_truth,
     read_base_poses,
 )
-from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number, read_table
+from segfloor_ros.files.writing import PNG, check_output, marked_png, write_output
 from segfloor_ros.geometry import Pose2d
 from segfloor_ros.grid.map_file import OccupancyGrid, load_map
 from segfloor_ros.trajectory import FARTHEST, TUM_COLUMNS
@@ -107,6 +107,9 @@ def evaluate_map(
     segfloor evaluate map result corridor1 --overlay overlay.png
     segfloor evaluate map result truth.yaml --align found --json
     """
+    inputs = [estimate, truth, trajectory]
+    if overlay is not None:
+        check_output(overlay, PNG, inputs, '--overlay')
     grid = load_map(estimate / 'map.yaml' if estimate.is_dir() else estimate)
     known = load_truth(truth)
     pose = resolve_alignment(align, grid, known)
@@ -114,7 +117,8 @@ def evaluate_map(
     plan = RoadMapPlan(nodes=nodes, min_distance_m=min_distance, repetitions=repetitions, seed=seed)
     score = score_map(grid, known, pose, plan, sight)
     if overlay is not None:
-        write_file(overlay, overlay_png(compare(grid, known, pose, sight)))
+        picture = marked_png(overlay_png(compare(grid, known, pose, sight)))
+        write_output(overlay, PNG, picture, inputs)
     if as_json:
         return print_json(dataclasses.asdict(score))
     console.print(map_table(score))
@@ -143,11 +147,14 @@ def evaluate_trajectory(
     """
     # Imported here: evo and matplotlib take a second that no other command should wait for.
     from segfloor_ros.evaluation.trajectory import (
+        check_plot,
         match_files,
         save_trajectory_plot,
         score_trajectory,
     )
 
+    if plot is not None:
+        check_plot(plot, [estimate, truth])
     matched = match_files(estimate, truth, frames)
     score = score_trajectory(matched)
     if plot is not None:

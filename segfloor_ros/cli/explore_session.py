@@ -38,8 +38,8 @@ from segfloor_ros.evaluation.exploration import (
     reachable_floor,
     write_film,
 )
-from segfloor_ros.files.results import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.files.whole import read_json, read_yaml
+from segfloor_ros.files.writing import check_target, folder_in_the_making, move_into_place
 from segfloor_ros.floor.observation import FloorScan
 from segfloor_ros.geometry import Array, Pose2d, planar, transform_points
 from segfloor_ros.grid.map_file import OccupancyGrid, save_map

@@ -16,11 +16,13 @@ from segfloor_ros.camera.bag_writer import convert as write_bag
 from segfloor_ros.camera.calibration.chessboard import (
     DICTIONARY,
     FILES,
+    PAGE,
     Board,
     CalibrationResult,
     calibrate_folder,
     check_recording,
 )
+from segfloor_ros.camera.calibration.chessboard import write as write_calibration
 from segfloor_ros.camera.model import DEPTH
 from segfloor_ros.camera.rig.check import SETTLED_FRAMES
 from segfloor_ros.camera.sources import open_source
@@ -31,6 +33,7 @@ from segfloor_ros.cli.terminal import console, figure_table, number_option, valu
 from segfloor_ros.cli.view import open_view, show_recording, show_results
 from segfloor_ros.errors import InputError, SettingsError, os_errors
 from segfloor_ros.files.results import is_map_file
+from segfloor_ros.files.whole import user_path
 from segfloor_ros.processes import Interrupt, first_interrupt_noted
 from segfloor_ros.results_folder import read_summary
 
@@ -51,7 +54,7 @@ def info(
     segfloor info result
     """
     name = options.input
-    path = Path(name).expanduser()
+    path = user_path(name)
     known = _known_output(path)
     if known and as_json:
         return terminal.print_json({'name': name, 'kind': known})
@@ -132,7 +135,8 @@ def record(
 ) -> None:
     """Record topics of the live graph, or a camera of this machine, to a rosbag2 (mcap).
 
-    Ctrl-C, and a disk that becomes full, leave a whole file.
+    Whatever ends it, what is recorded stays in OUT. Ctrl-C, SIGTERM, SIGHUP and a disk that becomes
+    full leave a complete file; a file that lacks its end is read all the same.
 
     \b
     segfloor record drive.mcap
@@ -163,7 +167,10 @@ def _record_topics(out: Path, topics: str | None, seconds: float, interrupt: Int
         dropped = sum(record.dropped for record in pictures)
         status.update(f'{size_mb:.0f} MB, images at {rates} Hz, {dropped} dropped')
 
-    with NewBag(out) as bag, terminal.error_console.status('waiting for topics') as status:
+    with (
+        NewBag(out, keeps=True) as bag,
+        terminal.error_console.status('waiting for topics') as status,
+    ):
         records, is_full = record_topics(bag, topics, seconds, interrupt, show)
         if not any(record.messages for record in records.values()):
             names = ', '.join(records) or 'none that is wanted'
@@ -183,7 +190,7 @@ def _record_device(
     """Return whether the disk became full."""
     pairs, first_ns, elapsed_s, is_full = 0, 0, 0.0, False
     writing = os_errors(f'{out}: cannot be written')
-    writer = BagWriter(out, source.calibration, images)
+    writer = BagWriter(out, source.calibration, images, keeps=True)
     with writing, writer as bag, terminal.progress_bar('recording', None) as progress:
         for pair in source.raw_pairs():
             bag.write(pair)
@@ -216,7 +223,7 @@ def view(
     segfloor view / --live
     """
     folder = Path(options.input)
-    with open_view(str(out or '')) as shown:
+    with open_view(str(out or ''), [options.input, options.params]) as shown:
         assert shown is not None
         if live:
             with terminal.needing_ros('--live'):
@@ -307,14 +314,15 @@ def calibrate(
         result = calibrate_folder(folder, pattern, out, progress)
     if result.left_out:
         terminal.print_error(f'{folder}: left out: {result.left_out}')
-    _print_calibration(result, out or folder)
+    _print_calibration(result, folder, out)
 
 
-def _print_calibration(result: CalibrationResult, folder: Path) -> None:
+def _print_calibration(result: CalibrationResult, pictures: Path, out: Path | None) -> None:
     """Print figures of a calibration and the errors of each pair, and write its report."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
-    from segfloor_ros.evaluation.report import write_calibration_page
+    from segfloor_ros.evaluation.report import calibration_page
 
+    folder = out or pictures
     table = figure_table('pair', 'left px', 'right px', 'rows px')
     for view, errors_px in zip(result.views, result.view_errors_px, strict=True):
         table.add_row(view.paths[0].name, *(f'{error:.3f}' for error in errors_px))
@@ -331,9 +339,9 @@ def _print_calibration(result: CalibrationResult, folder: Path) -> None:
         ('baseline', f'{camera.baseline_m:.4f} m'),
     ]
     console.print(value_table('calibration', rows, str(folder)))
-    page = write_calibration_page(result, rows, folder)
-    for path in (*(folder / name for name in FILES), page):
-        console.print(str(path), soft_wrap=True)
+    write_calibration(pictures, out, {PAGE: calibration_page(result, rows, folder)})
+    for name in (*FILES, PAGE):
+        console.print(str(folder / name), soft_wrap=True)
 
 
 def _check_calibration(source: StereoSource, board: Board | None) -> None:

@@ -26,7 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from segfloor_ros.cli.replay_recorder import SEMANTIC, SPIN_S, MaskListener, ReplayRecorder
 from segfloor_ros.errors import MapError, SegfloorError
-from segfloor_ros.files.results import scratch_folder
+from segfloor_ros.files.writing import scratch_folder
 from segfloor_ros.grid.map_file import OccupancyGrid
 from segfloor_ros.lockstep import ProgressListener
 from segfloor_ros.messages.arrays import grid_of

@@ -10,7 +10,7 @@ integers, so that the same observations give the same cells on every machine.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import InputError, MapError
+from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import read_picture
-from segfloor_ros.files.results import replacing
 from segfloor_ros.files.whole import read_yaml
+from segfloor_ros.files.writing import MARK, PGM, YAML, check_output, write_output
 from segfloor_ros.geometry import Array
 from segfloor_ros.settings import StageSettings, setting
 
@@ -72,8 +72,9 @@ def save_map(
     """Write `path` (YAML) and the PGM of the same name beside it; both appear whole or not at all.
 
     Free, occupied and unknown are kept; with mode `raw`, the numbers of the cells. facts: further
-    entries of the YAML. Raises MapError when the folder cannot be written.
+    entries of the YAML. Raises InputError where they cannot be written.
     """
+    check_map_output(path)
     image_path = path.with_suffix('.pgm')
     description = {
         'image': image_path.name,
@@ -86,8 +87,18 @@ def save_map(
         **(facts or {}),
     }
     pixels = grid.cells[::-1].view(np.uint8) if mode == 'raw' else grid.picture
-    _replace_file(image_path, _pgm_bytes(pixels))
-    _replace_file(path, yaml.safe_dump(description, sort_keys=False).encode())
+    text = f'# {MARK}\n{yaml.safe_dump(description, sort_keys=False)}'
+    write_output(image_path, PGM, _pgm_bytes(pixels))
+    write_output(path, YAML, text.encode())
+
+
+def check_map_output(path: Path, inputs: Iterable[Path | str | None] = ()) -> None:
+    """Raise InputError unless a map can be written to `path` (YAML) and the PGM beside it."""
+    inputs = [*inputs]
+    if path.suffix == '.pgm':
+        raise InputError(f'{path}: is a name for the image; name the YAML file')
+    check_output(path, YAML, inputs)
+    check_output(path.with_suffix('.pgm'), PGM, inputs)
 
 
 def load_map(path: Path) -> OccupancyGrid:
@@ -111,15 +122,7 @@ def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _pgm_bytes(pixels: NDArray[np.uint8]) -> bytes:
     rows, columns = pixels.shape
-    return f'P5\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
-
-
-def _replace_file(path: Path, content: bytes) -> None:
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise MapError(f'{path}: cannot write the map ({error.strerror})') from error
+    return f'P5\n# {MARK}\n{columns} {rows}\n255\n'.encode() + pixels.tobytes()
 
 
 def _read_description(path: Path) -> dict[str, Any]:

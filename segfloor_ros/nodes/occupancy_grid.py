@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path as FilePath
 from typing import Any
 
 from rclpy.timer import Timer
@@ -94,7 +93,7 @@ class OccupancyGridNode(StageNode[OccupancyGridNodeSettings]):
             raise SettingsError('map_file is empty; set it to the name of a file, e.g. map.yaml')
         if not self._part.frame_id:
             raise MapError('there is no map yet: no keyframe has arrived')
-        path = FilePath(name).expanduser().absolute()
+        path = user_path(name).absolute()
         if path.suffix not in YAML_SUFFIXES:
             path = path.with_name(f'{path.name}.yaml')
         save_map(self._stage.grid(), path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -128,7 +127,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
 
     def set_up(self) -> None:
         """Read the network and make the topics."""
-        network = Network(Path(self.settings.network).expanduser())
+        network = Network(user_path(self.settings.network))
         self._labeller = ImageLabeller(network)
         self._every = network.settings.every
         self._work = self.inputs.later(self._process)

@@ -24,7 +24,9 @@ from segfloor_ros.camera.images import Region, shrink_factor, shrunk_camera, shr
 from segfloor_ros.camera.model import Mount, StereoFrame
 from segfloor_ros.configuration import StereoSlamNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
+from segfloor_ros.files.whole import user_path
+from segfloor_ros.files.writing import check_output
 from segfloor_ros.geometry import Array
 from segfloor_ros.messages import arrays, poses
 from segfloor_ros.messages.arrays import (
@@ -386,7 +388,7 @@ class SlamMaps:
     def read(self) -> MapFile | None:
         """Return the map of the parameter `load_map`, None where it is empty. Raises InputError."""
         self.loaded, name = None, self._own.load_map
-        return read_map_file(Path(name).expanduser()) if name else None
+        return read_map_file(user_path(name)) if name else None
 
     def keep(self, slam: StereoSlam) -> None:
         """Keep what a later life of this node goes on from, where there are new keyframes."""
@@ -444,7 +446,7 @@ class SlamMaps:
             raise SettingsError('save_map is empty; set it to the name of a file, e.g. home.map')
         if self._arrived is not None:
             raise MapError('a map is being saved already')
-        return Path(self._own.save_map).expanduser().absolute()
+        return user_path(self._own.save_map).absolute()
 
     async def _prune(self) -> str:
         """Prune the file of `save_map` beside tracking; the map in use stays as it is."""
@@ -456,7 +458,7 @@ class SlamMaps:
     async def _save(self) -> str:
         """Gather the map and write it beside tracking, which goes on meanwhile."""
         path = self._file_to_save()
-        self._refuse_to_overwrite(path)
+        check_output(path, SAVED_MAP, inputs := (self._own.load_map,), 'save_map')
         saved = self._slam_part()
         start_ns = saved.header.pop('start_ns')
         self._arrived = Future()
@@ -469,21 +471,11 @@ class SlamMaps:
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
-            await _in_background(partial(write_map_file, path, saved))
+            await _in_background(partial(write_map_file, path, saved, inputs))
         finally:
             self._node.destroy_timer(give_up)
             self._arrived, self._parts = None, {}
         return str(path)
-
-    def _refuse_to_overwrite(self, path: Path) -> None:
-        """Raise MapError where a map would be replaced that the drive has not recognised."""
-        slam, load_map = self._slam(), self._own.load_map
-        is_outside = slam is not None and slam.back_end.submap is Submap.OUTSIDE
-        if is_outside and load_map and Path(load_map).expanduser().resolve() == path.resolve():
-            raise MapError(
-                f'{path}: stays as it was, since no place of it was recognised; set save_map to '
-                'another name to keep the map of this drive'
-            )
 
     def _give_up(self) -> None:
         if self._arrived is not None and not self._arrived.done():

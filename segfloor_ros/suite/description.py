@@ -10,7 +10,7 @@ from typing import Any
 
 from segfloor_ros.configuration import resolve
 from segfloor_ros.errors import SegfloorError, SettingsError
-from segfloor_ros.files.whole import Key, MarkedYaml, read_marked_yaml
+from segfloor_ros.files.whole import Key, MarkedYaml, read_marked_yaml, user_path
 from segfloor_ros.files.whole import number as finite_number
 from segfloor_ros.settings import suggestion
 from segfloor_ros.suite.measures import HIGHER, LOWER, MEASURES, Bound, Slack
@@ -303,7 +303,7 @@ class _Reader:
         """Return a path, relative to the folder of the recordings, in full; a URL as it is."""
         if is_url(text):
             return text
-        return str(self._folder / Path(text).expanduser())
+        return str(self._folder / user_path(text))
 
     def _at(self, name: str) -> Key:
         own: Key = (*self._key, name)

@@ -29,7 +29,7 @@ from typing import Any
 
 from segfloor_ros import __version__
 from segfloor_ros.errors import SegfloorError, SettingsError, without_credentials
-from segfloor_ros.files.results import scratch_folder
+from segfloor_ros.files.writing import scratch_folder
 from segfloor_ros.processes import end_with_parent, how_it_ended, interrupts_deferred, start_apart
 from segfloor_ros.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.suite.measures import Outcome, measure_run, start_pose_of
@@ -192,7 +192,7 @@ def _recording(entry: Entry, folder: Path) -> Path:
     scene = open_scene(entry.input, entry.scene_assignments)
     recording = folder / 'renderings' / _digest_of_text(repr((__version__, scene)))
     recording.parent.mkdir(parents=True, exist_ok=True)
-    with recording.with_suffix('.lock').open('w') as lock:
+    with recording.with_suffix('.lock').open('a') as lock:
         # Another worker may want the same drive.
         fcntl.flock(lock, fcntl.LOCK_EX)
         render_once(scene, recording, RecordingOptions())

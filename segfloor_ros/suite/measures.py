@@ -15,9 +15,9 @@ from segfloor_ros.errors import InputError
 from segfloor_ros.evaluation.floor import score_floor_folders
 from segfloor_ros.evaluation.map_score import score_map
 from segfloor_ros.evaluation.maps import load_truth, resample
-from segfloor_ros.files.results import write_file
 from segfloor_ros.files.whole import number as finite_number
 from segfloor_ros.files.whole import read_json
+from segfloor_ros.files.writing import Kind, write_output
 from segfloor_ros.geometry import Pose2d
 from segfloor_ros.grid.map_file import UNKNOWN, OccupancyGrid, load_map
 from segfloor_ros.results_folder import read_summary
@@ -332,10 +332,10 @@ def check(outcome: Outcome, bounds: Iterable[Bound]) -> Checked:
 
 
 def write_baseline(result: SuiteResult, path: Path) -> None:
-    """Write the measures of all recordings that have a map."""
+    """Write the measures of all recordings that have a map. Raises InputError."""
     measures = {c.name: dict(c.measured) for c in result.recordings if not c.problem}
     document = {'recordings': measures}
-    write_file(path, (json.dumps(document, indent=2) + '\n').encode())
+    write_output(path, BASELINE, (json.dumps(document, indent=2) + '\n').encode())
 
 
 def is_baseline(path: Path) -> bool:
@@ -345,6 +345,9 @@ def is_baseline(path: Path) -> bool:
     except InputError:
         return False
     return True
+
+
+BASELINE = Kind('baseline', is_baseline)
 
 
 def read_baseline(path: Path) -> Baseline:

@@ -31,8 +31,8 @@ from junitparser.junitparser import SystemErr, SystemOut
 from segfloor_ros import __version__
 from segfloor_ros.errors import InputError, printable, without_credentials
 from segfloor_ros.files.images import png_bytes, read_mask
-from segfloor_ros.files.results import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.files.whole import read_json
+from segfloor_ros.files.writing import folder_in_the_making, move_into_place, scratch_folder
 from segfloor_ros.grid.map_file import UNKNOWN_PIXEL
 from segfloor_ros.results_folder import REPORT
 from segfloor_ros.suite.measures import (
@@ -214,7 +214,7 @@ def page(result: SuiteResult, folder: Path) -> bytes:
     complaints = f'<h2>What fails</h2><ul>{failed}</ul>' if failed else ''
     about = f'{kept} of {len(result.recordings)} recordings are as they should be'
     table = f'<h2>Recordings</h2><table><tr>{head}</tr>{rows}</table>'
-    return html_page(printable(result.name), about, complaints + table, MARKS).encode()
+    return html_page(printable(result.name), about, complaints + table, MARKS)
 
 
 def _row(checked: Checked, folder: Path) -> str:

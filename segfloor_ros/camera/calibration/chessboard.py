@@ -4,7 +4,7 @@ the check of a calibration on a recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,8 @@ from segfloor_ros.camera.sources.image_folders import find_image_pairs
 from segfloor_ros.camera.sources.source import StereoSource
 from segfloor_ros.errors import CalibrationError, InputError, os_errors
 from segfloor_ros.files.images import CorruptImageError, Grey, read_grey
-from segfloor_ros.files.results import add_files, check_target
+from segfloor_ros.files.writing import PAGE as HTML
+from segfloor_ros.files.writing import YAML, add_files, check_output, check_target, write_output
 from segfloor_ros.geometry import Array, make_transform
 
 MIN_PAIRS = 5
@@ -39,6 +40,7 @@ MAX_SCALE_ERROR = 0.01
 SOLVER_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-9)
 
 FILES, PAGE = ('left.yaml', 'right.yaml'), 'calibration.html'
+KINDS = dict.fromkeys(FILES, YAML) | {PAGE: HTML}
 
 DICTIONARY = '5X5_1000'
 """Of the markers of a ChArUco board; it has those of 5X5_50, 5X5_100 and 5X5_250 as its first."""
@@ -235,8 +237,7 @@ def calibrate_folder(
     Recognition 2014. Raises InputError or CalibrationError.
     """
     left, right = find_image_pairs(folder)
-    target = folder if out is None else out
-    check_target(target, (*FILES, PAGE))
+    check_writable(folder, out)
     views, size, left_out = _find_boards(list(zip(left, right, strict=True)), board, on_progress)
     if len(views) < MIN_PAIRS:
         raise CalibrationError(
@@ -245,8 +246,7 @@ def calibrate_folder(
         )
     calibration, rms_px, errors_px = _solve(views, size, board, str(folder))
     texts = ros_calibration(calibration.left, 'left'), ros_calibration(calibration.right, 'right')
-    with os_errors(f'{target}: cannot be written', '; choose another --out'):
-        add_files(target, {n: text.encode() for n, text in zip(FILES, texts, strict=True)})
+    write(folder, out, {n: text.encode() for n, text in zip(FILES, texts, strict=True)})
     rows_px = [_rows_rms_px(calibration, view) for view in views]
     errors_px = np.column_stack([errors_px, rows_px])
     order = np.argsort(-np.linalg.norm(errors_px[:, :2], axis=1), kind='stable')
@@ -254,6 +254,26 @@ def calibrate_folder(
     return CalibrationResult(
         calibration, board, rms_px, views, errors_px[order], left_out, len(left)
     )
+
+
+def check_writable(folder: Path, out: Path | None) -> None:
+    """Raise InputError unless the files of a calibration can be written: to a folder of results, or
+    where none is given beside the pictures.
+    """
+    if out is not None:
+        return check_target(out, KINDS)
+    for name, kind in KINDS.items():
+        check_output(folder / name, kind)
+
+
+def write(folder: Path, out: Path | None, files: Mapping[str, bytes]) -> None:
+    """Write files of a calibration. Raises InputError."""
+    if out is None:
+        for name, content in files.items():
+            write_output(folder / name, KINDS[name], content)
+        return
+    with os_errors(f'{out}: cannot be written', '; choose another --out'):
+        add_files(out, files)
 
 
 @dataclass(frozen=True)

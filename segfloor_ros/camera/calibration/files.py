@@ -15,6 +15,7 @@ from segfloor_ros.camera.calibration.parameters import EyeCalibration, StereoCal
 from segfloor_ros.camera.model import StereoCameraSettings
 from segfloor_ros.errors import CalibrationError
 from segfloor_ros.files.whole import number, read_lines, read_yaml
+from segfloor_ros.files.writing import MARK
 from segfloor_ros.geometry import Array, invert
 
 KALIBR_NAMES = ('camchain.yaml', 'dso/camchain.yaml')
@@ -118,7 +119,8 @@ def ros_calibration(eye: EyeCalibration, camera_name: str) -> str:
         'rectification_matrix': matrix(eye.R, 3),
         'projection_matrix': matrix(eye.P, 3),
     }
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
+    return f'# {MARK}\n{text}'
 
 
 def write_ros_calibration(path: Path, eye: EyeCalibration, camera_name: str) -> None:

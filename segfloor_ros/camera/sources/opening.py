@@ -44,7 +44,7 @@ from segfloor_ros.camera.sources.image_folders import (
 from segfloor_ros.camera.sources.source import DEFAULT_RATE_HZ, MaskFolder, PairEntry, StereoSource
 from segfloor_ros.errors import InputError
 from segfloor_ros.files.images import Grey, silent_libraries
-from segfloor_ros.files.whole import check_file
+from segfloor_ros.files.whole import check_file, user_path
 
 KINDS = (
     'a KITTI odometry folder, an EuRoC folder, image folders left and right with left.yaml and '
@@ -83,7 +83,7 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
     if not settings.input:
         raise InputError(f'no input is given; set stereo_camera.input to {KINDS}')
     try:
-        path = Path(settings.input).expanduser()
+        path = user_path(settings.input)
         if not (path.exists() or is_device(path)):
             raise InputError(f'{path}: no such file or folder; give {KINDS}')
         kind = _kind(path)
@@ -96,7 +96,7 @@ def open_source(settings: StereoCameraSettings) -> StereoSource:
             )
         source.cut(settings.start, settings.frames, settings.every)
         if settings.masks:
-            source.masks = MaskFolder(Path(settings.masks).expanduser(), source.camera)
+            source.masks = MaskFolder(user_path(settings.masks), source.camera)
         return source
     except OSError as error:
         raise InputError(

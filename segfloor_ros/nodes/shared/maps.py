@@ -21,7 +21,7 @@ from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header, UInt8MultiArray
 
 from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import Arrays, MapFile, read_map_file, replacing, write_to
+from segfloor_ros.files.results import Arrays, MapFile, read_map_file, write_to
 from segfloor_ros.messages.arrays import (
     is_of_loaded_map,
     map_file_message,
@@ -271,8 +271,10 @@ class KeptState:
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(mode=0o700, exist_ok=True)
             self._check_private()
-            with replacing(self.file) as file:
+            written = self.file.with_suffix('.part')
+            with written.open('wb') as file:
                 write_to(file, saved, compress=False)
+            written.replace(self.file)
         now_s = time.monotonic()
         self._next_save_s = now_s + LEAST_SHARE * (now_s - start_s)
 
@@ -307,7 +309,7 @@ class KeptState:
         self.finish()
         with contextlib.suppress(OSError):
             self._check_private()
-            for file in (self.file, self._note):
+            for file in (self.file, self._note, self.file.with_suffix('.part')):
                 file.unlink(missing_ok=True)
 
     def _check_private(self) -> None:
