@@ -90,9 +90,9 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Deliver SIGINT, SIGTERM and SIGHUP at the end of the block, so that none falls between the start of a
-    process and the note that it runs, or into a fork, where exceptions are ignored. A started
-    program gets the default handlers again. Beside the main thread, which alone gets signals,
+    """Deliver `SIGNALS` at the end of the block, so that none falls between the start of a process
+    and the note that it runs, or into a fork, where exceptions are ignored. A started program gets
+    the default handlers again. Beside the main thread, which alone gets signals,
     nothing is done.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -111,7 +111,7 @@ def interrupts_deferred() -> Iterator[None]:
 
 @contextlib.contextmanager
 def first_interrupt_noted() -> Iterator[Interrupt]:
-    """Set an event at the first SIGINT, SIGTERM or SIGHUP within the block, so that the work can come to an
+    """Set an event at the first of `SIGNALS` within the block, so that the work can come to an
     orderly end; the next one takes its usual course.
     """
     event = Interrupt()
@@ -130,7 +130,8 @@ def _handled_by(
     handle: Callable[[int, FrameType | None], None], signals: Sequence[signal.Signals] = SIGNALS
 ) -> Iterator[Callable[[], None]]:
     """Handle signals within the block otherwise; yields what restores the handlers before."""
-    before = {number: signal.signal(number, handle) for number in signals}
+    taken = [number for number in signals if not _is_ignored_hangup(number)]
+    before = {number: signal.signal(number, handle) for number in taken}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -140,3 +141,8 @@ def _handled_by(
         yield restore
     finally:
         restore()
+
+
+def _is_ignored_hangup(number: signal.Signals) -> bool:
+    """Whether a signal is SIGHUP in a program that nohup started."""
+    return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN

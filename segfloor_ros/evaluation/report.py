@@ -77,7 +77,7 @@ def calibration_page(
     return html_page(f'Segfloor: calibration of {folder.name}', about, ''.join(content))
 
 
-def _page(data: ReportData) -> str:
+def _page(data: ReportData) -> bytes:
     sections = [
         _facts(data),
         _section('What to do next', _list(advice(data))),

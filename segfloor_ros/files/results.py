@@ -1,6 +1,6 @@
-"""Saved maps: named arrays and a header in one file, which is checked when it is read. A zip archive
-of `.npy` arrays, without pickled objects, so that reading it runs no code; every member has a
-checksum.
+"""Saved maps: named arrays and a header in one file, which is checked when it is read. A zip
+archive of `.npy` arrays, without pickled objects, so that reading it runs no code; every member has
+a checksum.
 """
 
 from __future__ import annotations

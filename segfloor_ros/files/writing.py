@@ -3,7 +3,7 @@ segfloor did not write, unchanged, for this very purpose. No link, device or pip
 no input of a command.
 
 A single file may take the place of one of its kind that bears the mark of segfloor. A folder of
-results is new, empty, or bears a marker; the marker lists the files of segfloor with a hash of each.
+results is new, empty, or bears a marker, which lists the files of segfloor with a hash of each.
 Everything is written to a temporary name in the same folder and moved into place; what a killed
 process has left under such names is removed by the next one of the same user.
 """
@@ -40,7 +40,7 @@ HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file. is_own: tells whether segfloor wrote a file of this kind; may raise OSError."""
+    """A kind of file. is_own: whether segfloor wrote a file, of this kind; may raise OSError."""
 
     name: str
     is_own: Callable[[Path], bool]
@@ -337,6 +337,7 @@ class _Journal:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._file: IO[str] | None = None
+        self._name = ''
         self._process = 0
         self._entries: dict[str, tuple[int, int]] = {}
 
@@ -354,7 +355,7 @@ class _Journal:
             if self._entries.pop(str(path.absolute()), None) is not None:
                 self._write()
             if not self._entries and self._file is not None:
-                os.unlink(self._file.name)
+                os.unlink(self._name)
                 self._file.close()
                 self._file = None
 
@@ -366,7 +367,8 @@ class _Journal:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for journal in folder.glob('*.json'):
             _sweep(journal)
-        self._file = tempfile.NamedTemporaryFile('w', suffix='.json', dir=folder, delete=False)
+        number, self._name = tempfile.mkstemp('.json', dir=folder)
+        self._file = os.fdopen(number, 'w')
         self._process, self._entries = os.getpid(), {}
         fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 

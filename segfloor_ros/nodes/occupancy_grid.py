@@ -11,6 +11,7 @@ from rclpy.timer import Timer
 from segfloor_ros.configuration import OccupancyGridNodeSettings
 from segfloor_ros.errors import MapError, SettingsError
 from segfloor_ros.files.results import MapFile
+from segfloor_ros.files.whole import user_path
 from segfloor_ros.grid.map_file import save_map
 from segfloor_ros.grid.mapper import OccupancyGridMapper
 from segfloor_ros.messages.arrays import features_arrays, grid_message, labelled_arrays, scan_arrays

@@ -14,6 +14,7 @@ from std_msgs.msg import String
 
 from segfloor_ros.camera.model import Mount, StereoCamera
 from segfloor_ros.configuration import SegfloorMasksNodeSettings
+from segfloor_ros.files.whole import user_path
 from segfloor_ros.messages.arrays import (
     colour8_image,
     depth_image,

@@ -238,10 +238,11 @@ def _check_clear(grid: OccupancyGrid, drive: Drive) -> None:
 RENDERED = 'rendered_from.txt'
 """In a rendered drive of the cache: of what."""
 
-RECORDED = ('image_0', 'image_1', 'left', 'right', 'left.yaml', 'right.yaml', 'calib.txt', 'times.txt',
-            'poses.txt', 'base_poses.txt', 'scene.yaml', 'map.yaml', 'map.pgm', 'wheel_odometry.txt',
-            'imu.csv', 'imu.yaml', 'depth', 'floor', 'disparity', 'labels', 'instances', 'moving',
-            RENDERED)  # fmt: skip
+RECORDED = (
+    'image_0', 'image_1', 'left', 'right', 'left.yaml', 'right.yaml', 'calib.txt', 'times.txt',
+    'poses.txt', 'base_poses.txt', 'scene.yaml', 'map.yaml', 'map.pgm', 'wheel_odometry.txt',
+    'imu.csv', 'imu.yaml', 'depth', 'floor', 'disparity', 'labels', 'instances', 'moving', RENDERED,
+)  # fmt: skip
 """All that a rendered drive may hold."""
 
 
