@@ -7,8 +7,17 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = 'segfloor_ros'
-NODES = ('stereo_camera', 'stereo_slam', 'floor_segmentation', 'cloud_labelling', 'occupancy_grid')
-FURTHER_NODES = ('segfloor_pipeline', 'simulated_robot', 'segfloor_masks')
+PROGRAMS = {
+    'segfloor': 'apps.cli:start',
+    'stereo_camera': 'apps.stereo_camera:main',
+    'stereo_slam': 'nodes.stereo_slam:main',
+    'floor_segmentation': 'nodes.floor_segmentation:main',
+    'cloud_labelling': 'nodes.cloud_labelling:main',
+    'occupancy_grid': 'nodes.occupancy_grid:main',
+    'segfloor_pipeline': 'apps.segfloor_pipeline:main',
+    'simulated_robot': 'apps.simulation.simulated_robot:main',
+    'segfloor_masks': 'nodes.segfloor_masks:main',
+}
 HERE = Path(__file__).resolve().parent
 VERSION = re.search(r"__version__ = '(.+)'", (HERE / PACKAGE / '__init__.py').read_text())[1]
 
@@ -44,7 +53,7 @@ setup(
     maintainer_email='segfloor@example.org',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
-        f'{PACKAGE}.simulation': [
+        f'{PACKAGE}.apps.simulation': [
             'scenes/*.yaml',
             'cameras/*.yaml',
             'robots/*.yaml',
@@ -53,9 +62,9 @@ setup(
             'world.xml',
             'robot.xml',
         ],
-        f'{PACKAGE}.evaluation': ['report.css'],
+        f'{PACKAGE}.apps.evaluation': ['report.css'],
         f'{PACKAGE}.nodes': ['fastdds.xml'],
-        f'{PACKAGE}.slam.places': ['vocabulary.npy'],
+        f'{PACKAGE}.core.slam.places': ['vocabulary.npy'],
     },
     data_files=data_files,
     python_requires='>=3.10',
@@ -95,10 +104,7 @@ setup(
         ],
     },
     entry_points={
-        'console_scripts': [
-            'segfloor = segfloor_ros.cli:start',
-            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in (*NODES, *FURTHER_NODES)),
-        ]
+        'console_scripts': [f'{name} = {PACKAGE}.{where}' for name, where in PROGRAMS.items()]
     },
     zip_safe=True,
 )

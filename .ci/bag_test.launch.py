@@ -17,12 +17,12 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from rclpy.time import Time
 from tf2_ros import Buffer, TransformListener
 
-import segfloor_ros.simulation
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.messages.arrays import grid_of
-from segfloor_ros.messages.topics import TOPICS
+import segfloor_ros.apps.simulation
+from segfloor_ros.nodes.map_files import save_map
+from segfloor_ros.nodes.messages.arrays import grid_of
+from segfloor_ros.nodes.messages.topics import TOPICS
 
-DRIVE = Path(segfloor_ros.simulation.__file__).parent / 'demo' / 'drive.mcap'
+DRIVE = Path(segfloor_ros.apps.simulation.__file__).parent / 'demo' / 'drive.mcap'
 SHARE = Path(get_package_share_directory('segfloor_ros'))
 FIRST_MAP_S = 120.0
 QUIET_S = 15.0

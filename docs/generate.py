@@ -7,8 +7,9 @@ from pathlib import Path
 
 from topic_texts import ABOUT
 
-from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
-from segfloor_ros.messages.topics import (
+from segfloor_ros.core.settings import SettingSpec
+from segfloor_ros.nodes.configuration import NODE_SETTINGS, STAGE_SETTINGS
+from segfloor_ros.nodes.messages.topics import (
     CAMERA,
     CLOUD,
     DIAGNOSTICS,
@@ -24,7 +25,6 @@ from segfloor_ros.messages.topics import (
     published_by,
     subscribed_by,
 )
-from segfloor_ros.settings import SettingSpec
 
 PAGES = Path(__file__).parent / 'nodes'
 

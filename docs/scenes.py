@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from segfloor_ros.simulation.scene_file import open_scene, shipped
-from segfloor_ros.simulation.simulation import Simulation
+from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
+from segfloor_ros.apps.simulation.simulation import Simulation
 
 PICTURE = Path(__file__).parent / 'images' / 'scenes.jpg'
 COLUMNS, SIZE, TITLE_PX, QUALITY = 5, (240, 180), 22, 82

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import invert, make_transform
+from segfloor_ros.core.geometry import invert, make_transform
 
 BOARD, SQUARE_M = (7, 5), 0.03
 SIZE = (320, 240)

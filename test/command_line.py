@@ -11,14 +11,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
-from segfloor_ros.cli.main import main
+from segfloor_ros.apps.cli.main import main
 
 
 def segfloor_process(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own."""
     environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parents[1])}
     return subprocess.run(
-        [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
+        [sys.executable, '-m', 'segfloor_ros.apps.cli.main', *map(str, arguments)],
         capture_output=True,
         text=True,
         env=environment,

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from segfloor_ros.processes import limit_threads
+from segfloor_ros.core.processes import limit_threads
 
 # Message fields of a wrong type must fail instead of being sent as garbage; read on import.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
@@ -31,7 +31,9 @@ collect_ignore_glob = [] if HAS_ROS else ['messages/*', 'nodes/*']
 
 def pytest_report_header() -> str:
     """Say at the top what is left out."""
-    return '' if HAS_ROS else 'rclpy is not installed: test/messages and test/nodes are left out'
+    return (
+        '' if HAS_ROS else 'rclpy is not installed: test/nodes/messages and test/nodes are left out'
+    )
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.geometry import make_transform
-from segfloor_ros.slam.results import NO_POINT
-from segfloor_ros.slam.rig import Observations, Rig
-from segfloor_ros.slam.sparse_map import KeyframeRecord, SparseMap
-from segfloor_ros.slam.tracking.images import Features
-from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.geometry import make_transform
+from segfloor_ros.core.slam.results import NO_POINT
+from segfloor_ros.core.slam.rig import Observations, Rig
+from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.slam.tracking.images import Features
+from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 300.0, 300.0, 319.5, 239.5, 0.1)
 """f b = 30 px m: at 2 m a disparity of 15 px."""

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import rclpy
 from std_srvs.srv import SetBool, Trigger
 
-from segfloor_ros.cli.replay_nodes import NodeGraph
-from segfloor_ros.cli.replay_recorder import ReplayRecorder
-from segfloor_ros.messages.topics import NODES
+from segfloor_ros.apps.cli.replay_nodes import NodeGraph
+from segfloor_ros.apps.cli.replay_recorder import ReplayRecorder
+from segfloor_ros.nodes.messages.topics import NODES
 
 
 def main() -> None:

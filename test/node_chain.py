@@ -15,10 +15,15 @@ from typing import Any
 from ros_graph import Graph
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.diagnostics import CONNECTIONS, Status
-from segfloor_ros.messages.topics import CLOUD, FLOOR, GRID, SLAM, published_by
+from segfloor_ros.apps.programs import program_of
+from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.nodes.messages.arrays import (
+    camera_info_message,
+    image_message,
+    rectified_calibration,
+)
+from segfloor_ros.nodes.messages.diagnostics import CONNECTIONS, Status
+from segfloor_ros.nodes.messages.topics import CLOUD, FLOOR, GRID, SLAM, published_by
 
 CHAIN = (SLAM, FLOOR, CLOUD, GRID)
 SIDES = ('left', 'right')
@@ -63,7 +68,7 @@ class NodeChain:
             options = [word for pair in words for word in ('-p', pair)]
             with (self._folder / f'{node}.log').open('ab') as log:
                 self._processes[node] = subprocess.Popen(
-                    [sys.executable, '-m', f'segfloor_ros.nodes.{node}', '--ros-args', *options],
+                    [sys.executable, '-m', program_of(node), '--ros-args', *options],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,

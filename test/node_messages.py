@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.cloud import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+from segfloor_ros.nodes.messages.arrays import (
     features_message,
     image_message,
     labelled_message,
     scan_message,
     sparse_cloud_message,
 )
-from segfloor_ros.messages.poses import PathMessages, odometry_message
-from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+from segfloor_ros.nodes.messages.poses import PathMessages, odometry_message
 
 STAMP_NS = 12_345_678_901
 AT_ORIGIN = np.eye(4)

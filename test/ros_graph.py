@@ -15,9 +15,9 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from segfloor_ros.cli.replay_nodes import free_domain
-from segfloor_ros.messages.diagnostics import Status, statuses
-from segfloor_ros.messages.topics import DIAGNOSTICS, TOPICS
+from segfloor_ros.apps.cli.replay_nodes import free_domain
+from segfloor_ros.nodes.messages.diagnostics import Status, statuses
+from segfloor_ros.nodes.messages.topics import DIAGNOSTICS, TOPICS
 
 PATIENCE_S = 60.0
 

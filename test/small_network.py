@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from segfloor_ros.semantics.network import Network
+from segfloor_ros.nodes.network_files import open_network
 
 onnx = pytest.importorskip('onnx')
 helper, numpy_helper, TensorProto = onnx.helper, onnx.numpy_helper, onnx.TensorProto
@@ -137,7 +137,7 @@ class FittedNetwork:
             {'features': shape}, kind='semantic', input=[width, height], mean=[0.0],
             classes=[str(i) for i in range(count)],
         )  # fmt: skip
-        features = Network(file)
+        features = open_network(file)
         gram = np.zeros((count + 1, count + 1))
         towards = np.zeros((count + 1, len(self.classes)))
         for image, numbers in zip(images, labels, strict=True):

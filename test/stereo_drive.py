@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from stereo_room import CAMERA, StereoRoom, planar_pose
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.pipeline import Pipeline
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.nodes.configuration import resolve
 
 RATE_HZ = 10.0
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from drawing import drawn
 
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.geometry import make_transform
+from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.geometry import make_transform
 
 ROOM_MIN = np.array([-3.0, -2.5, 0.0])
 ROOM_MAX = np.array([6.0, 2.5, 2.4])

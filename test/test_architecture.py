@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import ast
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from segfloor_ros.apps.programs import APPS
+
 PACKAGE = Path(__file__).resolve().parents[1] / 'segfloor_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
-ROS_FREE_ROOMS = (
-    'camera', 'slam', 'floor', 'cloud', 'grid', 'evaluation', 'simulation', 'navigation',
-    'semantics',
-)  # fmt: skip
+STOREYS = ('core', 'nodes', 'apps')
+"""From the lowest up: what lies lower imports nothing that lies higher."""
 ROS = {
     'rclpy', 'rcl_interfaces', 'tf2_ros', 'launch', 'launch_ros', 'ament_index_python', 'cv_bridge',
     'rosbag2_py', 'message_filters', 'builtin_interfaces',
 }  # fmt: skip
+CORE_USES = {'numpy', 'cv2', 'scipy', 'segfloor_ros', *sys.stdlib_module_names}
 # What belongs to one room or to a command only; the others must do without it.
 ONLY_IN = {
-    'typer': ('cli',),
-    'rich': ('cli',),
-    'mujoco': ('simulation',),
-    'rosbags': ('camera', 'cli'),
-    'evo': ('evaluation',),
-    'matplotlib': ('evaluation', 'cli'),
-    'distributed': ('suite',),
-    'fsspec': ('suite',),
-    'junitparser': ('suite',),
-    'rerun': ('cli',),
-    'onnxruntime': ('semantics',),
+    'typer': ('apps.cli',),
+    'rich': ('apps.cli',),
+    'mujoco': ('apps.simulation',),
+    'rosbags': ('apps.recordings', 'apps.cli'),
+    'evo': ('apps.evaluation',),
+    'matplotlib': ('apps.evaluation', 'apps.cli'),
+    'distributed': ('apps.suite',),
+    'fsspec': ('apps.suite',),
+    'junitparser': ('apps.suite',),
+    'rerun': ('apps.cli',),
+    'onnxruntime': ('core.plugins.semantics',),
 }
 FLOW = ('camera', 'slam', 'floor', 'cloud', 'grid')
 """Data flows one way: a stage may know the data of the stages before it, not of those behind it."""
@@ -52,47 +54,55 @@ def imports_of(path: Path) -> Iterator[str]:
             yield from (f'{node.module}.{alias.name}' for alias in node.names)
 
 
-def room_of(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0].removesuffix('.py')
+def name_of(path: Path) -> str:
+    """Return the name of a module within the package, e.g. `core.slam.rig`."""
+    return '.'.join(path.relative_to(PACKAGE).with_suffix('').parts).removesuffix('.__init__')
 
 
-def rooms_imported(path: Path) -> set[str]:
-    names = (name.split('.') for name in imports_of(path))
-    return {name[1] for name in names if name[0] == 'segfloor_ros' and len(name) > 1}
+def imported_modules(path: Path) -> set[str]:
+    """Return what a module imports of the package, also within functions, by names within it."""
+    names = (name.partition('.') for name in imports_of(path))
+    return {rest for top, _, rest in names if top == 'segfloor_ros' and rest}
 
 
-@pytest.mark.parametrize('path', MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def is_in(name: str, room: str) -> bool:
+    return name == room or name.startswith(f'{room}.')
+
+
+@pytest.mark.parametrize('path', MODULES, ids=name_of)
 def test_a_module_keeps_to_the_rules(path) -> None:
-    room, names = room_of(path), set(imports_of(path))
-    if room not in ('messages', 'nodes', 'cli'):
-        assert not {name for name in names if is_ros(name)}, 'ROS outside of messages, nodes, cli'
-    if room != 'nodes':
-        assert 'nodes' not in rooms_imported(path)
-    if room != 'cli':
-        assert 'cli' not in rooms_imported(path)
-    assert not any(name.split('.')[0] in ('tools', 'test') for name in names)
-    if room in ROS_FREE_ROOMS:
-        assert 'messages' not in rooms_imported(path)
-        assert 'pipeline' not in rooms_imported(path)
+    name, names = name_of(path), set(imports_of(path))
+    tops = {imported.split('.')[0] for imported in names}
+    assert not tops & {'tools', 'test'}
     for package, rooms in ONLY_IN.items():
-        if any(name.split('.')[0] == package for name in names):
-            assert room in rooms, f'{package} is for {rooms}'
+        if package in tops:
+            assert any(is_in(name, room) for room in rooms), f'{package} is for {rooms}'
+    if name == '__init__':
+        return
+    storey = name.partition('.')[0]
+    higher = STOREYS[STOREYS.index(storey) + 1 :]
+    assert not {one for one in imported_modules(path) if one.partition('.')[0] in higher}
+    if storey == 'core' and name != 'core.plugins.semantics.network':  # may use onnxruntime
+        assert tops <= CORE_USES
 
 
 @pytest.mark.parametrize('room', FLOW)
 def test_a_stage_knows_nothing_of_the_stages_behind_it(room) -> None:
-    behind = set(FLOW[FLOW.index(room) + 1 :])
+    behind = FLOW[FLOW.index(room) + 1 :]
     for path in MODULES:
-        if room_of(path) == room:
-            assert not rooms_imported(path) & behind, path.relative_to(PACKAGE)
+        if is_in(name_of(path), f'core.{room}'):
+            found = {n for n in imported_modules(path) for b in behind if is_in(n, f'core.{b}')}
+            assert not found, path.relative_to(PACKAGE)
 
 
-def test_ros_in_the_commands_is_for_replay_recorder_and_exploration_alone() -> None:
+def test_ros_in_the_apps_is_for_nodes_replay_recorder_and_exploration_alone() -> None:
+    """The apps that are nodes are programs; `recordings.ros_bag` reads with ROS where it is."""
+    programs = tuple(module.removeprefix('segfloor_ros.') for module in APPS.values())
+    begin = ('apps.cli.replay_', 'apps.cli.topic_recorder', 'apps.cli.explore_')
     for path in MODULES:
-        if room_of(path) == 'cli' and not path.stem.startswith(
-            ('replay_', 'topic_recorder', 'explore_')
-        ):
-            ros = {name for name in imports_of(path) if is_ros(name)}
+        name = name_of(path)
+        if not name.startswith((*begin, *programs, 'apps.recordings.ros_bag', 'nodes.')):
+            ros = {imported for imported in imports_of(path) if is_ros(imported)}
             assert not ros, path.relative_to(PACKAGE)
 
 

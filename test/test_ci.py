@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from segfloor_ros.suite.description import read_suite
-from segfloor_ros.suite.measures import MEASURES
+from segfloor_ros.apps.suite.description import read_suite
+from segfloor_ros.apps.suite.measures import MEASURES
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGE = (REPOSITORY / 'docs' / 'ci.md').read_text()

@@ -13,11 +13,11 @@ import pytest
 import yaml
 
 from segfloor_ros import __version__
-from segfloor_ros.configuration import NODE_SETTINGS, STAGE_SETTINGS
-from segfloor_ros.simulation import scene as scene_module
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import scene_from_mapping, shipped
-from segfloor_ros.simulation.textures import GENERATORS
+from segfloor_ros.apps.simulation import scene as scene_module
+from segfloor_ros.apps.simulation.scene import Scene
+from segfloor_ros.apps.simulation.scene_file import scene_from_mapping, shipped
+from segfloor_ros.apps.simulation.textures import GENERATORS
+from segfloor_ros.nodes.configuration import NODE_SETTINGS, STAGE_SETTINGS
 from tools import figures
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import HISTORY_NS, FrameTree, between, make_transform, rotation_angle
+from segfloor_ros.core.geometry import (
+    HISTORY_NS,
+    FrameTree,
+    between,
+    make_transform,
+    rotation_angle,
+)
 
 S = 1_000_000_000
 

@@ -155,7 +155,7 @@ def test_what_pip_installs_is_what_rosdep_installs() -> None:
 
 def test_without_its_libraries_the_command_ends_with_one_line(tmp_path) -> None:
     (tmp_path / 'typer.py').write_text("raise ModuleNotFoundError('No typer', name='typer')\n")
-    command = [sys.executable, '-c', 'from segfloor_ros.cli import start; start()', '--help']
+    command = [sys.executable, '-c', 'from segfloor_ros.apps.cli import start; start()', '--help']
     found = subprocess.run(
         command,
         cwd=REPOSITORY,
@@ -233,7 +233,7 @@ def test_the_install_has_what_ros_looks_for(workspace) -> None:
 
 @pytest.mark.slow
 def test_colcon_runs_the_tests(workspace) -> None:
-    some = ['--pytest-args', 'test/test_geometry.py']
+    some = ['--pytest-args', 'test/core/test_geometry.py']
     colcon = ['colcon', '--log-base', 'log', 'test', '--return-code-on-test-failure', *some]
     tested = subprocess.run(
         colcon, cwd=workspace, env=_environment(), capture_output=True, text=True, timeout=240
@@ -295,12 +295,12 @@ def _environment() -> dict[str, str]:
 def test_the_command_starts_without_libraries_that_few_of_its_parts_need() -> None:
     """Each takes a part of a second, in every process of a suite, too."""
     heavy = {'matplotlib', 'evo', 'mujoco', 'distributed', 'rerun'}
-    words = f'import sys, segfloor_ros.cli.main; print(sorted({heavy} & sys.modules.keys()))'
+    words = f'import sys, segfloor_ros.apps.cli.main; print(sorted({heavy} & sys.modules.keys()))'
     found = subprocess.run([sys.executable, '-c', words], capture_output=True, text=True)
     assert found.stdout.strip() == '[]', found.stderr
 
 
-@pytest.mark.parametrize('package', ['segfloor_ros.cli', 'segfloor_ros.nodes'])
+@pytest.mark.parametrize('package', ['segfloor_ros.apps.cli', 'segfloor_ros.nodes'])
 @pytest.mark.parametrize(('given', 'expected'), [(None, 1), ('2', 2)])
 def test_command_and_nodes_use_one_thread_of_opencv_unless_told_otherwise(package, given, expected):
     environment = {k: v for k, v in os.environ.items() if k != 'OPENCV_FOR_THREADS_NUM'}

@@ -23,21 +23,22 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud import CloudLabelling
-from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.evaluation.floor import count_pixels, draw_outline, read_outlines
-from segfloor_ros.evaluation.map_score import MapScore, score_map
-from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.floor.observation import FloorScan
-from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import Array, invert
-from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.results import Keyframe
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.evaluation.floor import count_pixels, draw_outline, read_outlines
+from segfloor_ros.apps.evaluation.map_score import MapScore, score_map
+from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.cloud import CloudLabelling
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.grid.mapper import OccupancyGridMapper
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.slam.results import Keyframe
+from segfloor_ros.nodes.configuration import resolve
 from tools.driving import noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS
 from tools.mechanisms import GRID, NOTHING, RECORDED, SLAM

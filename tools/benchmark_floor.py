@@ -13,10 +13,10 @@ import cv2
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import announcing, console, figure_table
-from segfloor_ros.configuration import resolve
+from segfloor_ros.apps.cli import terminal as options
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.nodes.configuration import resolve
 from tools.disparity_choices import DisparityScore, choices, read_pairs, score
 from tools.floor_masks import (
     SCENES,

@@ -12,12 +12,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.evaluate import print_node_figures
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import console
-from segfloor_ros.configuration import resolve
+from segfloor_ros.apps.cli import terminal as options
+from segfloor_ros.apps.cli.evaluate import print_node_figures
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.nodes.configuration import resolve
 from tools.endless_drive import write_endless_drive
 from tools.idle_nodes import longest_s, measure_idle
 

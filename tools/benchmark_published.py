@@ -16,7 +16,7 @@ import typer
 from rich.table import Table
 
 from segfloor_ros import __version__
-from segfloor_ros.benchmark import (
+from segfloor_ros.apps.benchmark import (
     JSON_VERSION,
     MeasuredStages,
     Progress,
@@ -24,13 +24,11 @@ from segfloor_ros.benchmark import (
     machine,
     run_in_process,
 )
-from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.evaluate import stage_table, workload_table
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
-from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.map_score import (
+from segfloor_ros.apps.cli import terminal as options
+from segfloor_ros.apps.cli.evaluate import stage_table, workload_table
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import Announce, announcing, console, figure_table
+from segfloor_ros.apps.evaluation.map_score import (
     MapScore,
     RoadMapPlan,
     RoadMapScore,
@@ -38,11 +36,15 @@ from segfloor_ros.evaluation.map_score import (
     overlay_png,
     score_map,
 )
-from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.grid.map_file import OccupancyGrid, OccupancyGridSettings, save_map
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import render_once
+from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.simulation.scene import Scene
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.errors import MapError
+from segfloor_ros.core.grid.occupancy import OccupancyGrid, OccupancyGridSettings
+from segfloor_ros.nodes.configuration import resolve
+from segfloor_ros.nodes.map_files import save_map
 from tools.driving import drive, open_recording
 from tools.published_figures import (
     PUBLISHED,

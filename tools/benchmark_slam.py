@@ -12,12 +12,13 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from segfloor_ros.cli import terminal as options
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import Announce, announcing, console, figure_table
-from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.cli import terminal as options
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import Announce, announcing, console, figure_table
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.nodes.configuration import resolve
 from tools.driving import open_recording, recordings
 from tools.endless_drive import write_endless_drive
 from tools.slam_drives import DRIVES, DriveResult, measure_drive

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.geometry import Array
+from segfloor_ros.core.geometry import Array
 from tools.look_alikes import Scene
 
 FLOORS = (

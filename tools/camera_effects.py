@@ -13,13 +13,13 @@ from typing import Annotated, Optional
 
 import typer
 
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import announcing, console, figure_table
-from segfloor_ros.files.whole import read_yaml
-from segfloor_ros.simulation.scene_file import open_scene, shipped
-from segfloor_ros.simulation.simulation import RecordingOptions, render_once
-from segfloor_ros.suite.job import ProgramError, run_segfloor
-from segfloor_ros.suite.measures import measure_run, number, start_pose_of
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.apps.simulation.scene_file import open_scene, shipped
+from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
+from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
+from segfloor_ros.apps.suite.measures import measure_run, number, start_pose_of
+from segfloor_ros.nodes.yaml_files import read_yaml
 
 DRIVE = (
     'path.waypoints=[[-0.3,0.0],[2.2,0.05],[3.4,-0.3],[4.75,0.0]]',

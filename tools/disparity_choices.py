@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.floor.disparity.matching import DisparityMatcher, TwoScaleMatcher
-from segfloor_ros.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.floor.disparity.matching import DisparityMatcher, TwoScaleMatcher
+from segfloor_ros.core.floor.observation import FloorSegmentationSettings
 
 TRUTH_STEPS_PER_PX = 4
 NUM_DISPARITIES = 64

@@ -11,14 +11,14 @@ from typing import Protocol
 
 import numpy as np
 
-from segfloor_ros.camera.model import MeasurementLog, RecordedSensor, StereoFrame
-from segfloor_ros.camera.sources import StereoSource, open_source
-from segfloor_ros.cli.terminal import Announce
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import render_once
-from segfloor_ros.slam.results import FrameResult
-from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.apps.cli.terminal import Announce
+from segfloor_ros.apps.recordings import StereoSource, open_source
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.core.camera.model import MeasurementLog, RecordedSensor, StereoFrame
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.slam.results import FrameResult
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 
 class Stages(Protocol):

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from segfloor_ros.camera.sources import StereoSource
-from segfloor_ros.errors import InputError
+from segfloor_ros.apps.recordings import StereoSource
+from segfloor_ros.core.errors import InputError
 
 
 def write_endless_drive(

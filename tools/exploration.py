@@ -17,9 +17,8 @@ from typing import Annotated, Any
 
 import typer
 
-from segfloor_ros.cli.terminal import console
-from segfloor_ros.files.results import write_file
-from segfloor_ros.files.whole import read_json
+from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.core.files.whole import read_json
 
 CAMERA = ('kind=realsense', 'width=480', 'height=360', 'rate_hz=3')
 
@@ -38,7 +37,7 @@ class Job:
         values = [word for value in CAMERA for word in ('--set', f'camera.{value}')]
         numbers = {'goals': goals, 'seed': seed, 'minutes': self.minutes, 'robot': self.robot}
         options = [word for name, value in numbers.items() for word in (f'--{name}', str(value))]
-        program = [sys.executable, '-m', 'segfloor_ros.cli.main']
+        program = [sys.executable, '-m', 'segfloor_ros.apps.cli.main']
         return [*program, 'explore', scene, '--out', str(out), *options, *values]
 
 
@@ -87,7 +86,7 @@ def main(
                     command = JOBS[name].command(seed, goals, maps, out)
                     status = subprocess.run(command, stdout=log, stderr=log, check=False).returncode
                 console.print(f'{name} {seed}: {"done" if not status else f"ended with {status}"}')
-            write_file(work / 'table.md', table(work, seeds).encode())
+            (work / 'table.md').write_bytes(table(work, seeds).encode())
     console.print((work / 'table.md').read_text(), highlight=False, soft_wrap=True)
 
 

@@ -20,18 +20,17 @@ import typer
 from scipy.optimize import minimize_scalar
 
 from segfloor_ros import __version__
-from segfloor_ros.cli.main import run_app
-from segfloor_ros.cli.terminal import announcing, console
-from segfloor_ros.evaluation.floor import score_floor_folders
-from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-from segfloor_ros.files.results import write_file
-from segfloor_ros.files.whole import read_json
-from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import RecordingOptions, render_once
-from segfloor_ros.suite.job import run_segfloor
-from segfloor_ros.suite.measures import measure_run, start_pose_of
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.cli.main import run_app
+from segfloor_ros.apps.cli.terminal import announcing, console
+from segfloor_ros.apps.evaluation.floor import score_floor_folders
+from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
+from segfloor_ros.apps.suite.job import run_segfloor
+from segfloor_ros.apps.suite.measures import measure_run, start_pose_of
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.core.geometry import Array
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures.json'
@@ -113,14 +112,14 @@ def measure(
         'drives': drives,
         'demo': _demo(work),
     }
-    write_file(FIGURES, (json.dumps(found, indent=1) + '\n').encode())
+    FIGURES.write_bytes((json.dumps(found, indent=1) + '\n').encode())
 
 
 @app.command()
 def write() -> None:
     """Put the figures of docs/figures.json between the marks of README and docs/benchmarks.md."""
     for page in PAGES:
-        write_file(page, written(page.read_text(encoding='utf-8')).encode())
+        page.write_bytes(written(page.read_text(encoding='utf-8')).encode())
 
 
 def written(page: str) -> str:
@@ -198,7 +197,7 @@ def _aligned_rmse(a: Array, b: Array) -> float:
 
 
 def _demo(work: Path) -> dict[str, float]:
-    from segfloor_ros.cli.commands import DRIVE
+    from segfloor_ros.apps.cli.commands import DRIVE
 
     out = work / 'demo'
     if not (out / 'summary.json').is_file():

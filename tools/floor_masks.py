@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.cli.terminal import Announce
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.observation import FLOOR
-from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import (
+from segfloor_ros.apps.cli.terminal import Announce
+from segfloor_ros.apps.simulation.scene import Scene
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import (
     DISPARITY_SCALE,
     FrameTruth,
     RecordingOptions,
     render_once,
 )
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.floor.observation import FLOOR
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.geometry import Array, invert, transform_points
 from tools.driving import open_recording
 
 SUN = ('ceiling.height_m=0', 'lighting.ambient=0.45', 'lighting.sun=0.9')

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.benchmark import CAMERA, DRIVE, MOUNT, CorridorImages
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.cli.terminal import Announce
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import MapError
-from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
-from segfloor_ros.geometry import Array
-from segfloor_ros.pipeline import make_slam
-from segfloor_ros.timing import StageTimes
+from segfloor_ros.apps.benchmark import CAMERA, DRIVE, MOUNT, CorridorImages
+from segfloor_ros.apps.cli.terminal import Announce
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.errors import MapError
+from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.timing import StageTimes
 from tools.driving import drive, open_recording
 
 WHOLE, WITHOUT_DISPARITY = 'all', 'all but disparity'

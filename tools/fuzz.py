@@ -34,8 +34,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from segfloor_ros.cli.main import main as segfloor
-from segfloor_ros.files.images import own_standard_error
+from segfloor_ros.apps.cli.main import main as segfloor
+from segfloor_ros.core.files.images import own_standard_error
 from tools.fuzz_damages import DAMAGES
 from tools.fuzz_inputs import KINDS, files_of, words_of
 
@@ -49,9 +49,9 @@ FOREIGN, UNNAMED = 'foreign lines', 'unnamed'
 GOOD = (OK, REFUSED, NO_MAP)
 OUTCOMES = (*GOOD, TRACEBACK, HANG, MEMORY_OUT, CRASH, FOREIGN, UNNAMED)
 EARLY = (
-    'segfloor_ros.evaluation.report', 'segfloor_ros.evaluation.trajectory',
-    'segfloor_ros.suite.result_files', 'segfloor_ros.simulation.simulation',
-    'segfloor_ros.simulation.simulation', 'segfloor_ros.simulation.scene_file',
+    'segfloor_ros.apps.evaluation.report', 'segfloor_ros.apps.evaluation.trajectory',
+    'segfloor_ros.apps.suite.result_files', 'segfloor_ros.apps.simulation.simulation',
+    'segfloor_ros.apps.simulation.simulation', 'segfloor_ros.apps.simulation.scene_file',
     'rosbags.rosbag1', 'rosbags.rosbag2', 'rosbags.typesys', 'scipy.spatial.transform',
 )  # fmt: skip
 """What commands import late."""

@@ -16,14 +16,14 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.benchmark import CAMERA, MOUNT, CorridorImages
-from segfloor_ros.camera.bag_writer import convert
-from segfloor_ros.camera.calibration.files import write_ros_calibration
-from segfloor_ros.camera.calibration.parameters import EyeCalibration
-from segfloor_ros.camera.model import StereoCameraSettings
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.main import app
-from segfloor_ros.floor.observation import FLOOR, NOT_FLOOR
+from segfloor_ros.apps.benchmark import CAMERA, MOUNT, CorridorImages
+from segfloor_ros.apps.cli.main import app
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.recordings.bag_writer import convert
+from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
+from segfloor_ros.core.camera.calibration import EyeCalibration
+from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.floor.observation import FLOOR, NOT_FLOOR
 
 FRAMES = 4
 SCALE = 4

@@ -6,11 +6,11 @@ import time
 
 from std_srvs.srv import SetBool
 
-from segfloor_ros.cli.replay_nodes import NodeGraph
-from segfloor_ros.cli.replay_session import connected_nodes, cpu_s
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.messages.diagnostics import LASTS_S
-from segfloor_ros.messages.topics import CAMERA, GRID
+from segfloor_ros.apps.cli.replay_nodes import NodeGraph
+from segfloor_ros.apps.cli.replay_session import connected_nodes, cpu_s
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.nodes.messages.diagnostics import LASTS_S
+from segfloor_ros.nodes.messages.topics import CAMERA, GRID
 
 SETTLE_S = 3.0
 ALL_IDLE_S = 3 * LASTS_S + SETTLE_S

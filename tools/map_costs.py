@@ -18,23 +18,23 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from segfloor_ros.camera.model import StereoCamera
-from segfloor_ros.files.results import Arrays
-from segfloor_ros.geometry import Array, invert, se3_exp
-from segfloor_ros.slam.mapping.bundle_adjustment import (
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.files.results import Arrays
+from segfloor_ros.core.geometry import Array, invert, se3_exp
+from segfloor_ros.core.plugins.saved_slam import fill_map
+from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     apply_global,
     copy_map,
     move_keyframes,
     solve_global,
 )
-from segfloor_ros.slam.places.loop_closing import plan_closing, solve_closing
-from segfloor_ros.slam.places.loops import path_lengths
-from segfloor_ros.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
-from segfloor_ros.slam.rig import NO_OFFSET, Rig
-from segfloor_ros.slam.saved_slam import fill_map
-from segfloor_ros.slam.sparse_map import Match, SparseMap
-from segfloor_ros.slam.tracking.images import Features
-from segfloor_ros.slam.tracking.patch_alignment import SIDE_PX
+from segfloor_ros.core.slam.places.loop_closing import plan_closing, solve_closing
+from segfloor_ros.core.slam.places.loops import path_lengths
+from segfloor_ros.core.slam.places.place_recognition import NUM_WORDS, PlaceRecognition, Vocabulary
+from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
+from segfloor_ros.core.slam.sparse_map import Match, SparseMap
+from segfloor_ros.core.slam.tracking.images import Features
+from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 STEP_M, SEEN_BY, POINTS = 0.1, 6, 50

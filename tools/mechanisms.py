@@ -11,8 +11,8 @@ from unittest import mock
 
 import numpy as np
 
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.floor.mask.filling import fill_regions, fill_to_contact, upright_above
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.floor.mask.filling import fill_regions, fill_to_contact, upright_above
 
 ROOM = 'segfloor_ros.'
 NOTHING = 'nothing'

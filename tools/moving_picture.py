@@ -2,7 +2,7 @@
 
 Left the image with the floor that was found in it, right the map so far with the path. README's
 picture is that of the demo: `python -m tools.moving_picture
-segfloor_ros/simulation/demo/drive.mcap docs/images/demo.gif`.
+segfloor_ros/apps/simulation/demo/drive.mcap docs/images/demo.gif`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import track
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import console
-from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError
-from segfloor_ros.floor.observation import FLOOR, NO_EVIDENCE, FloorObservation
-from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import UNKNOWN, OccupancyGrid
-from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.slam.results import Keyframe
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, FloorObservation
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.grid.occupancy import UNKNOWN, OccupancyGrid
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.core.slam.results import Keyframe
+from segfloor_ros.nodes.configuration import resolve
 
 Picture = NDArray[np.uint8]
 

@@ -17,10 +17,10 @@ import numpy as np
 import typer
 import yaml
 
-from segfloor_ros.geometry import Array
-from segfloor_ros.simulation.motion import Drive, plan_drive
-from segfloor_ros.simulation.scene import Person, Route
-from segfloor_ros.simulation.solids import place
+from segfloor_ros.apps.simulation.motion import Drive, plan_drive
+from segfloor_ros.apps.simulation.scene import Person, Route
+from segfloor_ros.apps.simulation.solids import place
+from segfloor_ros.core.geometry import Array
 
 NEAREST_M = 0.8
 """Distance from the robot that people keep."""

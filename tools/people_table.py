@@ -21,26 +21,27 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.map_score import (
+from segfloor_ros.apps.evaluation.map_score import (
     DEFAULT_RANGE_M,
     RoadMapPlan,
     compare,
     score_map,
     score_road_maps,
 )
-from segfloor_ros.evaluation.maps import MapTruth, Mask, load_truth, observable
-from segfloor_ros.evaluation.trajectory import match_files, score_trajectory
-from segfloor_ros.files.whole import read_table
-from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, load_map
-from segfloor_ros.lockstep import LockstepRun
-from segfloor_ros.results_folder import OutputFolder
-from segfloor_ros.simulation.scene import Scene
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import render_once
-from segfloor_ros.simulation.solids import place
+from segfloor_ros.apps.evaluation.maps import MapTruth, Mask, load_truth, observable
+from segfloor_ros.apps.evaluation.trajectory import match_files, score_trajectory
+from segfloor_ros.apps.lockstep import LockstepRun
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.results_folder import OutputFolder
+from segfloor_ros.apps.simulation.scene import Scene
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.apps.simulation.solids import place
+from segfloor_ros.core.files.whole import read_table
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
+from segfloor_ros.nodes.configuration import resolve
+from segfloor_ros.nodes.map_files import load_map
 
 SEEN_AGAIN_S = 10.0
 ENOUGH_S = 1.0

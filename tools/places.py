@@ -26,18 +26,18 @@ import cv2
 import numpy as np
 import typer
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
-from segfloor_ros.files.results import from_bytes, to_bytes
-from segfloor_ros.geometry import Array, invert, rotation_angle
-from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.places.loops import Candidate
-from segfloor_ros.slam.results import FrameResult, KeyframePath
-from segfloor_ros.slam.saved_slam import load_slam, save_slam
-from segfloor_ros.slam.stereo_slam import StereoSlam
-from segfloor_ros.timing import rss_mb
-from segfloor_ros.trajectory import TrackedPose, corrected_trajectory, read_trajectory
+from segfloor_ros.apps.evaluation.trajectory import TrajectoryScore, match, score_trajectory
+from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory, read_trajectory
+from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.files.results import from_bytes, to_bytes
+from segfloor_ros.core.geometry import Array, invert, rotation_angle
+from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.saved_slam import load_slam, save_slam
+from segfloor_ros.core.slam.places.loops import Candidate
+from segfloor_ros.core.slam.results import FrameResult, KeyframePath
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.timing import rss_mb
+from segfloor_ros.nodes.configuration import resolve
 from tools.driving import open_recording
 
 FALSE_M, FALSE_RAD = 0.25, 0.1

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from segfloor_ros.errors import SettingsError
-from segfloor_ros.settings import suggestion
+from segfloor_ros.core.errors import SettingsError
+from segfloor_ros.core.settings import suggestion
 
 SOURCE = 'Segfloor dissertation (2022, in Portuguese), evaluation chapter'
 

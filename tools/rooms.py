@@ -14,10 +14,10 @@ import numpy as np
 import typer
 import yaml
 
-from segfloor_ros.geometry import Array
-from segfloor_ros.grid.map_file import FREE
-from segfloor_ros.simulation.scene_file import scene_from_mapping
-from segfloor_ros.simulation.solids import floors, obstacles, true_map
+from segfloor_ros.apps.simulation.scene_file import scene_from_mapping
+from segfloor_ros.apps.simulation.solids import floors, obstacles, true_map
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.grid.occupancy import FREE
 
 FLOORS = ('tiles', 'wood', 'carpet', 'concrete', 'granite', 'marble')
 WALLS = ('rough_plaster', 'bricks', 'concrete', 'plaster')

@@ -17,16 +17,16 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import announcing, console, figure_table
-from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.map_score import score_map
-from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.pipeline import Pipeline, make_slam
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import render_once
-from segfloor_ros.slam.results import FrameResult, KeyframePath
-from segfloor_ros.trajectory import TrackedPose, corrected_trajectory
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import announcing, console, figure_table
+from segfloor_ros.apps.evaluation.map_score import score_map
+from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory
+from segfloor_ros.core.pipeline import Pipeline, make_slam
+from segfloor_ros.core.slam.results import FrameResult, KeyframePath
+from segfloor_ros.nodes.configuration import resolve
 from tools.driving import after_sensors, open_recording
 
 SENSORS = ('sensors.wheel_odometry.rate_hz=50', 'sensors.imu.rate_hz=200')

@@ -9,14 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from segfloor_ros.configuration import Configuration
-from segfloor_ros.errors import MapError
-from segfloor_ros.evaluation.trajectory import TrajectoryScore, match, score_trajectory
-from segfloor_ros.geometry import Array, invert
-from segfloor_ros.pipeline import make_slam
-from segfloor_ros.slam.results import KeyframePath
-from segfloor_ros.timing import StageTimes
-from segfloor_ros.trajectory import TrackedPose, Trajectory, corrected_trajectory, read_trajectory
+from segfloor_ros.apps.evaluation.trajectory import TrajectoryScore, match, score_trajectory
+from segfloor_ros.apps.trajectory import (
+    TrackedPose,
+    Trajectory,
+    corrected_trajectory,
+    read_trajectory,
+)
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.errors import MapError
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.slam.results import KeyframePath
+from segfloor_ros.core.timing import StageTimes
 from tools.driving import after_sensors, drive, noisy, open_recording
 
 DRIVES = ('corridor1', 'corridor2', 'ramp', 'rolling', 'exposure_difference')

@@ -17,16 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import announcing, console
-from segfloor_ros.cloud import FLOOR, OBSTACLE, read_ply
-from segfloor_ros.evaluation.map_score import compare, draw_overlay
-from segfloor_ros.evaluation.maps import load_truth
-from segfloor_ros.files.results import write_file
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import RecordingOptions, render_once
-from segfloor_ros.suite.job import ProgramError, run_segfloor
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import announcing, console
+from segfloor_ros.apps.evaluation.map_score import compare, draw_overlay
+from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
+from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
+from segfloor_ros.core.cloud import FLOOR, OBSTACLE, read_ply
+from segfloor_ros.nodes.map_files import load_map
 
 SMALL = ('camera.width=480', 'camera.height=360')
 WIDTH_PX = 640
@@ -121,7 +120,7 @@ def _drawn(symptom: Symptom, name: str, out: Path) -> str:
     picture = _side_view(result) if symptom.from_the_side else _on_the_truth(result, recording)
     scale = WIDTH_PX / picture.shape[1]
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    write_file(out / f'{name}.png', cv2.imencode('.png', small)[1].tobytes())
+    (out / f'{name}.png').write_bytes(cv2.imencode('.png', small)[1].tobytes())
     return log.read_text()
 
 

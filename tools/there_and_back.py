@@ -28,19 +28,19 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import StereoCamera, StereoFrame
-from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.trajectory import rigid_alignment
-from segfloor_ros.files.results import MapFile, read_map_file, write_map_file
-from segfloor_ros.geometry import Array, invert, transform_points
-from segfloor_ros.pipeline import make_slam
-from segfloor_ros.simulation.scene_file import scene_from_mapping
-from segfloor_ros.simulation.simulation import render_once
-from segfloor_ros.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
-from segfloor_ros.slam.results import FrameResult
-from segfloor_ros.slam.rig import Rig
-from segfloor_ros.slam.saved_slam import PART, gap_ns, load_slam, mount_of, save_slam
-from segfloor_ros.trajectory import corrected_trajectory, read_trajectory
+from segfloor_ros.apps.evaluation.trajectory import rigid_alignment
+from segfloor_ros.apps.simulation.scene_file import scene_from_mapping
+from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.apps.trajectory import corrected_trajectory, read_trajectory
+from segfloor_ros.core.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.core.files.results import MapFile, read_map_file, write_map_file
+from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.pipeline import make_slam
+from segfloor_ros.core.plugins.saved_slam import PART, gap_ns, load_slam, mount_of, save_slam
+from segfloor_ros.core.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
+from segfloor_ros.core.slam.results import FrameResult
+from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.nodes.configuration import resolve
 from tools.buildings import KINDS, make_building
 from tools.driving import open_recording
 from tools.mechanisms import NOTHING, SLAM

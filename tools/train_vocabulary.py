@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.slam.places import place_recognition as vocabulary
-from segfloor_ros.slam.places.place_recognition import BRANCHES, LEVELS
-from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.tracking.images import FeatureExtractor
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.core.slam.places import place_recognition as vocabulary
+from segfloor_ros.core.slam.places.place_recognition import BRANCHES, LEVELS
+from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.tracking.images import FeatureExtractor
+from segfloor_ros.nodes.configuration import resolve
 
 FRAMES_PER_RECORDING = 80
 STEPS = 12

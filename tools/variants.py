@@ -17,19 +17,19 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cli.main import run_command
-from segfloor_ros.cli.terminal import console
-from segfloor_ros.configuration import resolve
-from segfloor_ros.evaluation.floor import (
+from segfloor_ros.apps.cli.main import run_command
+from segfloor_ros.apps.cli.terminal import console
+from segfloor_ros.apps.evaluation.floor import (
     FloorScore,
     count_pixels,
     draw_outline,
     read_mask,
     read_outlines,
 )
-from segfloor_ros.files.whole import read_json
-from segfloor_ros.suite.job import ProgramError, run_segfloor
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
+from segfloor_ros.core.files.whole import read_json
+from segfloor_ros.nodes.configuration import resolve
 from tools.figures import OUTLINES, TIMEOUT_S
 
 Image = NDArray[np.uint8]

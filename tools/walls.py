@@ -17,21 +17,22 @@ import typer
 import yaml
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.cloud import LabelledPoints
-from segfloor_ros.configuration import Configuration, resolve
-from segfloor_ros.evaluation.map_score import compare, score_cells
-from segfloor_ros.evaluation.maps import MapTruth, from_frame, load_truth
-from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import invert, planar
-from segfloor_ros.grid.keyframe_evidence import gather_evidence
-from segfloor_ros.grid.map_file import FREE, OccupancyGrid, render
-from segfloor_ros.grid.mapper import EvidenceFolder, EvidenceHistory
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.solids import floors, obstacles, true_map
-from segfloor_ros.slam.results import KeyframeFeatures
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.evaluation.map_score import compare, score_cells
+from segfloor_ros.apps.evaluation.maps import MapTruth, from_frame, load_truth
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.solids import floors, obstacles, true_map
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.cloud import LabelledPoints
+from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.geometry import invert, planar
+from segfloor_ros.core.grid.keyframe_evidence import gather_evidence
+from segfloor_ros.core.grid.mapper import EvidenceFolder, EvidenceHistory
+from segfloor_ros.core.grid.occupancy import FREE, OccupancyGrid, render
+from segfloor_ros.core.slam.results import KeyframeFeatures
+from segfloor_ros.nodes.configuration import resolve
 from tools.ablation import print_row
 from tools.mechanisms import FLOOR, GRID, NOTHING
 

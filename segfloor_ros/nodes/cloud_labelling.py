@@ -11,18 +11,18 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
 
-from segfloor_ros.cloud import FLOOR, CloudLabelling, LabelledPoints
-from segfloor_ros.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
-from segfloor_ros.files.results import MapFile
-from segfloor_ros.messages import arrays
-from segfloor_ros.messages.arrays import grey8_image
-from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import FRESH_S, to_ns
+from segfloor_ros.core.cloud import FLOOR, CloudLabelling, LabelledPoints
+from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.settings import RobotSettings
+from segfloor_ros.core.slam.results import SparseCloud
+from segfloor_ros.nodes.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
+from segfloor_ros.nodes.messages import arrays
+from segfloor_ros.nodes.messages.arrays import grey8_image
+from segfloor_ros.nodes.messages.poses import pose_array
+from segfloor_ros.nodes.messages.topics import FRESH_S, to_ns
 from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
-from segfloor_ros.settings import RobotSettings
-from segfloor_ros.slam.results import SparseCloud
 
 MAP_POINTS, FEATURES = 'map_points', 'keyframe/features'
 

@@ -9,12 +9,16 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 
-from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.images import eye_calibration
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.configuration import FloorSegmentationNodeSettings
-from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay, v_disparity_picture
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.floor.segmentation import (
+    FloorSegmentation,
+    mask_overlay,
+    v_disparity_picture,
+)
+from segfloor_ros.nodes.configuration import FloorSegmentationNodeSettings
+from segfloor_ros.nodes.messages.arrays import (
     disparity_message,
     free_scan_message,
     grey8_image,
@@ -23,9 +27,9 @@ from segfloor_ros.messages.arrays import (
     right_image,
     scan_message,
 )
-from segfloor_ros.messages.diagnostics import REMARKS_APART
-from segfloor_ros.messages.poses import pose_array, transform_array
-from segfloor_ros.messages.topics import (
+from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART
+from segfloor_ros.nodes.messages.poses import pose_array, transform_array
+from segfloor_ros.nodes.messages.topics import (
     FRAME_PARTS,
     KEYFRAME_PARTS,
     MOVING_MASK,

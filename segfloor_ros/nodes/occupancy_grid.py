@@ -8,14 +8,19 @@ from typing import Any
 
 from rclpy.timer import Timer
 
-from segfloor_ros.configuration import OccupancyGridNodeSettings
-from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.files.results import MapFile
-from segfloor_ros.files.whole import user_path
-from segfloor_ros.grid.map_file import save_map
-from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.messages.arrays import features_arrays, grid_message, labelled_arrays, scan_arrays
-from segfloor_ros.messages.poses import path_arrays
+from segfloor_ros.core.errors import MapError, SettingsError
+from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.grid.mapper import OccupancyGridMapper
+from segfloor_ros.nodes.configuration import OccupancyGridNodeSettings
+from segfloor_ros.nodes.map_files import save_map
+from segfloor_ros.nodes.messages.arrays import (
+    features_arrays,
+    grid_message,
+    labelled_arrays,
+    scan_arrays,
+)
+from segfloor_ros.nodes.messages.poses import path_arrays
 from segfloor_ros.nodes.shared.maps import KeyframeJoin, MapPart
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from segfloor_ros.camera.model import Mount, StereoCamera
-from segfloor_ros.configuration import SegfloorMasksNodeSettings
-from segfloor_ros.files.whole import user_path
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
+from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
+from segfloor_ros.core.slam.results import KeyframePath
+from segfloor_ros.nodes.configuration import SegfloorMasksNodeSettings
+from segfloor_ros.nodes.messages.arrays import (
     colour8_image,
     depth_image,
     features_arrays,
@@ -25,9 +28,9 @@ from segfloor_ros.messages.arrays import (
     image_message,
     scan_arrays,
 )
-from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.poses import path_arrays, transform_array
-from segfloor_ros.messages.topics import (
+from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.poses import path_arrays, transform_array
+from segfloor_ros.nodes.messages.topics import (
     IMAGES,
     KEYFRAME_PARTS,
     KEYFRAMES,
@@ -35,11 +38,9 @@ from segfloor_ros.messages.topics import (
     best_effort,
     to_ns,
 )
+from segfloor_ros.nodes.network_files import open_network
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode, StageNode
-from segfloor_ros.semantics.label_map import LabelMap, numbered
-from segfloor_ros.semantics.network import ImageLabeller, Network, NetworkSettings
-from segfloor_ros.slam.results import KeyframePath
 
 IMAGE, (KEYFRAME, INFO, *_) = 'left/image_raw', KEYFRAME_PARTS
 DISPARITY, MASK, SCAN = 'keyframe/disparity', 'keyframe/floor_mask', 'keyframe/floor_scan'
@@ -128,7 +129,7 @@ class SegfloorMasksNode(StageNode[SegfloorMasksNodeSettings]):
 
     def set_up(self) -> None:
         """Read the network and make the topics."""
-        network = Network(user_path(self.settings.network))
+        network = open_network(user_path(self.settings.network))
         self._labeller = ImageLabeller(network)
         self._every = network.settings.every
         self._work = self.inputs.later(self._process)

@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 
-from segfloor_ros.camera.calibration.parameters import (
-    EyeCalibration,
-    StereoCalibration,
-    StereoRectifier,
-)
-from segfloor_ros.camera.images import (
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration, StereoRectifier
+from segfloor_ros.core.camera.images import (
     EightBitScale,
     depth_calibration,
     depth_image,
@@ -31,13 +27,13 @@ from segfloor_ros.camera.images import (
     eye_calibration,
     grey_image,
 )
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.camera.rig.check import InputFault
-from segfloor_ros.configuration import StereoSlamNodeSettings
-from segfloor_ros.errors import InputError
-from segfloor_ros.messages.arrays import same_calibration
-from segfloor_ros.messages.diagnostics import LASTS_S, RECENT, Level
-from segfloor_ros.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.plugins.rig.check import InputFault
+from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
+from segfloor_ros.nodes.messages.arrays import same_calibration
+from segfloor_ros.nodes.messages.diagnostics import LASTS_S, RECENT, Level
+from segfloor_ros.nodes.messages.topics import IMAGES, KEYFRAMES, PATIENCE_S, best_effort
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S
 from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode

@@ -19,17 +19,22 @@ from numpy.typing import NDArray
 from rclpy.task import Future
 from std_msgs.msg import UInt8MultiArray
 
-from segfloor_ros.camera.calibration.parameters import StereoCalibration
-from segfloor_ros.camera.images import Region, shrink_factor, shrunk_camera, shrunk_image
-from segfloor_ros.camera.model import Mount, StereoFrame
-from segfloor_ros.configuration import StereoSlamNodeSettings
-from segfloor_ros.errors import MapError, SettingsError
-from segfloor_ros.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
-from segfloor_ros.files.whole import user_path
-from segfloor_ros.files.writing import check_output
-from segfloor_ros.geometry import Array
-from segfloor_ros.messages import arrays, poses
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.images import Region, shrink_factor, shrunk_camera, shrunk_image
+from segfloor_ros.core.camera.model import Mount, StereoFrame
+from segfloor_ros.core.errors import MapError, SettingsError
+from segfloor_ros.core.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
+from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.files.writing import check_output
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.pipeline import prune_file
+from segfloor_ros.core.plugins.saved_slam import LoadedMap, save_slam
+from segfloor_ros.core.slam.mapping.back_end import Submap
+from segfloor_ros.core.slam.results import FrameResult, Keyframe
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
+from segfloor_ros.nodes.messages import arrays, poses
+from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     image_message,
     map_file_message,
@@ -37,8 +42,8 @@ from segfloor_ros.messages.arrays import (
     map_start_message,
     rectified_calibration,
 )
-from segfloor_ros.messages.diagnostics import REMARKS_APART, Level
-from segfloor_ros.messages.topics import (
+from segfloor_ros.nodes.messages.diagnostics import REMARKS_APART, Level
+from segfloor_ros.nodes.messages.topics import (
     CORRECTED,
     FRAME_PARTS,
     KEYFRAME_PARTS,
@@ -55,11 +60,6 @@ from segfloor_ros.nodes.shared.inputs import LEAST_PERIOD_S, LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import CameraWatch
-from segfloor_ros.pipeline import prune_file
-from segfloor_ros.slam.mapping.back_end import Submap
-from segfloor_ros.slam.results import FrameResult, Keyframe
-from segfloor_ros.slam.saved_slam import LoadedMap, save_slam
-from segfloor_ros.slam.stereo_slam import StereoSlam
 
 MAPPING_SUBMAP = 'lost; maps a submap until it recognises a place of the map'
 

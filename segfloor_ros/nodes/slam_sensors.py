@@ -17,20 +17,26 @@ from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, Imu
 
-from segfloor_ros.camera.calibration.parameters import StereoRectifier
-from segfloor_ros.camera.images import imu_sample, measures_motion, wheel_pose, xyz
-from segfloor_ros.camera.model import Measurement, WheelPose
-from segfloor_ros.camera.sources.files import is_upright
-from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.messages.arrays import grey8_image
-from segfloor_ros.messages.poses import pose_array
-from segfloor_ros.messages.topics import FRESH_S, IMAGES, PATIENCE_S, SENSORS, best_effort, to_ns
+from segfloor_ros.core.camera.calibration import StereoRectifier
+from segfloor_ros.core.camera.images import imu_sample, measures_motion, wheel_pose, xyz
+from segfloor_ros.core.camera.model import Measurement, WheelPose, is_upright
+from segfloor_ros.core.geometry import Array, make_transform
+from segfloor_ros.core.slam.rig import GATE, chi2_limit
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.nodes.messages.arrays import grey8_image
+from segfloor_ros.nodes.messages.poses import pose_array
+from segfloor_ros.nodes.messages.topics import (
+    FRESH_S,
+    IMAGES,
+    PATIENCE_S,
+    SENSORS,
+    best_effort,
+    to_ns,
+)
 from segfloor_ros.nodes.shared.inputs import DISCOVERY_S, LOOK_S
 from segfloor_ros.nodes.shared.reporter import offered_best_effort
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
-from segfloor_ros.slam.rig import GATE, chi2_limit
-from segfloor_ros.slam.stereo_slam import StereoSlam
 
 WHEELS, IMU, TF_WHEELS = 'wheel_odometry', 'imu', 'odom → base_link'
 MASKS, INITIAL_POSE = 'dynamic_mask', 'initialpose'

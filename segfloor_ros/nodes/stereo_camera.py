@@ -7,37 +7,41 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
-from segfloor_ros.camera.bag_writer import IMU_FRAME
-from segfloor_ros.camera.images import Grey
-from segfloor_ros.camera.model import (
+from segfloor_ros.core.camera.calibration import StereoCalibration
+from segfloor_ros.core.camera.images import Grey
+from segfloor_ros.core.camera.model import (
     DEPTH,
+    IMU_FRAME,
     MAX_LAG_S,
     SENSORS,
     Measurement,
     MeasurementLog,
+    RawPair,
+    RecordedSensor,
+    StereoCamera,
+    StereoCameraSettings,
     WheelPose,
 )
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.camera.sources.source import RawPair, StereoSource
-from segfloor_ros.configuration import (
-    MAX_KEYFRAMES_UNDER_WAY,
-    StereoCameraNodeSettings,
-    StereoSlamNodeSettings,
+from segfloor_ros.core.configuration import MAX_KEYFRAMES_UNDER_WAY
+from segfloor_ros.core.errors import InputError, SegfloorError
+from segfloor_ros.core.geometry import Array, make_transform
+from segfloor_ros.nodes.configuration import StereoCameraNodeSettings, StereoSlamNodeSettings
+from segfloor_ros.nodes.messages.arrays import (
+    camera_info_message,
+    compressed_message,
+    image_message,
 )
-from segfloor_ros.errors import InputError, SegfloorError
-from segfloor_ros.geometry import Array, make_transform
-from segfloor_ros.messages.arrays import camera_info_message, compressed_message, image_message
-from segfloor_ros.messages.diagnostics import RECORDING, Level
-from segfloor_ros.messages.poses import imu_message, transform_message, wheel_message
-from segfloor_ros.messages.ros_bag import use_rosbag2_py
-from segfloor_ros.messages.topics import (
+from segfloor_ros.nodes.messages.diagnostics import RECORDING, Level
+from segfloor_ros.nodes.messages.poses import imu_message, transform_message, wheel_message
+from segfloor_ros.nodes.messages.topics import (
     FRAMES,
     PACED_BY,
     PATIENCE_S,
@@ -47,7 +51,6 @@ from segfloor_ros.messages.topics import (
     to_time,
 )
 from segfloor_ros.nodes.shared.inputs import LOOK_S
-from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import TfLink
 
@@ -59,10 +62,44 @@ MAX_FRAMES_UNDER_WAY = StereoSlamNodeSettings.max_waiting_frames
 """
 
 
+class Recording(Protocol):
+    """What the node plays: raw pairs and what was measured beside them.
+
+    calibration: of the raw pairs; camera: the rectified one. takes_depth: whether depth images
+    stand in place of the right ones. skipped_frames: pairs left out so far.
+    """
+
+    name: str
+    calibration: StereoCalibration
+    sensors: Sequence[RecordedSensor]
+    skipped_frames: int
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The rectified stereo camera."""
+
+    @property
+    def takes_depth(self) -> bool:
+        """Whether depth images stand in place of the right ones."""
+
+    def raw_pairs(self) -> Iterator[RawPair]:
+        """Yield the pairs in order of their stamps."""
+
+    def mask(self, index: int) -> NDArray[np.uint8] | None:
+        """Return the mask (H, W) of what moves in a frame, None where there is none."""
+
+
+OpenRecording = Callable[[StereoCameraSettings], Recording]
+
+
 class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
     """Publishes every pair with its own stamp, once somebody listens."""
 
     settings_type = StereoCameraNodeSettings
+
+    def __init__(self, open_recording: OpenRecording) -> None:
+        self._open = open_recording
+        super().__init__()
 
     def output_topics(self) -> Sequence[Topic]:
         """Return none: they follow from the recording."""
@@ -73,8 +110,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         if not self.settings.input:
             raise InputError('stereo_camera.input is empty; name a recording or a device')
         own = self.settings
-        use_rosbag2_py()
-        self._source: StereoSource = open_source(self.settings)
+        self._source = self._open(own)
         self._frame_ids = {'left': own.left_frame, 'right': own.right_frame}
         self._imu_frame = ''
         self._compressed = own.image_transport == 'compressed'
@@ -208,7 +244,7 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
         # What sensors measured is sent ahead of the images: their stamps may be late.
         for measurement in self._measurements.until(pair.stamp_ns + round(1e9 * MAX_LAG_S)):
             self._send_measurement(measurement)
-        mask = self._source.masks.read(pair.index) if self._source.masks is not None else None
+        mask = self._source.mask(pair.index)
         if mask is not None:
             self._mask.publish(image_message(pair.stamp_ns, self._frame_ids['left'], mask))
         if self._has_depth:
@@ -273,11 +309,6 @@ class StereoCameraNode(StageNode[StereoCameraNodeSettings]):
     def _log_waiting_for(self, what: str) -> None:
         if what and time.monotonic() - self._waiting_since_s > PATIENCE_S:
             self.reporter.diagnose(WAITING, f'waiting for {what}')
-
-
-def main() -> None:
-    """Run the node."""
-    run_node(StereoCameraNode)
 
 
 class ClockPace:
@@ -383,7 +414,3 @@ class ChainPace:
         if self._frames:
             return f'stereo_slam to answer the frame with stamp {min(self._frames)}'
         return f'the keyframe with stamp {min(self._keyframes, default=0)} to reach the map'
-
-
-if __name__ == '__main__':
-    main()

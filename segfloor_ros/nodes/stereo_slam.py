@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import time
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.configuration import StereoSlamNodeSettings
-from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import MapFile
-from segfloor_ros.geometry import MAX_DISORDER_NS
-from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.topics import FRAME_DONE, make_header
+from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.geometry import MAX_DISORDER_NS
+from segfloor_ros.core.pipeline import CAMERA_AS_BASE, make_slam
+from segfloor_ros.core.plugins.saved_slam import (
+    last_pose_of,
+    last_pose_values,
+    load_slam,
+    saved_camera,
+)
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
+from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.topics import FRAME_DONE, make_header
 from segfloor_ros.nodes.shared.inputs import CHECK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
@@ -18,9 +26,6 @@ from segfloor_ros.nodes.shared.transforms import Transforms
 from segfloor_ros.nodes.slam_camera import Pair, StereoInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
 from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
-from segfloor_ros.pipeline import CAMERA_AS_BASE, make_slam
-from segfloor_ros.slam.saved_slam import last_pose_of, last_pose_values, load_slam, saved_camera
-from segfloor_ros.slam.stereo_slam import StereoSlam
 
 
 class StereoSlamNode(StageNode[StereoSlamNodeSettings]):

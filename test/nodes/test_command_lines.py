@@ -12,16 +12,17 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.configuration import STAGE_SETTINGS
-from segfloor_ros.messages.topics import FRAMES, to_ns
+from segfloor_ros.apps.programs import program_of
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.nodes.configuration import STAGE_SETTINGS
+from segfloor_ros.nodes.messages.topics import FRAMES, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 
 PATIENCE_S = 60
 
 
 def run(node: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, '-m', f'segfloor_ros.nodes.{node}', *arguments]
+    command = [sys.executable, '-m', program_of(node), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
@@ -66,7 +67,7 @@ def test_a_recording_is_the_clock_of_the_others_where_it_is_asked_to(make_graph,
     for side in ('left', 'right'):
         for name in ('image_raw', 'camera_info'):
             graph.collect(f'{side}/{name}')
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: len(times) == 3, 'the clock')
     assert times == [frame.stamp_ns for frame in frames]
 

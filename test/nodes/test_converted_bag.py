@@ -8,7 +8,7 @@ import sys
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.messages.topics import TOPICS
+from segfloor_ros.nodes.messages.topics import TOPICS
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 FRAMES = 4
@@ -22,7 +22,7 @@ def test_a_converted_recording_is_tracked_as_it_is_played(make_graph, tmp_path, 
     frames, _ = room_drive(FRAMES)
     drive = write_kitti(tmp_path / 'drive', frames)
     bag = tmp_path / 'out.mcap'
-    start = 'from segfloor_ros.cli import start; start()'
+    start = 'from segfloor_ros.apps.cli import start; start()'
     words = ['convert', str(drive), str(bag), '--images', coding]
     done = subprocess.run(
         [sys.executable, '-c', start, *words], capture_output=True, text=True, timeout=CONVERT_S

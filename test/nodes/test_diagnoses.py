@@ -18,12 +18,16 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.floor.plane.mount import MountEstimator
-from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.diagnostics import HEALTH, Health, Level
-from segfloor_ros.messages.topics import IMAGES, TOPICS, best_effort
+from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import (
+    camera_info_message,
+    image_message,
+    rectified_calibration,
+)
+from segfloor_ros.nodes.messages.diagnostics import HEALTH, Health, Level
+from segfloor_ros.nodes.messages.topics import IMAGES, TOPICS, best_effort
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 CALIBRATION = rectified_calibration(CAMERA)

@@ -14,12 +14,12 @@ from ros_graph import fresh_graph
 from std_srvs.srv import Trigger
 from stereo_drive import room_drive
 
-from segfloor_ros.geometry import invert
-from segfloor_ros.messages.arrays import camera_info_message, image_message
-from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.poses import path_arrays, pose_array
-from segfloor_ros.messages.topics import FLOOR, SLAM, TOPICS, to_ns
-from segfloor_ros.slam.places.views import NEW_TURN_RAD
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
+from segfloor_ros.nodes.messages.arrays import camera_info_message, image_message
+from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
+from segfloor_ros.nodes.messages.topics import FLOOR, SLAM, TOPICS, to_ns
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""

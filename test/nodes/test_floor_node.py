@@ -6,18 +6,18 @@ import numpy as np
 from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.floor.observation import FloorSegmentationSettings
-from segfloor_ros.floor.segmentation import FloorSegmentation, mask_overlay
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.floor.segmentation import FloorSegmentation, mask_overlay
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     grey8_image,
     image_message,
     rectified_calibration,
     scan_arrays,
 )
-from segfloor_ros.messages.poses import transform_message
-from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.poses import transform_message
+from segfloor_ros.nodes.messages.topics import to_ns
 
 CALIBRATION = rectified_calibration(CAMERA)
 

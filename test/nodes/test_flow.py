@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.configuration import resolve
-from segfloor_ros.messages.topics import (
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.configuration import resolve
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.topics import (
     DIAGNOSTICS,
     MASKS,
     NODES,
@@ -17,16 +20,13 @@ from segfloor_ros.messages.topics import (
     published_by,
     subscribed_by,
 )
-from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 PARAMS = Path(__file__).resolve().parents[2] / 'params'
 OURS = sorted(set(PARAMS.glob('*.yaml')) - {PARAMS / 'nav2.yaml'})
 MAKERS = {
-    'stereo_camera': StereoCameraNode,
+    'stereo_camera': make_stereo_camera,
     'stereo_slam': StereoSlamNode,
     'floor_segmentation': FloorSegmentationNode,
     'cloud_labelling': CloudLabellingNode,

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.geometry import quaternions_of, rotations_of
+from segfloor_ros.apps.programs import program_of
+from segfloor_ros.core.geometry import quaternions_of, rotations_of
 
 USE = """
 import sys
 import numpy as np
-import segfloor_ros.nodes.{node}
-from segfloor_ros.messages.poses import PathMessages, path_arrays, pose_array, pose_message
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.slam.results import KeyframePath
+import {node}
+from segfloor_ros.nodes.messages.poses import PathMessages, path_arrays, pose_array, pose_message
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.slam.results import KeyframePath
 Mount.from_transform(Mount(0.3, 0.1).T_base_left)
 pose_array(pose_message(np.eye(4)))
 path_arrays(PathMessages('map').next(1, KeyframePath(np.array([1]), np.eye(4)[None])))
@@ -31,7 +32,7 @@ print(sorted(packages & {{'scipy', 'matplotlib', 'rosbags'}}))
 )
 def test_a_node_does_without_large_libraries_that_it_does_not_need(node) -> None:
     """SciPy takes 20 MB of every process that imports it."""
-    command = [sys.executable, '-c', USE.format(node=node)]
+    command = [sys.executable, '-c', USE.format(node=program_of(node))]
     found = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert found.stdout.strip() == '[]', found.stderr
 

@@ -14,7 +14,8 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import GetParameters
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.messages.topics import NODES, SLAM
+from segfloor_ros.apps.programs import program_of
+from segfloor_ros.nodes.messages.topics import NODES, SLAM
 
 LAUNCH = Path(__file__).resolve().parents[2] / 'launch_configs' / 'segfloor.launch.py'
 STOP_S = 20.0
@@ -38,7 +39,7 @@ def test_the_nodes_are_as_the_arguments_say(make_graph, monkeypatch, tmp_path, c
     graph, started = make_graph(), []
     try:
         for process in processes:
-            module = f'segfloor_ros.nodes.{process.executable}'
+            module = program_of(process.executable)
             command = [sys.executable, '-m', module, *process.arguments]
             with (tmp_path / f'{process.executable}.log').open('wb') as log:
                 started.append(subprocess.Popen(command, stdout=log, stderr=log))

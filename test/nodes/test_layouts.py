@@ -13,7 +13,7 @@ import rclpy
 import yaml
 from rclpy.node import Node
 
-from segfloor_ros.messages.topics import DIAGNOSTICS, FRESH_S, TOPICS
+from segfloor_ros.nodes.messages.topics import DIAGNOSTICS, FRESH_S, TOPICS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAV2 = REPOSITORY / 'params' / 'nav2.yaml'

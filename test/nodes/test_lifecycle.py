@@ -11,12 +11,12 @@ from node_messages import FEATURES, MASK, POINTS, STAMP_NS, cloud_messages, grid
 from std_srvs.srv import SetBool
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.cloud import CloudLabelling, CloudLabellingSettings
-from segfloor_ros.messages.arrays import labelled_arrays
-from segfloor_ros.messages.topics import NODES, published_by, subscribed_by, to_ns
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.messages.arrays import labelled_arrays
+from segfloor_ros.nodes.messages.topics import NODES, published_by, subscribed_by, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 
 MANAGED = ('-p', 'autostart:=false')
 
@@ -85,7 +85,7 @@ def test_an_impossible_transition_is_refused_and_the_node_lives(make_graph) -> N
 
 def test_a_camera_without_recording_stays_unconfigured(make_graph) -> None:
     graph = make_graph(*MANAGED, '-p', 'input:=/nowhere')
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     assert not change(graph, 'stereo_camera', Transition.TRANSITION_CONFIGURE)
     assert state(graph, 'stereo_camera') == State.PRIMARY_STATE_UNCONFIGURED
 

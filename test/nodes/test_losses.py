@@ -15,10 +15,14 @@ from std_srvs.srv import SetBool
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.diagnostics import HEALTH, LASTS_S, Level
-from segfloor_ros.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.messages.arrays import (
+    camera_info_message,
+    image_message,
+    rectified_calibration,
+)
+from segfloor_ros.nodes.messages.diagnostics import HEALTH, LASTS_S, Level
+from segfloor_ros.nodes.messages.topics import KEYFRAMES
 from segfloor_ros.nodes.shared.reporter import LossCounter, loss_in_words
 from segfloor_ros.nodes.slam_camera import PairQueue
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode

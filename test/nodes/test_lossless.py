@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.messages.diagnostics import HEALTH
-from segfloor_ros.messages.topics import FRAME_DONE, TOPICS, make_header, to_ns
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.nodes import stereo_camera as pacing
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.nodes.messages.diagnostics import HEALTH
+from segfloor_ros.nodes.messages.topics import FRAME_DONE, TOPICS, make_header, to_ns
 
 INPUTS = tuple(
     f'{side}/{what}' for side in ('left', 'right') for what in ('image_raw', 'camera_info')
@@ -53,7 +53,7 @@ def play(make_graph, tmp_path):
         drive = write_kitti(tmp_path / 'drive', room_drive(FRAMES)[0])
         graph = make_graph('-p', f'input:={drive}', '-p', 'rate:=0.0')
         listener = Listener(graph)
-        graph.add(StereoCameraNode())
+        graph.add(make_stereo_camera())
         graph.until(lambda: len(listener.stamps) == pacing.MAX_FRAMES_UNDER_WAY, 'the first frames')
         assert not graph.comes(lambda: len(listener.stamps) > pacing.MAX_FRAMES_UNDER_WAY, 0.5)
         return graph, listener

@@ -6,8 +6,8 @@ import pytest
 from stereo_drive import write_kitti
 from stereo_room import MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 KNOWN = [planar_pose(0.04 * k, 0.0, 0.03 * k) for k in range(20)]
@@ -32,7 +32,7 @@ def test_more_held_results_than_a_queue_holds_arrive(make_graph, tmp_path) -> No
     )
     odometry = graph.collect('odometry')
     graph.add(StereoSlamNode())
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     last_ns = frames[-1].stamp_ns
     graph.until(lambda: odometry and to_ns(odometry[-1].header.stamp) == last_ns, 'the last pose')
     came = [to_ns(message.header.stamp) for message in odometry]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from node_chain import NodeChain
 
-from segfloor_ros.messages.topics import CLOUD, NAMED_BY, PROFILES, prepare_middleware
+from segfloor_ros.nodes.messages.topics import CLOUD, NAMED_BY, PROFILES, prepare_middleware
 
 STEREO_PAIR_BYTES = 2 * 1226 * 370
 

@@ -10,12 +10,16 @@ from moving_drive import MovingDrive
 from node_messages import AT_ORIGIN, SCAN, STAMP_NS, pose_message_at, publish
 from stereo_room import CAMERA, MOUNT, planar_pose
 
-from segfloor_ros.camera.calibration.parameters import StereoRectifier
-from segfloor_ros.cli.explore_session import Pilot
-from segfloor_ros.cli.replay_recorder import DriveNotes
-from segfloor_ros.evaluation.exploration import Exploration
-from segfloor_ros.floor.observation import FLOOR
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.apps.cli.explore_session import Pilot
+from segfloor_ros.apps.cli.replay_recorder import DriveNotes
+from segfloor_ros.apps.evaluation.exploration import Exploration
+from segfloor_ros.apps.navigation import Body, Explorer
+from segfloor_ros.core.camera.calibration import StereoRectifier
+from segfloor_ros.core.floor.observation import FLOOR
+from segfloor_ros.core.slam.results import MovingPoints, SparseCloud
+from segfloor_ros.core.slam.tracking.images import is_inside
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import (
     FEATURE_DTYPE,
     MOVING_DTYPE,
     camera_info_message,
@@ -28,19 +32,15 @@ from segfloor_ros.messages.arrays import (
     rectified_calibration,
     sparse_cloud_message,
 )
-from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.poses import (
+from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.poses import (
     odometry_message,
     pose_with_covariance_message,
     transform_message,
 )
-from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.navigation import Body, Explorer
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.slam_sensors import MaskInput
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import MovingPoints, SparseCloud
-from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
 ARGUMENTS = (

@@ -12,15 +12,15 @@ import pytest
 from ros_graph import fresh_graph
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.messages.topics import NODES
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.topics import NODES
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
-MAKERS = (StereoCameraNode, StereoSlamNode, FloorSegmentationNode, CloudLabellingNode,
+MAKERS = (make_stereo_camera, StereoSlamNode, FloorSegmentationNode, CloudLabellingNode,
           OccupancyGridNode)  # fmt: skip
 ALTERNATIVES = (
     (),

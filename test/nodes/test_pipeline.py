@@ -14,8 +14,8 @@ from ros_graph import fresh_graph
 from std_srvs.srv import SetBool, Trigger
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
-from segfloor_ros.grid.map_file import load_map
-from segfloor_ros.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
+from segfloor_ros.nodes.map_files import load_map
+from segfloor_ros.nodes.messages.topics import CAMERA, GRID, NODES, SLAM, published_by, to_ns
 
 FRAMES = 14
 
@@ -32,7 +32,7 @@ def pipeline(drive, tmp_path_factory):
     parameters = {'input': drive, 'rate': 0.0, 'start_paused': 'true', 'background': 'false',
                   'map_file': folder / 'map.yaml'}  # fmt: skip
     options = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
-    command = [sys.executable, '-m', 'segfloor_ros.nodes.segfloor_pipeline', '--ros-args']
+    command = [sys.executable, '-m', 'segfloor_ros.apps.segfloor_pipeline', '--ros-args']
     with fresh_graph() as graph, (folder / 'log').open('w') as log:
         process = subprocess.Popen([*command, *options], stdout=log, stderr=log)
         try:

@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.cli.main import main
-from segfloor_ros.cli.replay_nodes import unconnected
-from segfloor_ros.files.results import read_map_file
-from segfloor_ros.grid.map_file import FREE, load_map
-from segfloor_ros.messages.topics import NODES, published_by
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.cli.main import main
+from segfloor_ros.apps.cli.replay_nodes import unconnected
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.files.results import read_map_file
+from segfloor_ros.core.grid.occupancy import FREE
+from segfloor_ros.nodes.map_files import load_map
+from segfloor_ros.nodes.messages.topics import NODES, published_by
 
 FRAMES, DAMAGED = 20, 7
 SAME_FILES = (
@@ -47,7 +48,7 @@ def drive(tmp_path_factory) -> Path:
 def start(*arguments: object) -> subprocess.Popen[str]:
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_DOMAIN_ID'}
     return subprocess.Popen(
-        [sys.executable, '-m', 'segfloor_ros.cli.main', *map(str, arguments)],
+        [sys.executable, '-m', 'segfloor_ros.apps.cli.main', *map(str, arguments)],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -70,7 +71,7 @@ def node_processes(replay: subprocess.Popen[str]) -> dict[str, int]:
             words = Path(f'/proc/{pid}/cmdline').read_text().split('\0')
         except OSError:
             continue
-        names = [w.rsplit('.', 1)[-1] for w in words if w.startswith('segfloor_ros.nodes.')]
+        names = [w.rsplit('.', 1)[-1] for w in words if w.startswith('segfloor_ros.')]
         found.update({name: int(pid) for name in names})
     return found
 

@@ -13,9 +13,13 @@ from std_srvs.srv import Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.model import Mount, StereoFrame
-from segfloor_ros.configuration import resolve
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.core.camera.model import Mount, StereoFrame
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.configuration import resolve
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     image_message,
     labelled_arrays,
@@ -23,14 +27,10 @@ from segfloor_ros.messages.arrays import (
     map_start_ns,
     rectified_calibration,
 )
-from segfloor_ros.messages.poses import transform_array
-from segfloor_ros.messages.topics import MAP_START, TOPICS, to_ns
-from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.poses import transform_array
+from segfloor_ros.nodes.messages.topics import MAP_START, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.pipeline import Pipeline
 
 S = 1_000_000_000
 FRAMES, MIDDLE = 12, 6
@@ -178,7 +178,7 @@ def test_the_camera_reset_plays_from_the_first_frame(make_graph, tmp_path) -> No
     received = graph.collect('left/image_raw')
     for name in ('right/image_raw', 'left/camera_info', 'right/camera_info'):
         graph.collect(name)
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: len(received) == 3, 'the recording')
     assert graph.call(Trigger, 'stereo_camera/reset', Trigger.Request()).success
     graph.until(lambda: len(received) == 6, 'the recording again')

@@ -14,17 +14,17 @@ from node_messages import grid_arrays
 from ros_graph import fresh_graph, surroundings
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.camera.model import StereoFrame
-from segfloor_ros.cloud import UNKNOWN, LabelledPoints
-from segfloor_ros.files.results import MapFile
-from segfloor_ros.geometry import invert
-from segfloor_ros.grid.map_file import OccupancyGrid
-from segfloor_ros.messages.arrays import labelled_arrays
-from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.poses import path_arrays, pose_array
-from segfloor_ros.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
+from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.cloud import UNKNOWN, LabelledPoints
+from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.slam.places.views import NEW_TURN_RAD
+from segfloor_ros.nodes.messages.arrays import labelled_arrays
+from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.poses import path_arrays, pose_array
+from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, GRID, SLAM, to_ns
 from segfloor_ros.nodes.shared.maps import KeptState
-from segfloor_ros.slam.places.views import NEW_TURN_RAD
 
 NEW_VIEW_RAD = 1.1 * NEW_TURN_RAD
 """Turn per frame: every one is a new view, which becomes a keyframe."""

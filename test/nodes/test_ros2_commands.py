@@ -23,8 +23,8 @@ from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.configuration import NODE_SETTINGS
-from segfloor_ros.messages.topics import NODES, TOPICS, to_ns
+from segfloor_ros.nodes.configuration import NODE_SETTINGS
+from segfloor_ros.nodes.messages.topics import NODES, TOPICS, to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 
 LIFECYCLE = {

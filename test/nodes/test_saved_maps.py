@@ -18,14 +18,18 @@ from std_srvs.srv import Trigger
 from stereo_drive import room_drive
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import read_map_file
-from segfloor_ros.geometry import invert
-from segfloor_ros.messages.arrays import camera_info_message, image_message, rectified_calibration
-from segfloor_ros.messages.poses import pose_array, pose_message
-from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.results import read_map_file
+from segfloor_ros.core.geometry import invert
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import (
+    camera_info_message,
+    image_message,
+    rectified_calibration,
+)
+from segfloor_ros.nodes.messages.poses import pose_array, pose_message
+from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 

@@ -12,10 +12,12 @@ from node_messages import publish
 from small_network import constant_network, grey_network
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.floor.observation import FLOOR, MOVING, FloorObservation, FloorScan
-from segfloor_ros.grid.map_file import FREE, UNKNOWN, OccupancyGrid
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.floor.observation import FLOOR, MOVING, FloorObservation, FloorScan
+from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN, OccupancyGrid
+from segfloor_ros.core.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
+from segfloor_ros.core.slam.tracking.images import is_inside
+from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     disparity_message,
     features_message,
@@ -26,12 +28,10 @@ from segfloor_ros.messages.arrays import (
     rectified_calibration,
     scan_message,
 )
-from segfloor_ros.messages.poses import PathMessages, transform_message
-from segfloor_ros.messages.topics import to_ns
+from segfloor_ros.nodes.messages.poses import PathMessages, transform_message
+from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.segfloor_masks import SegfloorMasksNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
-from segfloor_ros.slam.tracking.images import is_inside
 
 CALIBRATION = rectified_calibration(CAMERA)
 MOUNTED = (

@@ -13,18 +13,23 @@ from sensor_msgs.msg import Imu
 from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT, depth_of_room
 
-from segfloor_ros.camera.images import imu_sample, wheel_pose
-from segfloor_ros.camera.model import ImuSample, StereoFrame, WheelPose
-from segfloor_ros.geometry import invert, make_transform, quaternion_xyzw
-from segfloor_ros.messages.arrays import grey8_image, right_image
-from segfloor_ros.messages.poses import imu_message, pose_array, transform_message, wheel_message
-from segfloor_ros.messages.topics import KEYFRAMES, to_ns
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.core.camera.images import imu_sample, wheel_pose
+from segfloor_ros.core.camera.model import ImuSample, StereoFrame, WheelPose
+from segfloor_ros.core.geometry import invert, make_transform, quaternion_xyzw
 from segfloor_ros.nodes import slam_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.arrays import grey8_image, right_image
+from segfloor_ros.nodes.messages.poses import (
+    imu_message,
+    pose_array,
+    transform_message,
+    wheel_message,
+)
+from segfloor_ros.nodes.messages.topics import KEYFRAMES, to_ns
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.slam_sensors import SensorInput
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
 
 FRAMES, BLIND = 14, range(6, 10)
@@ -54,7 +59,7 @@ def test_frames_that_show_nothing_have_the_pose_of_the_wheels(make_graph, drive)
     graph = make_graph(*arguments)
     odometry = graph.collect('odometry')
     graph.add(StereoSlamNode())
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
     for message in odometry:
         truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
@@ -80,7 +85,7 @@ def test_where_the_imu_of_a_recording_is_comes_through_tf(make_graph, drive) -> 
     ]
     graph = make_graph(*arguments)
     slam = graph.add(StereoSlamNode())
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
 
     def places() -> list[list[float]]:
         samples = slam.slam.sensors.gyroscope.samples if slam.slam else []
@@ -112,7 +117,7 @@ def test_where_no_topic_tells_the_odometry_that_another_node_broadcasts_is_taken
         transform_message(round(k * 1e8), 'odom', 'base_link', pose) for k, pose in enumerate(poses)
     ]
     others.publish(tf_msgs.TFMessage(transforms=told))
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: len(odometry) == FRAMES, 'the odometry of every frame')
     for message in odometry:
         truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]
@@ -271,7 +276,7 @@ def test_depth_images_take_the_place_of_right_ones_that_nobody_publishes(
     masks, scans = graph.collect('keyframe/floor_mask'), graph.collect('scan')
     graph.add(StereoSlamNode())
     graph.add(FloorSegmentationNode())
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: len(odometry) == 8 and masks and scans, 'odometry and floor')
     for message in odometry:
         truth = invert(poses[0]) @ poses[round(to_ns(message.header.stamp) * 1e-8)]

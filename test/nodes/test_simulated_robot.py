@@ -9,9 +9,9 @@ import pytest
 from geometry_msgs.msg import Twist, TwistStamped, Vector3
 from ros_graph import fresh_graph
 
-from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.topics import TOPICS, make_header, stamp_of
-from segfloor_ros.nodes.simulated_robot import SimulatedRobotNode
+from segfloor_ros.apps.simulation.simulated_robot import SimulatedRobotNode
+from segfloor_ros.core.errors import SegfloorError
+from segfloor_ros.nodes.messages.topics import TOPICS, make_header, stamp_of
 
 pytestmark = pytest.mark.skipif(find_spec('mujoco') is None, reason='the extra sim')
 

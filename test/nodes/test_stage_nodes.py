@@ -26,15 +26,24 @@ from std_srvs.srv import SetBool, Trigger
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.camera.images import eye_calibration
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.cloud import FLOOR, CloudLabelling, CloudLabellingSettings
-from segfloor_ros.floor.observation import FloorSegmentationSettings, free_ranges, near_obstacles
-from segfloor_ros.floor.segmentation import FloorSegmentation
-from segfloor_ros.geometry import invert
-from segfloor_ros.grid.map_file import OccupancyGridSettings, load_map
-from segfloor_ros.grid.mapper import OccupancyGridMapper
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.apps.stereo_camera import make_stereo_camera
+from segfloor_ros.core.camera.images import eye_calibration
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.cloud import FLOOR, CloudLabelling, CloudLabellingSettings
+from segfloor_ros.core.floor.observation import (
+    FloorSegmentationSettings,
+    free_ranges,
+    near_obstacles,
+)
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.grid.mapper import OccupancyGridMapper
+from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
+from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
+from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
+from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.map_files import load_map
+from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     compressed_message,
     features_message,
@@ -45,15 +54,16 @@ from segfloor_ros.messages.arrays import (
     sparse_cloud_arrays,
     sparse_cloud_message,
 )
-from segfloor_ros.messages.diagnostics import Level, Status
-from segfloor_ros.messages.poses import path_arrays, pose_array, transform_array, transform_message
-from segfloor_ros.messages.topics import to_ns
-from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
-from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
+from segfloor_ros.nodes.messages.diagnostics import Level, Status
+from segfloor_ros.nodes.messages.poses import (
+    path_arrays,
+    pose_array,
+    transform_array,
+    transform_message,
+)
+from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
-from segfloor_ros.nodes.stereo_camera import StereoCameraNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
-from segfloor_ros.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 
 CALIBRATION = rectified_calibration(CAMERA)
 
@@ -64,7 +74,7 @@ def test_the_camera_sends_every_pair_as_recorded(make_graph, tmp_path) -> None:
     graph = make_graph('-p', f'input:={folder}', '-p', 'rate:=50.0', '-p', 'start_paused:=true')
     names = ('left/image_raw', 'right/image_raw', 'left/camera_info', 'right/camera_info')
     received = {name: graph.collect(name) for name in names}
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     resumed = graph.call(SetBool, 'stereo_camera/pause', SetBool.Request(data=False))
     assert resumed.success
     graph.until(lambda: any(s.kind == 'recording' for s in graph.statuses), 'the end')
@@ -88,7 +98,7 @@ def test_the_camera_waits_for_somebody_who_listens(make_graph, tmp_path) -> None
     frames, _ = room_drive(2)
     folder = write_kitti(tmp_path / 'drive', frames)
     graph = make_graph('-p', f'input:={folder}', '-p', 'rate:=50.0')
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: any(s.kind == 'connections' for s in graph.statuses), 'a sign of life')
     received = graph.collect('left/image_raw')
     for name in ('right/image_raw', 'left/camera_info', 'right/camera_info'):
@@ -106,7 +116,7 @@ def test_the_camera_compresses_as_it_is_told(make_graph, tmp_path) -> None:
     received = graph.collect('left/image_raw/compressed')
     for name in ('right/image_raw/compressed', 'left/camera_info', 'right/camera_info'):
         graph.collect(name)
-    graph.add(StereoCameraNode())
+    graph.add(make_stereo_camera())
     graph.until(lambda: received, 'the image')
     expected = compressed_message(frame.stamp_ns, '', frame.left, 30)
     assert bytes(received[0].data) == bytes(expected.data)

@@ -10,10 +10,10 @@ from node_chain import NodeChain
 from stereo_drive import room_drive
 from stereo_room import MOUNT
 
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.geometry import FrameTree, invert, make_transform
-from segfloor_ros.messages.poses import pose_array, transform_array, transform_message
-from segfloor_ros.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, SLAM, to_ns
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.geometry import FrameTree, invert, make_transform
+from segfloor_ros.nodes.messages.poses import pose_array, transform_array, transform_message
+from segfloor_ros.nodes.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, SLAM, to_ns
 
 tf2_msgs = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs could not be built by make')
 

@@ -13,8 +13,10 @@ import pytest
 import thin_link
 from stereo_drive import lockstep_map, room_drive, write_kitti
 
-from segfloor_ros.grid.map_file import OccupancyGrid, load_map
-from segfloor_ros.messages.topics import CAMERA, FLOOR, NODES, SLAM
+from segfloor_ros.apps.programs import program_of
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.nodes.map_files import load_map
+from segfloor_ros.nodes.messages.topics import CAMERA, FLOOR, NODES, SLAM
 
 TEST = Path(__file__).resolve().parents[1]
 PROFILES = TEST.parent / 'params' / 'fastdds_thin_link.xml'
@@ -104,7 +106,7 @@ def test_the_map_of_two_hosts_is_that_of_one(
         for host in (robot, base):
             (tmp_path / host).mkdir()
         for node in NODES:
-            command = [sys.executable, '-m', f'segfloor_ros.nodes.{node}', '--ros-args', *options]
+            command = [sys.executable, '-m', program_of(node), '--ros-args', *options]
             host = robot if node in on_robot else base
             logs.append(tmp_path / f'{node}.log')
             with logs[-1].open('w') as log:

@@ -8,11 +8,11 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.camera.model import RecordedSensor, StereoFrame, WheelPose
-from segfloor_ros.configuration import resolve
-from segfloor_ros.geometry import invert
-from segfloor_ros.slam.results import StereoSlamSettings
-from segfloor_ros.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.camera.model import RecordedSensor, StereoFrame, WheelPose
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.nodes.configuration import resolve
 from tools.ablation import app
 from tools.driving import after_sensors, noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS

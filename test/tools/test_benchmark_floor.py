@@ -9,10 +9,10 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError, MapError
-from segfloor_ros.floor.observation import FloorSegmentationSettings
-from segfloor_ros.floor.segmentation import DISPARITY, DISPARITY_ABOVE
+from segfloor_ros.core.errors import InputError, MapError
+from segfloor_ros.core.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE
+from segfloor_ros.nodes.configuration import resolve
 from tools.benchmark_floor import benchmark_floor, disparity_table, steps_table
 from tools.disparity_choices import TruePair, choices, read_pairs, score, visible
 from tools.floor_steps import WHOLE, WITHOUT_DISPARITY, generated_keyframes, time_steps

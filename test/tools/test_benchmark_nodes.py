@@ -10,15 +10,15 @@ import pytest
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA
 
-from segfloor_ros.camera.model import StereoCameraSettings
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.nodes.configuration import resolve
 from tools.endless_drive import write_endless_drive
 
 pytest.importorskip('rclpy')
 
-from segfloor_ros.messages.topics import NODES
+from segfloor_ros.nodes.messages.topics import NODES
 from tools import idle_nodes
 from tools.benchmark_nodes import idle_table
 

@@ -13,14 +13,14 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.camera.model import StereoCameraSettings
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.errors import InputError
-from segfloor_ros.geometry import invert
-from segfloor_ros.pipeline import Pipeline
-from segfloor_ros.simulation.world import RenderingError
-from segfloor_ros.trajectory import read_trajectory
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.simulation.world import RenderingError
+from segfloor_ros.apps.trajectory import read_trajectory
+from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.pipeline import Pipeline
+from segfloor_ros.nodes.configuration import resolve
 from tools.benchmark_slam import benchmark_slam, drives_table, soak_table
 from tools.endless_drive import write_endless_drive
 from tools.slam_drives import measure_drive

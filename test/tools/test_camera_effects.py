@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from segfloor_ros.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.scene_file import open_scene
 from tools.camera_effects import DRIVE, effects_of
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.camera.model import Mount, StereoCamera, StereoCameraSettings
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
-from segfloor_ros.simulation.scene_file import open_scene
-from segfloor_ros.simulation.simulation import FrameTruth
-from segfloor_ros.simulation.world import RenderingError
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.apps.simulation.scene_file import open_scene
+from segfloor_ros.apps.simulation.simulation import FrameTruth
+from segfloor_ros.apps.simulation.world import RenderingError
+from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoCameraSettings
+from segfloor_ros.nodes.configuration import resolve
 from tools.floor_masks import (
     SCENES,
     count,

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.errors import InputError
+from segfloor_ros.core.errors import InputError
 from tools import figures
 from tools.moving_picture import moving_picture
 from tools.symptoms import delay, scale_calibration

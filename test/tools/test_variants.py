@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.camera.sources import open_source
-from segfloor_ros.configuration import resolve
+from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.nodes.configuration import resolve
 from tools.variants import VARIANTS, write_variant
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from segfloor_ros.evaluation.maps import MapTruth
-from segfloor_ros.grid.map_file import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from segfloor_ros.apps.evaluation.maps import MapTruth
+from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tools.walls import FINE_M, depth_m
 
 

@@ -16,8 +16,8 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from segfloor_ros.camera.sources.source import StampJoiner
-from segfloor_ros.messages.topics import TOPICS, stamp_of, to_ns
+from segfloor_ros.nodes.messages.topics import TOPICS, stamp_of, to_ns
+from segfloor_ros.nodes.shared.joining import StampJoiner
 from segfloor_ros.nodes.shared.reporter import Reporter
 
 LEAST_PERIOD_S, LOOK_S, CHECK_S = 0.005, 0.05, 0.1

@@ -20,16 +20,16 @@ from typing import TYPE_CHECKING, Any
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header, UInt8MultiArray
 
-from segfloor_ros.errors import InputError
-from segfloor_ros.files.results import Arrays, MapFile, read_map_file, write_to
-from segfloor_ros.messages.arrays import (
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.files.results import Arrays, MapFile, read_map_file, write_to
+from segfloor_ros.nodes.messages.arrays import (
     is_of_loaded_map,
     map_file_message,
     map_file_of,
     map_start_ns,
 )
-from segfloor_ros.messages.diagnostics import Level
-from segfloor_ros.messages.topics import (
+from segfloor_ros.nodes.messages.diagnostics import Level
+from segfloor_ros.nodes.messages.topics import (
     KEYFRAME_DONE,
     KEYFRAMES,
     MAP_LOADED,

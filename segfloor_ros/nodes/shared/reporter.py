@@ -16,8 +16,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from segfloor_ros.errors import SegfloorError
-from segfloor_ros.messages.diagnostics import (
+from segfloor_ros.core.errors import SegfloorError
+from segfloor_ros.core.timing import rss_mb
+from segfloor_ros.nodes.messages.diagnostics import (
     CONNECTIONS,
     HEALTH,
     LASTS_S,
@@ -26,11 +27,16 @@ from segfloor_ros.messages.diagnostics import (
     Status,
     status_message,
 )
-from segfloor_ros.messages.topics import DIAGNOSTICS, PATIENCE_S, TOPICS, Topic, describe_policies
-from segfloor_ros.timing import rss_mb
+from segfloor_ros.nodes.messages.topics import (
+    DIAGNOSTICS,
+    PATIENCE_S,
+    TOPICS,
+    Topic,
+    describe_policies,
+)
 
 if TYPE_CHECKING:
-    from segfloor_ros.camera.sources.source import StampJoiner
+    from segfloor_ros.nodes.shared.joining import StampJoiner
 
 MOST = 3
 

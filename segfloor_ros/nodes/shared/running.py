@@ -28,16 +28,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
-from segfloor_ros.configuration import (
+from segfloor_ros.core.errors import SegfloorError, SettingsError
+from segfloor_ros.core.settings import SettingSpec, suggestion
+from segfloor_ros.nodes.configuration import (
     NODE_SETTINGS,
     ROS_PARAMETERS,
     NodeSettings,
     is_node_parameter,
 )
-from segfloor_ros.errors import SegfloorError, SettingsError
-from segfloor_ros.files.whole import yaml_value
-from segfloor_ros.messages.topics import prepare_middleware
-from segfloor_ros.settings import SettingSpec, suggestion
+from segfloor_ros.nodes.messages.topics import prepare_middleware
+from segfloor_ros.nodes.yaml_files import yaml_value
 
 INTERRUPT_HEARD_S = 0.2
 

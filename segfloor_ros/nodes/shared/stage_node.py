@@ -16,11 +16,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
-from segfloor_ros.configuration import NodeSettings
-from segfloor_ros.errors import SegfloorError
-from segfloor_ros.files.results import MapFile
-from segfloor_ros.messages.diagnostics import HEALTH_PERIOD_S
-from segfloor_ros.messages.topics import TOPICS, Topic, published_by
+from segfloor_ros.core.errors import SegfloorError
+from segfloor_ros.core.files.results import MapFile
+from segfloor_ros.nodes.configuration import NodeSettings
+from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S
+from segfloor_ros.nodes.messages.topics import TOPICS, Topic, published_by
 from segfloor_ros.nodes.shared.inputs import CHECK_S, Inputs
 from segfloor_ros.nodes.shared.maps import KeptState
 from segfloor_ros.nodes.shared.reporter import Connections, Reporter, one_line

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 
-from segfloor_ros.camera.model import Mount
-from segfloor_ros.configuration import StereoSlamNodeSettings
-from segfloor_ros.errors import InputError
-from segfloor_ros.geometry import Array, FrameTree, invert
-from segfloor_ros.messages.poses import transform_array, transform_message
-from segfloor_ros.messages.topics import (
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.errors import InputError
+from segfloor_ros.core.geometry import Array, FrameTree, invert
+from segfloor_ros.core.slam.results import FrameResult
+from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
+from segfloor_ros.nodes.messages.poses import transform_array, transform_message
+from segfloor_ros.nodes.messages.topics import (
     IMAGES,
     KEYFRAMES,
     LATCHED,
@@ -27,7 +28,6 @@ from segfloor_ros.messages.topics import (
 )
 from segfloor_ros.nodes.shared.inputs import LOOK_S
 from segfloor_ros.nodes.shared.stage_node import AnyStageNode
-from segfloor_ros.slam.results import FrameResult
 
 DISCOVERY_S = 1.0
 """Who publishes tf is known so long after the start; where nobody does, tf is not waited for."""

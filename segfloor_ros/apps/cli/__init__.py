@@ -1,0 +1,27 @@
+"""The segfloor command."""
+
+import sys
+
+from segfloor_ros.core.processes import limit_threads
+
+limit_threads()
+
+
+def start() -> None:
+    """Run the command line; without its libraries, end with one line and status 2."""
+    try:
+        from segfloor_ros.apps.cli.main import main as run
+        from segfloor_ros.core.files.images import own_standard_error
+    except ModuleNotFoundError as error:
+        if (error.name or '').startswith('segfloor_ros'):
+            raise
+        name = (error.name or '').partition('.')[0]
+        print(
+            f'segfloor: the command needs the Python package {name}, which is not installed: '
+            f'apt install python3-{name}, or pip install {name} in a virtual environment; the ROS '
+            'nodes do without it',
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    own_standard_error()
+    run()

@@ -1,0 +1,7 @@
+"""Sources of stereo pairs: folders, bags, videos and devices behind one interface."""
+
+from segfloor_ros.apps.recordings.opening import open_source
+from segfloor_ros.apps.recordings.source import StereoSource, prefetched
+from segfloor_ros.core.camera.model import RawPair
+
+__all__ = ['RawPair', 'StereoSource', 'open_source', 'prefetched']

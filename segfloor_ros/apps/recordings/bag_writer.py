@@ -1,0 +1,437 @@
+"""Stereo pairs, and what a robot measures besides, as a rosbag2 (mcap): by `rosbags`, without a ROS
+install, or by the writer that a ROS install has.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from enum import Enum
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE, MISSING_LIBRARY
+from segfloor_ros.apps.recordings.source import StereoSource
+from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
+from segfloor_ros.core.camera.images import NOT_MEASURED
+from segfloor_ros.core.camera.model import (
+    IMU_FRAME,
+    ImuSample,
+    Measurement,
+    MeasurementLog,
+    RawPair,
+    WheelPose,
+    is_disparity,
+)
+from segfloor_ros.core.errors import InputError, os_errors
+from segfloor_ros.core.files.images import jpeg_bytes, png_bytes
+from segfloor_ros.core.files.writing import scratch_folder
+from segfloor_ros.core.geometry import Array, make_transform, quaternion_xyzw
+
+SIDES = ('left', 'right')
+FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')
+TF_TOPIC = '/tf_static'
+
+WHEELS_TOPIC, IMU_TOPIC, DEPTH_TOPIC = '/wheel_odometry', '/imu', '/depth/image_raw'
+WHEELS_FRAME = 'wheel_odom'
+
+RESERVE_S, LEAST_FREE_BYTES = 10.0, 64_000_000
+"""A recording ends while there is space for what comes in this time, so that its file is whole."""
+
+ODOMETRY = 'nav_msgs/msg/Odometry'
+IMU = 'sensor_msgs/msg/Imu'
+TF = 'tf2_msgs/msg/TFMessage'
+
+
+class ImageCoding(str, Enum):
+    """How images are kept in a bag: pixels in zstd chunks, PNG (both exact), or JPEG (small)."""
+
+    raw = 'raw'
+    png = 'png'
+    jpeg = 'jpeg'
+
+
+def convert(
+    source: StereoSource,
+    out: Path,
+    coding: ImageCoding = ImageCoding.raw,
+    on_progress: Callable[[int], None] = lambda done: None,
+    depth: StereoSource | None = None,
+) -> int:
+    """Write every pair of a source to a new bag and return how many there were.
+
+    The grey pairs are written as the camera saw them, with the calibration to rectify them, to
+    `/left/image_raw` and `/right/image_raw`, or `image_rect` where they are rectified already; what
+    wheels and IMU measured, to `/wheel_odometry` and `/imu`. Depth images go to `/depth/image_raw`
+    (32FC1, m): those of the source, or of `depth`, the same recording opened with them. on_progress
+    gets the number of pairs done. Raises InputError.
+    """
+    done, log = 0, MeasurementLog(source.sensors)
+    depths = _by_stamp(depth)
+    writing = os_errors(f'{out}: cannot be written')
+    with writing, BagWriter(out, source.calibration, coding) as bag:
+        for pair in source.raw_pairs():
+            for measurement in log.until(pair.stamp_ns):
+                bag.write_measurement(measurement)
+            bag.write(pair)
+            other = depths(pair.stamp_ns)
+            if other is not None and depth is not None:
+                bag.write_depth(other, depth.camera.disparity_times_depth)
+            done += 1
+            on_progress(done)
+        for measurement in log.until(np.iinfo(np.int64).max):
+            bag.write_measurement(measurement)
+    return done
+
+
+def _by_stamp(source: StereoSource | None) -> Callable[[int], RawPair | None]:
+    """Return a function that returns the pair of a source at a stamp, each later than the last."""
+    pairs = iter(()) if source is None else source.raw_pairs()
+    waiting: list[RawPair] = []
+
+    def take(stamp_ns: int) -> RawPair | None:
+        while not waiting or waiting[-1].stamp_ns < stamp_ns:
+            pair = next(pairs, None)
+            if pair is None:
+                return None
+            waiting[:] = [pair]
+        return waiting[-1] if waiting[-1].stamp_ns == stamp_ns else None
+
+    return take
+
+
+class BagLibrary(Protocol):
+    """A library that writes a rosbag2 folder of one mcap file. types: message classes by name."""
+
+    types: Mapping[str, Any]
+
+    def knows(self, kind: str) -> bool:
+        """Whether messages of a type can be written."""
+
+    def sequence(self, values: NDArray[Any]) -> Any:
+        """Return an array (N,) as the message classes take it for a sequence."""
+
+    def serialize(self, message: Any, kind: str) -> bytes | memoryview:
+        """Return a message of a type in CDR."""
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message in CDR."""
+
+    def close(self, is_whole: bool) -> None:
+        """Complete the bag, or give it up."""
+
+
+OpenLibrary = Callable[[Path, bool], BagLibrary]
+"""Opens a folder that is not there yet; whether its chunks are compressed."""
+
+_ros_library: OpenLibrary | None = None
+
+
+def write_rosbag2_with(open_library: OpenLibrary | None) -> None:
+    """Have bags written by another library from now on; None: by rosbags again."""
+    global _ros_library
+    _ros_library = open_library
+
+
+class Rosbags:
+    """Writes by `rosbags`. Raises ImportError where that is not installed."""
+
+    def __init__(self, folder: Path, compressed: bool) -> None:
+        from rosbags import rosbag2
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self.types: Mapping[str, Any] = self._store.types
+        self._connections: dict[str, Any] = {}
+        self._writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        if compressed:
+            self._writer.set_compression(
+                rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
+            )
+        self._writer.open()
+
+    def knows(self, kind: str) -> bool:
+        """Whether it is a type of ROS 2 Jazzy."""
+        return kind in self.types
+
+    def sequence(self, values: NDArray[Any]) -> Any:
+        """Return the array itself."""
+        return values
+
+    def serialize(self, message: Any, kind: str) -> bytes | memoryview:
+        """Return a message of a type in CDR."""
+        return self._store.serialize_cdr(message, kind)
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message in CDR."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._store
+            )
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def close(self, is_whole: bool) -> None:
+        """Complete the bag, or give it up."""
+        (self._writer.close if is_whole else self._writer.abort)()
+
+
+class NewBag:
+    """A new bag of serialised messages: one file where its name ends in `.mcap`, else a rosbag2
+    folder. compressed: in zstd chunks. bytes: of the messages so far.
+
+    keeps: whether what is written stays, whatever ends the recording: it is at its final place from
+    the first message on. Else the bag appears when it is complete, and after an error nothing is
+    left. Raises InputError when `out` exists or cannot be written.
+    """
+
+    def __init__(self, out: Path, compressed: bool = False, keeps: bool = False) -> None:
+        self._out = out
+        self._keeps = keeps
+        self._compressed = compressed
+        self._stack = ExitStack()
+        self._topics: set[str] = set()
+        self.bytes = 0
+
+    def __enter__(self) -> NewBag:
+        out, is_file = self._out, self._out.suffix == '.mcap'
+        if os.path.lexists(out):
+            raise InputError(f'{out}: exists already; choose another name')
+        try:
+            with os_errors(f'{out}: cannot be written'):
+                out.parent.mkdir(parents=True, exist_ok=True)
+                self._folder = self._stack.enter_context(scratch_folder(out.parent)) / out.stem
+                if self._keeps and not is_file:
+                    self._folder = out
+                self.library = (_ros_library or Rosbags)(self._folder, self._compressed)
+                if is_file:
+                    (self._file,) = self._folder.glob('*.mcap')
+                    os.link(self._file, out)  # the same file by two names
+                    if not self._keeps:
+                        out.unlink()
+        except ImportError:
+            self._stack.close()
+            raise InputError(f'{out}: {MISSING_LIBRARY}') from None
+        except InputError:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        out, is_file = self._out, self._out.suffix == '.mcap'
+        is_whole = kind is None or (self._keeps and bool(self._topics))
+        try:
+            self.library.close(is_whole)
+            if not is_whole and self._keeps:
+                out.unlink() if is_file else shutil.rmtree(out)
+            if is_whole and not self._keeps:
+                (self._file if is_file else self._folder).rename(out)
+        finally:
+            self._stack.close()
+
+    def knows(self, kind: str) -> bool:
+        """Whether messages of a type can be written."""
+        return self.library.knows(kind)
+
+    def has(self, topic: str) -> bool:
+        """Whether a message of a topic was written."""
+        return topic in self._topics
+
+    def write(self, topic: str, kind: str, stamp_ns: int, data: bytes | memoryview) -> None:
+        """Append a message of a type, in CDR, recorded at stamp_ns."""
+        self._topics.add(topic)
+        self.library.write(topic, kind, stamp_ns, data)
+        self.bytes += len(data)
+
+    def is_disk_full(self, elapsed_s: float) -> bool:
+        """Whether the space that is left is short for the next seconds, if messages go on to come
+        as fast as in the seconds so far.
+        """
+        next_bytes = RESERVE_S * self.bytes / max(elapsed_s, 1.0)
+        return shutil.disk_usage(self._folder).free < LEAST_FREE_BYTES + next_bytes
+
+
+class BagWriter:
+    """A new bag of stereo pairs."""
+
+    def __init__(
+        self,
+        out: Path,
+        calibration: StereoCalibration,
+        coding: ImageCoding = ImageCoding.raw,
+        keeps: bool = False,
+    ) -> None:
+        self.file = NewBag(out, coding is ImageCoding.raw, keeps)
+        self._calibration = calibration
+        self._coding = coding
+
+        self._turn_imu = np.eye(3) if calibration.is_rectified else calibration.left.R.T
+
+    def __enter__(self) -> BagWriter:
+        self.file.__enter__()
+        self.messages = BagMessages(self.file.library.types)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.file.__exit__(*error)
+
+    def write(self, pair: RawPair) -> None:
+        """Append one pair, recorded at its own stamp; of a depth camera, image and depth."""
+        left, right = self._calibration.left, self._calibration.right
+        self._write_image('left', pair.stamp_ns, FRAME_IDS[0], left, pair.left)
+        if is_disparity(pair.right):
+            self.write_depth(pair, self._calibration.camera.disparity_times_depth)
+        else:
+            self._write_image('right', pair.stamp_ns, FRAME_IDS[1], right, pair.right)
+
+    def _write_image(
+        self, side: str, stamp_ns: int, frame_id: str, eye: EyeCalibration, image: NDArray[np.uint8]
+    ) -> None:
+        info = self._info_message(self.messages.header(stamp_ns, frame_id), eye)
+        self.write_message(f'/{side}/camera_info', CAMERA_INFO, stamp_ns, info)
+        kind = IMAGE if self._coding is ImageCoding.raw else COMPRESSED
+        picture = self._picture_message(stamp_ns, frame_id, image)
+        self.write_message(self._image_topic(side), kind, stamp_ns, picture)
+
+    def write_depth(self, pair: RawPair, disparity_times_depth: float) -> None:
+        """Append the depths of a pair whose right image is a disparity (H, W)."""
+        with np.errstate(divide='ignore'):
+            depth_m = np.float32(disparity_times_depth) / pair.right
+        message = self.image_message(pair.stamp_ns, depth_m.astype(np.float32), '32FC1')
+        self.write_message(DEPTH_TOPIC, IMAGE, pair.stamp_ns, message)
+
+    def write_measurement(self, measurement: Measurement) -> None:
+        """Append what wheels or an IMU measured, the latter in the raw left optical frame."""
+        stamp_ns = measurement.stamp_ns
+        if isinstance(measurement, WheelPose):
+            odometry = self.messages.odometry(stamp_ns, WHEELS_FRAME, measurement.T_wheels_base)
+            self.write_message(WHEELS_TOPIC, ODOMETRY, stamp_ns, odometry)
+        elif isinstance(measurement, ImuSample):
+            imu = self.messages.imu(measurement, self._imu_frame(measurement), self._turn_imu)
+            self.write_message(IMU_TOPIC, IMU, stamp_ns, imu)
+
+    def _imu_frame(self, sample: ImuSample) -> str:
+        """Return the frame of an IMU, which is written before its first sample."""
+        if not sample.place_m.any():
+            return FRAME_IDS[0]
+        if not self.file.has(TF_TOPIC):
+            T_raw_imu = make_transform(np.eye(3), self._turn_imu @ sample.place_m)
+            transform = self.messages.transform(FRAME_IDS[0], IMU_FRAME, T_raw_imu)
+            self.write_message(TF_TOPIC, TF, sample.stamp_ns, transform)
+        return IMU_FRAME
+
+    def write_message(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
+        """Append a message of a type to a topic, recorded at stamp_ns."""
+        self.file.write(topic, kind, stamp_ns, self.file.library.serialize(message, kind))
+
+    def _image_topic(self, side: str) -> str:
+        image = 'image_rect' if self._calibration.is_rectified else 'image_raw'
+        suffix = '' if self._coding is ImageCoding.raw else '/compressed'
+        return f'/{side}/{image}{suffix}'
+
+    def image_message(
+        self, stamp_ns: int, image: NDArray[Any], encoding: str, frame_id: str = FRAME_IDS[0]
+    ) -> Any:
+        """Return a sensor_msgs/Image of an image (H, W) of one channel."""
+        pixels = np.ascontiguousarray(image)
+        height, width = pixels.shape
+        return self.messages.types[IMAGE](
+            header=self.messages.header(stamp_ns, frame_id),
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=0,
+            step=width * pixels.itemsize,
+            data=self.file.library.sequence(pixels.ravel().view(np.uint8)),
+        )
+
+    def _picture_message(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Any:
+        if self._coding is ImageCoding.raw:
+            return self.image_message(stamp_ns, image, 'mono8', frame_id)
+        encoded = (png_bytes if self._coding is ImageCoding.png else jpeg_bytes)(image)
+        words = f'mono8; {self._coding.value} compressed mono8'
+        header = self.messages.header(stamp_ns, frame_id)
+        data = self.file.library.sequence(np.frombuffer(encoded, np.uint8))
+        return self.messages.types[COMPRESSED](header=header, format=words, data=data)
+
+    def _info_message(self, header: Any, eye: EyeCalibration) -> Any:
+        whole_image = self.messages.types['sensor_msgs/msg/RegionOfInterest'](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self.messages.types[CAMERA_INFO](
+            header=header,
+            height=eye.height,
+            width=eye.width,
+            distortion_model=eye.distortion_model,
+            d=self.file.library.sequence(eye.D),
+            k=eye.K.ravel(),
+            r=eye.R.ravel(),
+            p=eye.P.ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=whole_image,
+        )
+
+
+class BagMessages:
+    """Makes messages of the classes of a typestore, by name."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self.types = types
+
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Return a std_msgs/Header."""
+        sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
+        stamp = self.types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
+        return self.types['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+
+    def odometry(self, stamp_ns: int, frame_id: str, T_frame_base: Array) -> Any:
+        """Return the pose (4, 4) of `base_link` as nav_msgs/Odometry."""
+        types, no_covariance = self.types, np.zeros(36)
+        pose = types['geometry_msgs/msg/Pose'](
+            position=self._filled('Point', T_frame_base[:3, 3]),
+            orientation=self._filled('Quaternion', quaternion_xyzw(T_frame_base[:3, :3])),
+        )
+        still = self._filled('Vector3', np.zeros(3))
+        twist = types['geometry_msgs/msg/Twist'](linear=still, angular=still)
+        return types[ODOMETRY](
+            header=self.header(stamp_ns, frame_id),
+            child_frame_id='base_link',
+            pose=types['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=no_covariance),
+            twist=types['geometry_msgs/msg/TwistWithCovariance'](
+                twist=twist, covariance=no_covariance
+            ),
+        )
+
+    def imu(self, sample: ImuSample, frame_id: str, R_frame_left: Array) -> Any:
+        """Return a sample as sensor_msgs/Imu in a frame that R_frame_left (3, 3) turns it into."""
+        no_covariance = np.zeros(9)
+        return self.types[IMU](
+            header=self.header(sample.stamp_ns, frame_id),
+            orientation=self._filled('Quaternion', np.array([0.0, 0.0, 0.0, 1.0])),
+            orientation_covariance=np.array([NOT_MEASURED, *[0.0] * 8]),
+            angular_velocity=self._filled('Vector3', R_frame_left @ sample.gyro_rad_s),
+            angular_velocity_covariance=no_covariance,
+            linear_acceleration=self._filled('Vector3', R_frame_left @ sample.accel_m_s2),
+            linear_acceleration_covariance=no_covariance,
+        )
+
+    def transform(self, frame_id: str, child: str, T_frame_child: Array) -> Any:
+        """Return a fixed transform (4, 4) as tf2_msgs/TFMessage."""
+        transform = self.types['geometry_msgs/msg/Transform'](
+            translation=self._filled('Vector3', T_frame_child[:3, 3]),
+            rotation=self._filled('Quaternion', quaternion_xyzw(T_frame_child[:3, :3])),
+        )
+        stamped = self.types['geometry_msgs/msg/TransformStamped'](
+            header=self.header(0, frame_id), child_frame_id=child, transform=transform
+        )
+        return self.types[TF](transforms=[stamped])
+
+    def _filled(self, kind: str, xyzw: Array) -> Any:
+        """Return a type of geometry_msgs with fields x, y, z and, of four values, w."""
+        fields = {name: float(value) for name, value in zip('xyzw', xyzw, strict=False)}
+        return self.types[f'geometry_msgs/msg/{kind}'](**fields)

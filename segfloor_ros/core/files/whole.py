@@ -1,0 +1,157 @@
+"""Files as bytes, text and JSON, and as tables of numbers and stamps in text: one row per line,
+words parted by blanks or commas.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import stat
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.errors import InputError, SegfloorError
+
+MAX_BYTES = 1 << 28
+"""Of a file that is read whole: an hour of an IMU at 1 kHz has about as many."""
+
+END_NS = 2**31 * 10**9
+"""Stamps are before this and not before 0: what `builtin_interfaces/Time` can say."""
+
+_NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
+
+
+def user_path(name: str | Path, error_type: type[SegfloorError] = InputError) -> Path:
+    """Return the path of a name that a user gives, with `~` and `~user` for home folders. Raises an
+    error of a type for a name that cannot be one.
+    """
+    if '\0' in str(name):
+        raise error_type(f'{name}: a name holds no null character')
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:
+        raise error_type(f'{name}: there is no such user; write the whole path') from None
+
+
+def check_file(path: Path, error_type: type[SegfloorError] = InputError) -> int:
+    """Return the size of a file in bytes. Raises an error of a type for what is missing, a folder,
+    a FIFO or a device: reading one of these may never end.
+    """
+    try:
+        facts = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        reason = getattr(error, 'strerror', None) or error
+        raise error_type(f'{path}: cannot be read ({reason})') from None
+    if not stat.S_ISREG(facts.st_mode):
+        what = 'a folder' if stat.S_ISDIR(facts.st_mode) else 'a device or pipe'
+        raise error_type(f'{path}: cannot be read (is {what}, not a file)')
+    return facts.st_size
+
+
+def read_bytes(
+    path: Path, error_type: type[SegfloorError] = InputError, at_most: int = MAX_BYTES
+) -> bytes:
+    """Return what a file holds. Raises an error of a type, also for more than `at_most` bytes."""
+    if check_file(path, error_type) > at_most:
+        raise error_type(f'{path}: has more than {at_most / 1e6:.1f} MB; is it the right file?')
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise error_type(f'{path}: cannot be read ({error.strerror})') from None
+
+
+def read_text(
+    path: Path, error_type: type[SegfloorError] = InputError, at_most: int = MAX_BYTES
+) -> str:
+    """Return the text of a file in UTF-8. Raises an error of a type."""
+    try:
+        return read_bytes(path, error_type, at_most).decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        raise error_type(f'{path}, byte {error.start}: is not UTF-8; save it as that') from None
+
+
+def read_json(path: Path, expected: str) -> dict[str, Any]:
+    """Return the object that a JSON file holds. expected: what it should be, in words. Raises
+    InputError.
+    """
+    document = json_object(read_text(path))
+    if document is None:
+        raise InputError(f'{path}: not {expected}: no object in JSON')
+    return document
+
+
+def json_object(text: str | bytes) -> dict[str, Any] | None:
+    """Return the object that a JSON text is, None where it is none."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def number(word: str) -> float:
+    """Return the finite number that a word is. Raises ValueError."""
+    value = float(word) if _NUMBER.fullmatch(word) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f'{word[:40]}: not a finite number')
+    return value
+
+
+def nanoseconds(seconds: str) -> int:
+    """Return a time in seconds, as text, in ns, exactly. Raises ValueError for what is no stamp."""
+    value = Decimal(seconds) if -1 < number(seconds) < 1e10 else Decimal(-1)
+    return checked_ns(int(value.scaleb(9).to_integral_value()), seconds)
+
+
+def whole_nanoseconds(word: str) -> int:
+    """Return a stamp in ns. Raises ValueError for what is none."""
+    if not (word.isascii() and word.isdigit() and len(word) < 20):
+        raise ValueError(f'{word[:40]}: not a stamp in ns')
+    return checked_ns(int(word), word)
+
+
+def checked_ns(stamp_ns: int, word: str) -> int:
+    """Return a stamp in ns. Raises ValueError for one that no clock shows."""
+    if not 0 <= stamp_ns < END_NS:
+        raise ValueError(f'{word[:40]}: not a stamp from 0 to {END_NS // 10**9} s')
+    return stamp_ns
+
+
+def read_lines(
+    path: Path, error_type: type[SegfloorError] = InputError
+) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a text, and what to call each in a message; without empty ones and
+    comments (`#`). Bytes that are no text stay in their lines, where they are no numbers. Raises an
+    error of a type.
+    """
+    text = read_bytes(path, error_type).decode('utf-8-sig', errors='replace')
+    for number_of_line, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.lstrip().startswith('#'):
+            yield f'{path}, line {number_of_line}', line
+
+
+def read_table(path: Path) -> NDArray[np.float64]:
+    """Return the numbers of a text file (rows, columns), all finite. Raises InputError."""
+    rows: list[list[float]] = []
+    for where, line in read_lines(path):
+        words = line.partition('#')[0].split()
+        try:
+            rows.append([number(word) for word in words])
+        except ValueError as error:
+            raise InputError(f'{where}: {error}') from None
+        if len(rows[-1]) != len(rows[0]):
+            raise InputError(f'{where}: has {len(words)} numbers, the first row {len(rows[0])}')
+    if not rows:
+        raise InputError(f'{path}: is empty')
+    return np.array(rows, np.float64)
+
+
+def shortened(text: str) -> str:
+    """Return a text that may be long, for a message."""
+    return text if len(text) <= 40 else f'{text[:37]}…'

@@ -1,0 +1,468 @@
+"""What each pixel says: floor, not floor, or nothing.
+
+A pixel is judged by its own disparity: its height above the floor that has the same disparity.
+Where there is no texture, how bright a surface is tells it from the floor around it: a black tyre,
+the shade below a car. What looks like no more than a few of the floor's own pixels is floor only if
+that was measured.
+
+The floor is tested on the images themselves, too. Semi-global matching prefers surfaces that face
+the camera and, where texture is weak, agrees with whatever repeats: the blocks of a compressed
+image, its neighbours. Here the right image is drawn as it would look were everything floor, and
+compared with the left one. What then agrees about as well as it does with the matched disparities
+cannot be said not to be floor. Texture, beyond the noise of the image, says where a disparity means
+something.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.images import SUBPIXEL, measured_sigma_px
+from segfloor_ros.core.floor.disparity.matching import (
+    BLOCK_PX,
+    MEAN_NOISE,
+    NOISE_PX,
+    SAME_PX,
+    SIGMAS,
+)
+from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
+from segfloor_ros.core.floor.observation import (
+    FLOOR,
+    NO_EVIDENCE,
+    NOT_FLOOR,
+    FloorSegmentationSettings,
+)
+
+_MIN_DISPARITY_PX = 2.5
+"""Farther floor is not judged."""
+_CONTACT_HEIGHT_M = 0.12
+"""Up to this height an upright surface is taken to stand on the floor below it."""
+
+
+_NEIGHBOURS_PX = 9
+"""Heights are averaged over so wide a square; ones that are matched err together."""
+_MOST_SIGMAS = np.float32(10)
+_LEAST_KNOWN = 0.2
+
+_DIRT = 0.1
+"""By such a share of its brightness a floor varies: dust, wear."""
+_SAMPLED, _FITS = 8, 4
+"""Every such row and column, one independent of the other, tells how light falls on the floor; so
+often it is asked."""
+_FLAT = np.diag(np.array([1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3], np.float32))
+
+_AGAINST_GREY = 1.0
+"""By how much the images must contradict the floor to deny it, beyond their noise."""
+_LIKENESS_GREY = 3.0
+"""How much left and right may differ on the floor, beyond their noise."""
+_WIDE_WINDOW, _WIDE_RATIO, _WIDE_MARGIN_GREY, _WIDE_SHARE = 15, 1.15, 0.05, 0.65
+"""What too little texture leaves open in a small window a larger one often tells: floor is denied
+there where it differs by this much more than what was matched, over so much of the window."""
+_FOREIGN = 0.4, 0.3
+"""Correlation of both eyes from which on it says something, if all differences are noise; and the
+share of it below which they show different things."""
+_MARGIN_PX = 4.0
+"""So near to the right image's border interpolation is unsure."""
+_NOISE_SHARE = 2.0
+"""Two images of the same thing differ by 1.13 sigma of noise on average, and by interpolation."""
+
+_SIGMA_PX = 2.0
+_MIN_TEXTURE_GREY = 0.2
+"""Below this slope of the image along a row, per pixel, a disparity says nothing."""
+_NOISE_TEXTURE = 0.1
+"""Texture per grey level of noise that is surely no noise: its own is 0.04."""
+TEXTURE_WINDOW_PX = 11
+"""Over so wide a square texture is measured."""
+EDGE_SLOPE = 24
+"""Sobel response of the weakest edge that counts: 3 grey levels per row."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the images say of each pixel of a view, (R, W) bool where not said otherwise.
+
+    floor_px: (R / 2, W') float32, the floor's disparity at half the resolution of the image.
+    against: clearly more like the matched disparity than like floor. denied: the same of the
+    surroundings taken together. unlike: unlike floor, whatever it is. consistent: may be floor.
+    """
+
+    floor_px: NDArray[np.float32]
+    against: NDArray[np.bool_]
+    denied: NDArray[np.bool_]
+    unlike: NDArray[np.bool_]
+    consistent: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeightTable:
+    """Per disparity step: row: the de-rolled row of the floor. Height above the floor is
+    `offset - scale * derolled row`, in metres; up, down: how much of it is still floor; noise: its
+    error, one sigma. All (B,) float32, NaN at disparity 0.
+    """
+
+    row: NDArray[np.float32]
+    offset: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    up: NDArray[np.float32]
+    down: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        line: FloorLine,
+        profile: FloorProfile,
+        num_disparities: int,
+        settings: FloorSegmentationSettings,
+        measured: float | None = None,
+    ) -> HeightTable:
+        """Return the table of a profile. measured: disparity times depth of a depth camera."""
+        disparity = np.arange(num_disparities * SUBPIXEL + 1) / SUBPIXEL
+        disparity[0] = np.nan
+        scale = line.metres_per_row / disparity
+        noise_px = NOISE_PX if measured is None else measured_sigma_px(measured, disparity)
+        # One pixel of disparity is this much height: the camera's height over the disparity.
+        noise_m = noise_px * line.metres_per_row / line.slope / disparity
+        row = profile.row_of_disparity(disparity)
+        tables = (
+            row,
+            scale * row,
+            scale,
+            np.hypot(settings.step_height_m, noise_m),
+            settings.drop_height_m + SIGMAS * noise_m,
+            noise_m,
+        )
+        return cls(*(table.astype(np.float32) for table in tables))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """mask: (R, W) uint8. Others, (R, W) bool: above: what is matched above the floor; off,
+    standing: what is matched off it in the mean of its neighbours, farther than their noise
+    explains, and above it, farther than that of a single one; odd: what does not look like floor.
+    """
+
+    mask: NDArray[np.uint8]
+    above: NDArray[np.bool_]
+    off: NDArray[np.bool_]
+    standing: NDArray[np.bool_]
+    odd: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Heights:
+    """What disparities say of how high pixels lie, (R, W). table, index: their disparity step in
+    it. height: float32 in metres. above, off: bool, higher than floor can be, or lower, too.
+    """
+
+    table: HeightTable
+    index: NDArray[np.int32]
+    height: NDArray[np.float32]
+    above: NDArray[np.bool_]
+    off: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: FloorView, table: HeightTable, disparity: NDArray[np.float32]) -> Heights:
+        """Return the heights of the pixels of a view, of known disparities (R, W)."""
+        # What is nearer than the table goes is no lower than what is as near as that.
+        last = np.float32(len(table.row) - 1)
+        index = np.minimum(disparity * np.float32(SUBPIXEL), last).astype(np.int32)
+        height = table.offset.take(index) - table.scale.take(index) * view.derolled
+        above = height > table.up.take(index)
+        return cls(table, index, height, above, above | (height < -table.down.take(index)))
+
+
+def judge(
+    view: FloorView,
+    disparity: NDArray[np.float32],
+    textured: NDArray[np.bool_],
+    compared: Comparison,
+    heights: Heights,
+    settings: FloorSegmentationSettings,
+) -> NDArray[np.uint8]:
+    """Return what the pixels (R, W) of the view say by themselves, the mask of `Evidence`.
+
+    textured: where a disparity means something; compared: what the images say of the floor. A
+    disparity makes floor only where the images agree, and denies it only where they do.
+    """
+    table, above, off = heights.table, heights.above, heights.off
+    # What seems to lie below the floor may be what the floor mirrors.
+    sure = (textured & compared.against) | (compared.denied & above)
+    near = disparity >= np.float32(_MIN_DISPARITY_PX)
+    may_be = textured & near & ~off
+    mask = np.full(disparity.shape, NO_EVIDENCE, np.uint8)
+    mask[may_be & ~(compared.against | compared.unlike)] = FLOOR
+    mask[off & sure] = NOT_FLOOR
+    up = table.up.take(heights.index)
+    low = above & sure & (heights.height < up + np.float32(_CONTACT_HEIGHT_M))
+    mask[_below_contact(view, table.row, heights.index, low)] = NOT_FLOOR
+    mask[view.derolled <= view.line.horizon] = NOT_FLOOR
+    # On a sill the images contradict the floor, and show that it is a sill; beyond it floor goes on
+    # where above a foot there is what stands on it.
+    step_m = np.float32(settings.step_height_m)
+    sill = compared.against & (np.abs(heights.height) <= step_m)
+    mask[may_be & sill & below_floor(mask)] = FLOOR
+    mask[
+        (mask == FLOOR) & ~most_around(mask == FLOOR, textured & near & (off | (mask == FLOOR)))
+    ] = NO_EVIDENCE
+    return mask
+
+
+def most_around(said: NDArray[np.bool_], measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return around which pixels (R, W) most of what is measured (R, W) says something (R, W): some
+    of what is matched wrongly lies on the floor by chance.
+    """
+    window = (_WIDE_WINDOW, _WIDE_WINDOW)
+    of_all, of_said = (cv2.blur(part.astype(np.float32), window) for part in (measured, said))
+    return np.asarray(of_said >= np.float32(0.5) * of_all)
+
+
+def below_floor(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Tell of each pixel of a mask (R, W) whether the next evidence up its column is floor."""
+    twice_row = np.arange(0, 2 * len(mask), 2, dtype=np.int16)[:, None]
+    evidence = twice_row * (mask != NO_EVIDENCE)  # odd where it is floor
+    evidence |= mask == FLOOR
+    return np.maximum.accumulate(evidence, axis=0, out=evidence) & 1 > 0
+
+
+def mean_height(heights: Heights) -> NDArray[np.float32]:
+    """Return the height above the floor of each pixel (R, W) in the mean of its neighbours, in
+    sigmas of one of them; NaN where that is not known.
+    """
+    return _mean_of_neighbours(heights.height / heights.table.noise.take(heights.index))
+
+
+def lies_on_floor(
+    view: FloorView, disparity: NDArray[np.float32], heights: Heights
+) -> NDArray[np.bool_]:
+    """Return which pixels (R, W) have a disparity of a floor, and rise down the image as one does
+    in the mean of their neighbours: the foot of what stands is no higher than a floor, but steeper.
+
+    They are compared with so far above and below that floor differs by more than noise.
+    """
+    half = min(math.ceil(SAME_PX / view.line.slope), len(disparity) // 2)
+    rise = np.full_like(disparity, np.nan)
+    above, below = disparity[: -2 * half], disparity[2 * half :]
+    expected = np.float32(2 * half * view.line.slope)
+    rise[half:-half] = np.where((above > 0) & (below > 0), below - above - expected, np.nan)
+    noise_px = math.sqrt(2) * NOISE_PX
+    mean = _mean_of_neighbours(rise / np.float32(noise_px))
+    return (disparity > 0) & ~heights.off & (np.abs(mean) < SIGMAS * MEAN_NOISE)
+
+
+def _mean_of_neighbours(sigmas: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the mean of what is known around each pixel (R, W), NaN where that is too little. One
+    that is far off counts for no more than a few.
+    """
+    window = (_NEIGHBOURS_PX, _NEIGHBOURS_PX)
+    known = np.isfinite(sigmas)
+    share = cv2.blur(known.astype(np.float32), window)
+    bounded = np.clip(np.where(known, sigmas, np.float32(0)), -_MOST_SIGMAS, _MOST_SIGMAS)
+    mean = cv2.blur(bounded, window) / np.maximum(share, np.float32(_LEAST_KNOWN))
+    return np.where(share > _LEAST_KNOWN, mean, np.float32(np.nan))
+
+
+def _below_contact(
+    view: FloorView,
+    floor_row: NDArray[np.float32],
+    index: NDArray[np.int32],
+    low: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Return the pixels between the foot of an upright surface and where it meets the floor.
+
+    They are lower than a step but belong to the same surface: its disparity says at which row
+    the floor is. floor_row: by disparity step. index: (R, W) disparity steps.
+    """
+    height, width = low.shape
+    at = np.flatnonzero(low)
+    foot = floor_row.take(index.reshape(-1).take(at))
+    rows, columns = np.divmod(at.astype(np.int32), np.int32(width))
+    foot -= view.shear_px.take(columns) + np.float32(view.first_row)
+    end = np.clip(foot.astype(np.int32), rows, height - 1) + 1
+    size = (height + 1) * width
+    covered = np.zeros((height + 1, width), np.int16)
+    covered[:height] = low
+    ends = np.bincount(end * np.int32(width) + columns, minlength=size)
+    covered -= ends.reshape(-1, width).astype(np.int16)
+    return np.cumsum(covered, axis=0, dtype=np.int16)[:height] >= 2
+
+
+def unlike_floor(image: NDArray[np.uint8], floor: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels of an image (R, W) are darker or brighter than nearly all of the floor
+    (R, W) would be there.
+
+    A sun, a lamp, a lens and dust change the floor's brightness slowly: its logarithm is taken for
+    a quadratic of row and column. What is measured as floor may be a thing that is hardly higher:
+    it is fitted again without what stood out.
+    """
+    grey = cv2.blur(image, (BLOCK_PX, BLOCK_PX)).astype(np.float32) + 1
+    brightness = cv2.log(grey)
+    y, x = (np.linspace(-1, 1, size, dtype=np.float32) for size in image.shape)
+    part = np.s_[::_SAMPLED, ::_SAMPLED]
+    rows, columns = np.nonzero(floor[part])
+    if len(rows) == 0:
+        return np.zeros(image.shape, np.bool_)
+    terms = _quadratic(x[::_SAMPLED][columns], y[::_SAMPLED][rows])
+    seen = brightness[part][rows, columns]
+    counted = np.ones(len(rows), np.float32)
+    for _ in range(_FITS):
+        weighted = terms * counted
+        weighted /= counted.sum()
+        # A few pixels do not tell how it bends.
+        bends = weighted @ terms.T + _FLAT
+        light = np.linalg.solve(bends, weighted @ seen)
+        squares = (seen - light @ terms) ** 2
+        variance = float(squares @ counted) / float(counted.sum()) + _DIRT**2
+        counted = (squares < SIGMAS**2 * variance).astype(np.float32)
+    one, across, down, across2, both, down2 = light
+    expected = (one + down * y + down2 * y * y)[:, None] + (across + both * y)[:, None] * x
+    expected += across2 * x * x
+    at = _quadratic(*(axis.ravel() for axis in np.meshgrid(x[::_SAMPLED], y[::_SAMPLED])))
+    of_light = np.einsum('an,an->n', at, np.linalg.solve(bends, at)) / counted.sum()
+    unsure = cv2.resize(1 + of_light.reshape(brightness[part].shape), image.shape[::-1])
+    # Grey levels are whole: no surface is known better.
+    return (brightness - expected) ** 2 > SIGMAS**2 * (variance * unsure + 1 / grey**2)
+
+
+def _quadratic(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def compare(
+    view: FloorView,
+    profile: FloorProfile,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    disparity: NDArray[np.float32],
+    on_floor: NDArray[np.bool_],
+    noise_grey: float,
+) -> Comparison:
+    """Compare the view's rows of a rectified pair under floor and under the disparities (R, W).
+
+    left, right: whole image rows (R, image width). on_floor: (R, W), where the disparities are
+    those of a floor, though not of the profile: it bends only along the way. Where the right image
+    does not reach, nothing speaks against the floor nor for it.
+    """
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    sampled = left[::STEP_PX, ::STEP_PX]
+    steps = (np.arange(0, size, STEP_PX, dtype=np.float32) for size in left.shape)
+    rows, columns = np.meshgrid(*steps, indexing='ij')
+    floor_px = profile.at_pixels(view.derolled[part])
+    matched_px = disparity[part]
+
+    def right_at(disparity_px: NDArray[np.float32]) -> NDArray[np.uint8]:
+        at = columns - disparity_px
+        seen = cv2.remap(right, at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return seen.astype(np.uint8, copy=False)
+
+    reached = columns >= floor_px + _MARGIN_PX
+    lying = on_floor[part] & (matched_px > 0)
+    as_floor = right_at(np.where(lying, matched_px, floor_px))
+    matched = _local_difference(sampled, right_at(matched_px))
+    floor = _local_difference(sampled, as_floor)
+    lying &= reached & (np.abs(matched_px - floor_px) < np.float32(SAME_PX))
+    foreign = _foreign(sampled, as_floor, lying, noise_grey)
+    margin = _AGAINST_GREY + 0.5 * noise_grey
+    against = (matched_px > 0) & (floor > 1.3 * matched + np.float32(margin))
+    unlike = floor > _LIKENESS_GREY + _NOISE_SHARE * noise_grey
+    wide = (_WIDE_WINDOW, _WIDE_WINDOW)
+    denied = cv2.blur(floor, wide) > _WIDE_RATIO * cv2.blur(matched, wide) + _WIDE_MARGIN_GREY
+    worse = floor > 1.1 * matched
+    denied &= (matched_px > 0) & worse
+    denied &= cv2.blur(worse.astype(np.float32), wide) > _WIDE_SHARE
+    contrary = against | foreign
+    contrary |= floor > 2 * _LIKENESS_GREY + _NOISE_SHARE * noise_grey
+    contradicted = (against, denied, unlike)
+    masks = (*(mask & reached for mask in contradicted), ~(contrary & reached))
+    return Comparison(floor_px, *(_enlarged(mask, disparity.shape) for mask in masks))
+
+
+def compare_measured(
+    view: FloorView,
+    profile: FloorProfile,
+    disparity: NDArray[np.float32],
+    on_floor: NDArray[np.bool_],
+    noise_px: float,
+) -> Comparison:
+    """Compare the floor with disparities (R, W) that a depth camera measured, 0 for none: there is
+    no right image to look at. on_floor: as of `compare`. noise_px: of the disparities, one sigma.
+    """
+    floor_px = profile.at_pixels(view.derolled)
+    against = (disparity > 0) & (np.abs(disparity - floor_px) > np.float32(SIGMAS * noise_px))
+    against &= ~on_floor
+    part = np.s_[::STEP_PX, :: STEP_PX // view.step]
+    return Comparison(floor_px[part], against, against, np.zeros_like(against), ~against)
+
+
+def _foreign(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], lying: NDArray[np.bool_], noise_grey: float
+) -> NDArray[np.bool_]:
+    """Return where the left image (R, W) has texture that the right one, drawn as if all were
+    floor, has not: what stands so near, or so askew, that it is not matched at all.
+
+    lying: where what is matched lies on the floor; what the two differ by there is noise, too.
+    """
+    window = (_WIDE_WINDOW, _WIDE_WINDOW)
+    a, b = left.astype(np.float32), right.astype(np.float32)
+    mean_a, mean_b = cv2.blur(a, window), cv2.blur(b, window)
+    variance = np.maximum(cv2.blur(a * a, window) - mean_a**2, np.float32(1e-3))
+    other = np.maximum(cv2.blur(b * b, window) - mean_b**2, np.float32(1e-3))
+    shared = cv2.blur(a * b, window) - mean_a * mean_b
+    noise = noise_grey**2
+    if np.count_nonzero(lying) > window[0] * window[1]:
+        noise = max(noise, float(np.median((variance + other)[lying] / 2 - shared[lying])))
+    expected = 1 - np.float32(noise) / variance
+    texture, least = _FOREIGN
+    return np.asarray(
+        (expected > texture) & (shared < least * expected * np.sqrt(variance * other))
+    )
+
+
+def _local_difference(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the local mean absolute difference, free of differences in brightness."""
+    difference = cv2.subtract(left, right, dtype=cv2.CV_32F)
+    difference -= cv2.blur(difference, (BLOCK_PX, BLOCK_PX))
+    return cv2.blur(np.abs(difference), (BLOCK_PX, BLOCK_PX))
+
+
+def _enlarged(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    size = (shape[1], shape[0])
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def texture_grey(image: NDArray[np.uint8], window_px: int) -> NDArray[np.float32]:
+    """Return the mean absolute slope (H, W) along the row in grey levels per pixel.
+
+    Slopes are taken on a scale of two pixels, where sensor noise has averaged out; only slopes
+    along the row tell a stereo pair anything.
+    """
+    radius = int(3 * _SIGMA_PX)
+    x = np.arange(-radius, radius + 1, dtype=np.float64)
+    smooth = np.exp(-0.5 * (x / _SIGMA_PX) ** 2)
+    smooth /= smooth.sum()
+    slope = x * smooth
+    slope /= (x * slope).sum()
+    # sepFilter2D correlates: a positive slope gives a positive response.
+    response = cv2.sepFilter2D(image, cv2.CV_32F, slope, smooth)
+    return cv2.blur(np.abs(response), (window_px, window_px))
+
+
+def enough_texture(noise_grey: float) -> float:
+    """Return the texture, in grey levels per pixel, that is surely no noise."""
+    return max(_MIN_TEXTURE_GREY, _NOISE_TEXTURE * noise_grey)
+
+
+def row_slope(image: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """Return how steep the image (H, W) is from row to row, as Sobel's response: 8 times the grey
+    levels per row.
+    """
+    smooth = cv2.GaussianBlur(image, (3, 5), 0)
+    slope: NDArray[np.int16] = np.abs(
+        cv2.Sobel(smooth, cv2.CV_16S, 0, 1, borderType=cv2.BORDER_REPLICATE)
+    )
+    return slope

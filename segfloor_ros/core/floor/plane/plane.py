@@ -1,0 +1,464 @@
+"""The plane of the floor in the disparities of one or more frames.
+
+A plane is written as m = n / h, with n its unit normal pointing up and h the height of the camera
+above it, in the axes of the left camera. The point X is on the plane where m . X + 1 = 0, so the
+ray q meets it at the inverse depth -m . q: in a rectified pair a plane's disparity is linear in the
+pixel. A camera that is fixed to its base sees the floor on the same plane in all frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX
+from segfloor_ros.core.floor.disparity.profile import (
+    HEIGHT_SIGMA,
+    PITCH_SIGMA_RAD,
+    FloorLine,
+    column_step,
+    is_rise,
+    pixels_where,
+    rising,
+)
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.plugins.rig.estimates import OFFSET_SIGMA_PX
+
+MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])
+HEIGHT_RANGE_M = (0.04, 4.0)
+"""What mounts are."""
+LEVEL_SIGMA = np.array([math.radians(7.0), math.radians(2.0), math.inf])
+"""Cameras look roughly ahead and hardly roll, one sigma of pitch and roll; height is not known."""
+SAMPLES = 4000
+"""So many pixels of an image are looked at: their neighbours say the same."""
+_BEND = 0.05
+"""A floor bends, and its disparity differs from the plane's, by this share."""
+_VIOLATION_WEIGHT = 1.5
+_CORRELATED_SAMPLES = 12.0
+"""Neighbouring samples err together: so many count as one."""
+_SCALES_PX = (3.0, 2.0, 1.5, 1.0, 1.0, 0.7, 0.5, 0.5, 0.5, 0.5)
+NEAR_SCALES_PX = (2.0, 1.5, 1.0, 0.7, 0.5, 0.5)
+FINER_SCALES_PX = NEAR_SCALES_PX[2:]
+"""Of the biweight with which a plane is refined, one per step; of one that is nearly known, and of
+one that was refined by some of its samples."""
+_CLIMB, _SWAY_M = 0.03, 0.03
+"""How far from parallel to the floor a camera travels: a slope, and what it sways."""
+_FAITH = 2.0
+"""So much more must speak for another expectation than for the camera as it is mounted."""
+_NOISE_SHARE = 0.01
+"""What so little of all that is seen speaks for is noise: the camera is as it is mounted."""
+_SWING_RAD = math.radians(3.0)
+"""So far robots swing on their wheels; what the map says beyond that is drift."""
+_FLAT_WEIGHT = 0.1
+"""Of samples whose disparity does not rise down the image as a floor's does."""
+_AT_ONCE = 200
+"""So many samples are compared with all planes at once: what they take fits a processor's cache."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Disparities of one frame: rays (N, 3), disparities (N,) in pixels, weights (N,). disparity_m:
+    fx * baseline. rise: (N,), by how much disparities grow per row around the samples, None where
+    that is not known; down: by how much rays change per row.
+    """
+
+    rays: Array
+    disparity_px: Array
+    weight: Array
+    disparity_m: float
+    rise: Array | None = None
+    down: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        camera: StereoCamera,
+        uv_px: Array,
+        disparity_px: Array,
+        weight: Array,
+        rise: Array | None = None,
+    ) -> Samples:
+        """Return the samples at pixels (N, 2)."""
+        rays = camera.back_project(uv_px, np.ones(len(uv_px)))
+        constant = camera.disparity_times_depth
+        return cls(rays, disparity_px, weight, constant, rise, 1.0 / camera.fy)
+
+    def every(self, step: int) -> Samples:
+        """Return only one of every so many, which weighs as much as these."""
+        some = self.take(np.s_[::step])
+        return replace(some, weight=step * some.weight)
+
+    def take(self, rows: slice | NDArray[np.intp]) -> Samples:
+        """Return the chosen ones."""
+        return replace(
+            self,
+            rays=self.rays[rows],
+            disparity_px=self.disparity_px[rows],
+            weight=self.weight[rows],
+            rise=None if self.rise is None else self.rise[rows],
+        )
+
+    @classmethod
+    def joined(cls, frames: Sequence[Samples]) -> Samples:
+        """Return the samples of at least one frame of one camera as those of one."""
+        rises = [frame.rise for frame in frames if frame.rise is not None]
+        return replace(
+            frames[0],
+            rays=np.concatenate([frame.rays for frame in frames]),
+            disparity_px=np.concatenate([frame.disparity_px for frame in frames]),
+            weight=np.concatenate([frame.weight for frame in frames]),
+            rise=np.concatenate(rises) if rises else None,
+        )
+
+    def near(self, angles_height: Array) -> Samples:
+        """Return only those that matter where a plane, (3,), is refined that is nearly known."""
+        error, _, visible = _seen(self, plane_of(angles_height)[None])
+        return self.take(
+            np.flatnonzero(visible[:, 0] & (np.abs(error[:, 0]) < 2 * FINER_SCALES_PX[0]))
+        )
+
+    def weight_on(self, plane: Array) -> Array:
+        """Return the weights (N,) for a plane (3,): little where disparities do not rise down the
+        image as those of the plane do.
+        """
+        if self.rise is None:
+            return self.weight
+        slope = -self.disparity_m * self.down * float(plane[1])
+        return self.weight * np.where(is_rise(self.rise, slope), 1.0, _FLAT_WEIGHT)
+
+
+LOOKS = 4
+"""By so many frames it is seen how much a plane varies."""
+SWAY = (math.radians(2.0), math.radians(2.5), 0.04)
+"""How much pitch, roll and height, as a share of it, of the camera above the floor vary on the way,
+as standard deviations: robots sway, and where they are is known so well.
+"""
+_INTERVAL_PERCENT = (2.5, 16, 50, 84, 97.5)
+"""One and two sigmas to either side of the median: a few wrong planes do not count."""
+_LEAST_SUPPORT, _MOST_BELOW = 0.08, 0.15
+"""A floor is so much of what is seen where it is visible. What is seen below it, of mirrors and
+wrong matches, is so small a share of that: of true floors 0.11 at most, of boards 0.2 to 0.4.
+"""
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """A refined plane: angles_height (3,) = pitch_rad, roll_rad, height_m of the camera;
+    sigma (3,) of them; support: share of the weight of the samples below the plane's horizon
+    that lies on it; violations: share that lies below it.
+    """
+
+    angles_height: Array
+    sigma: Array
+    support: float
+    violations: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether enough is seen on it, and little enough below it, for a floor."""
+        return self.support > _LEAST_SUPPORT and self.violations < _MOST_BELOW * self.support
+
+
+class Fixture:
+    """Whether the camera is fixed to its base: then the planes of all frames lie equally far below
+    it. problem: in words, once they do not. A hand does not hold a camera like that.
+    """
+
+    def __init__(self) -> None:
+        self.problem: str | None = None
+        self._heights_m: list[float] = []
+
+    def note(self, fit: PlaneFit) -> None:
+        """Take in the plane of a frame."""
+        if not fit.is_seen:
+            return
+        self._heights_m.append(float(fit.angles_height[2]))
+        low, minus, middle, plus, high = np.percentile(self._heights_m, _INTERVAL_PERCENT)
+        if len(self._heights_m) >= LOOKS and plus - minus > 2 * SWAY[2] * middle:
+            self.problem = (
+                'the camera is not fixed to its base: its height above the floor varies by '
+                f'{high - low:.2f} m; fix it. There is floor only where an image shows its plane'
+            )
+
+
+def plane_of(angles_height: Array) -> Array:
+    """Return planes m (..., 3) of pitch, roll and height (..., 3)."""
+    pitch, roll, height = np.moveaxis(angles_height, -1, 0)
+    normal = np.stack(
+        [-np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll), -np.sin(pitch)], axis=-1
+    )
+    return normal / height[..., None]
+
+
+def angles_height_of(planes: Array) -> Array:
+    """Return pitch, roll and height (..., 3) of planes m (..., 3)."""
+    height = 1 / np.linalg.norm(planes, axis=-1)
+    normal = planes * height[..., None]
+    pitch = np.arcsin(np.clip(-normal[..., 2], -1, 1))
+    roll = np.arctan2(-normal[..., 0], -normal[..., 1])
+    return np.stack([pitch, roll, height], axis=-1)
+
+
+def plausible(angles_height: Array) -> NDArray[np.bool_]:
+    """Return which of pitch, roll and height (..., 3) a floor can have."""
+    pitch, roll, height = np.moveaxis(angles_height, -1, 0)
+    level = (np.abs(pitch) < MAX_PITCH_RAD) & (np.abs(roll) < MAX_ROLL_RAD)
+    return level & (height > HEIGHT_RANGE_M[0]) & (height < HEIGHT_RANGE_M[1])
+
+
+def propose(samples: Samples, count: int, rng: np.random.Generator, known: Array) -> Array:
+    """Return plausible pitch, roll and height (M, 3) of planes through few samples each.
+
+    Half of them go through three samples, half through two, without roll. known: (3,), values
+    that are given, NaN where not.
+    """
+    probability = samples.weight / samples.weight.sum()
+    chosen = rng.choice(len(samples.weight), size=(count, 3), p=probability)
+    q = samples.rays[chosen]
+    inverse_depth = samples.disparity_px[chosen] / samples.disparity_m
+    rows = q.copy()
+    half = count // 2
+    rows[half:, 2] = (1.0, 0.0, 0.0)
+    inverse_depth[half:, 2] = 0.0
+    regular = np.abs(np.linalg.det(rows)) > 1e-6
+    planes = np.linalg.solve(rows[regular], -inverse_depth[regular][..., None])[..., 0]
+    planes = planes[np.isfinite(planes).all(axis=1) & (np.abs(planes).max(axis=1) > 1e-6)]
+    guesses = np.where(np.isnan(known), angles_height_of(planes), known)
+    return guesses[plausible(guesses)]
+
+
+def _seen(samples: Samples, planes: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return of each sample and each plane m (M, 3) by how much its disparity exceeds the plane's,
+    how much less than that lies clearly below the plane, and whether it is visible there at all,
+    each (N, M).
+    """
+    scaled = (-samples.disparity_m * planes).astype(np.float32)
+    expected = samples.rays.astype(np.float32) @ scaled.T
+    visible = expected > SAME_PX
+    error = samples.disparity_px[:, None].astype(np.float32) - expected
+    expected *= np.float32(-_BEND)
+    expected -= np.float32(2 * SAME_PX)
+    return error, expected, visible
+
+
+def scores(samples: Samples, angles_height: Array) -> Array:
+    """Return how much of the samples' weight speaks for each plane (M, 3), less what speaks
+    against it.
+
+    The floor hides what is below it: a disparity clearly smaller than the plane's contradicts it.
+    """
+    planes, total = plane_of(angles_height), np.zeros(len(angles_height))
+    for start in range(0, len(samples.weight), _AT_ONCE):
+        part = samples.take(slice(start, start + _AT_ONCE))
+        error, limit, visible = _seen(part, planes)
+        below = error < limit
+        against = np.multiply(error, np.float32(1 / SAME_PX), out=error)
+        np.multiply(against, against, out=against)
+        np.minimum(against, 1, out=against)
+        against += np.multiply(below, np.float32(_VIOLATION_WEIGHT), out=limit)
+        against -= 1
+        against *= visible
+        total -= part.weight @ against
+    return total
+
+
+def shares(samples: Samples, angles_height: Array) -> tuple[float, float]:
+    """Return which share of the weight of the samples where a plane, (3,), is visible lies on it,
+    and which below it.
+    """
+    error, limit, visible = (
+        column[:, 0] for column in _seen(samples, plane_of(angles_height)[None])
+    )
+    weight = np.where(visible, samples.weight, 0)
+    total = float(weight.sum())
+    if total == 0:
+        return 0.0, 1.0
+    on, below = weight[np.abs(error) < SAME_PX].sum(), weight[error < limit].sum()
+    return float(on) / total, float(below) / total
+
+
+def preference(angles_height: Array, travel: Array, mean: Array, sigma: Array) -> Array:
+    """Return how far each plane (M, 3) is what one expects, in (0, 1]: pitch, roll and height (3,)
+    with their standard deviations, and a camera that travels (T, 3), in metres, parallel to it.
+    """
+    squares = (((angles_height - mean) / sigma) ** 2).sum(axis=1)
+    squares += mean_climb(angles_height, travel) ** 2
+    return np.exp(-0.5 * squares)
+
+
+def mean_climb(angles_height: Array, travel: Array) -> Array:
+    """Return how far travel (T, 3) leaves each plane (M, 3), in sigmas of what slopes and swaying
+    explain.
+    """
+    if len(travel) == 0:
+        return np.zeros(len(angles_height))
+    unit = plane_of(angles_height) * angles_height[:, 2:]
+    climb = (unit @ travel.T) / _climb_sigma_m(travel)
+    return np.sqrt(np.mean(climb**2, axis=1))
+
+
+def _climb_sigma_m(travel: Array) -> Array:
+    return _CLIMB * np.linalg.norm(travel, axis=1) + _SWAY_M
+
+
+def refine(
+    samples: Samples,
+    start: Array,
+    known: Array,
+    travel: Array,
+    mean: Array,
+    sigma: Array,
+    scales_px: tuple[float, ...] = _SCALES_PX,
+) -> PlaneFit:
+    """Refine pitch, roll and height (3,) by robust Gauss-Newton on disparities.
+
+    known: (3,), values that are given, NaN where not. travel: (T, 3) displacements of the camera in
+    metres, along which the floor runs. mean, sigma: (3,) what is expected, and how surely.
+    scales_px: of the biweight, one per iteration.
+    """
+    state = start.copy()
+    samples = replace(samples, rays=np.asfortranarray(samples.rays))
+    free = np.isnan(known)
+    information: Array = np.eye(3)
+    shared: Array = np.zeros(3)
+    prior = np.diag(sigma**-2.0)
+    for scale in scales_px:
+        information, gradient, shared = _normal_equations(samples, state, scale)
+        _add_travel(information, gradient, state, travel)
+        information += prior
+        gradient += prior @ (mean - state)
+        step = np.zeros(3)
+        step[free] = np.linalg.solve(
+            information[np.ix_(free, free)] + 1e-9 * np.eye(int(free.sum())), gradient[free]
+        )
+        state = state + np.clip(step, -0.1, 0.1)
+    error = np.zeros(3)
+    covariance = np.linalg.pinv(information[np.ix_(free, free)])
+    by_offset = OFFSET_SIGMA_PX * (covariance @ shared[free])
+    error[free] = np.sqrt(np.maximum(np.diag(covariance), 0) + by_offset**2)
+    return PlaneFit(state, error, *shares(samples, state))
+
+
+def _jacobian(angles_height: Array) -> Array:
+    """Return dm / d(pitch, roll, height) (3, 3)."""
+    pitch, roll, height = (float(value) for value in angles_height)
+    (sp, cp), (sr, cr) = ((math.sin(angle), math.cos(angle)) for angle in (pitch, roll))
+    by_angles = np.array(
+        [[sp * sr, -cp * cr, cp * sr / height], [sp * cr, cp * sr, cp * cr / height]]
+    )
+    by_angles = np.vstack([by_angles, [-cp, 0.0, sp / height]])
+    return by_angles / height
+
+
+def _normal_equations(samples: Samples, state: Array, scale: float) -> tuple[Array, Array, Array]:
+    """Return the information (3, 3), the gradient (3,), and that (3,) of an error of a pixel which
+    all disparities share.
+    """
+    by_state = -samples.disparity_m * _jacobian(state)
+    expected = samples.rays @ (-state[2] * by_state[:, 2])
+    error = samples.disparity_px - expected
+    biweight = error * error
+    biweight *= -1 / (4 * scale**2)
+    biweight += 1
+    np.maximum(biweight, 0, out=biweight)
+    weight = samples.weight_on(plane_of(state)) * (expected > SAME_PX)
+    weight *= biweight
+    weight *= biweight
+    weight /= _CORRELATED_SAMPLES * NOISE_PX**2
+    weighted = samples.rays.T * weight
+    information = by_state.T @ (weighted @ samples.rays) @ by_state
+    return information, by_state.T @ (weighted @ error), by_state.T @ weighted.sum(axis=1)
+
+
+def _add_travel(information: Array, gradient: Array, state: Array, travel: Array) -> None:
+    """Add that the camera travels parallel to the floor: all displacements count as one."""
+    if len(travel) == 0:
+        return
+    unit = np.array([*state[:2], 1.0])
+    scaled = travel / (_climb_sigma_m(travel) * math.sqrt(len(travel)))[:, None]
+    rows = scaled @ _jacobian(unit)[:, :2]
+    information[:2, :2] += rows.T @ rows
+    gradient[:2] -= rows.T @ (scaled @ plane_of(unit))
+
+
+def texture_weight(texture: NDArray[np.floating], enough: float) -> Array:
+    """Return how much disparities count where the image has some texture, in [0, 1]. enough: what
+    is no noise; clearly more is needed for a plane.
+    """
+    grey = texture.astype(np.float64) / (4 * enough)
+    grey *= grey
+    grey *= grey
+    weight: Array = grey / (grey + 1)
+    return weight
+
+
+def expectations(mount: Mount, T_map_base: Array | None) -> Array:
+    """Return what pitch, roll and height to expect of a frame, (P, 3), the likeliest first.
+
+    As the camera is mounted; or, should the robot pitch or roll on its wheels, level in the map;
+    or, of a camera in a hand, as high as it is in the map.
+    """
+    mounted = np.array([mount.pitch_rad, mount.roll_rad, mount.height_m])
+    if T_map_base is None:
+        return mounted[None]
+    T_map_left = T_map_base @ mount.T_base_left
+    # A height that nothing can have is none.
+    heights_m = np.maximum((mount.height_m, T_map_left[2, 3]), HEIGHT_RANGE_M[0])
+    return np.stack([mounted, *angles_height_of(T_map_left[2, :3] / heights_m[:, None])])
+
+
+def plane_of_frame(
+    camera: StereoCamera,
+    first_row: int,
+    disparity: NDArray[np.float32],
+    texture: NDArray[np.float32],
+    enough: float,
+    expected: Array,
+    is_fixed: bool = True,
+) -> PlaneFit:
+    """Return the plane of the floor in a frame, in its own camera's axes.
+
+    disparity, texture: (R, W) from `first_row` on, every `column_step` columns. enough: texture
+    that is no noise. expected: (P, 3), as of `expectations`. is_fixed: the camera to its base.
+    """
+    step = max(2, round(math.sqrt(disparity.size / SAMPLES)))
+    part = disparity[::step, ::step]
+    rows, columns = pixels_where(part > 0)
+    across = step * column_step(camera)
+    slope = FloorLine.of(camera, Mount(height_m=expected[0, 2], pitch_rad=expected[0, 0])).slope
+    inclined = rising(disparity[:, ::step], slope)[::step][rows, columns]
+    weight = texture_weight(texture[::step, ::step][rows, columns], enough)
+    weight *= np.where(inclined, 1.0, _FLAT_WEIGHT)
+    uv_px = np.stack([columns * across, rows * step + first_row], axis=1).astype(np.float64)
+    found_px = part[rows, columns].astype(np.float64)
+    samples = Samples.of(camera, uv_px, found_px, weight)
+    expected = np.vstack([expected, swung(expected[0], 2 * SAME_PX / camera.fy / slope)])
+    share = scores(samples, expected) / max(samples.weight.sum(), 1e-9)
+    start = expected[likeliest(share, expected) if is_fixed else int(np.argmax(share))]
+    sigma = np.array([*2 * [PITCH_SIGMA_RAD], HEIGHT_SIGMA * start[2]])
+    unknown, still = np.full(3, np.nan), np.zeros((0, 3))
+    return refine(samples, start, unknown, still, start, sigma, NEAR_SCALES_PX)
+
+
+def swung(angles_height: Array, step_rad: float) -> Array:
+    """Return a camera's pitch, roll and height (N, 3) as its base swings over a bump, in steps of
+    its pitch of at most so much.
+    """
+    steps = max(1, math.ceil(_SWING_RAD / step_rad))
+    angles_rad = np.delete(np.linspace(-_SWING_RAD, _SWING_RAD, 2 * steps + 1), steps)
+    return angles_height + np.outer(angles_rad, (1.0, 0.0, 0.0))
+
+
+def likeliest(share: Array, expected: Array) -> int:
+    """Return which expectation, of pitch, roll and height (P, 3), to start from, by the share (P,)
+    of all that is seen that speaks for each, less what speaks against it.
+    """
+    swing = np.hypot(*(expected - expected[0])[:, :2].T)
+    likelihood = share * np.exp(-0.5 * (swing / _SWING_RAD) ** 2)
+    likelihood[0] = max(_FAITH * share[0], _NOISE_SHARE)
+    return int(np.argmax(likelihood))

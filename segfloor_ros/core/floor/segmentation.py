@@ -1,0 +1,458 @@
+"""The floor segmentation stage: a rectified stereo pair in, the floor out.
+
+What moves and the border that rectification leaves do not count. For people there are pictures of
+mask and v-disparity.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.images import BlankBorder, noise_grey, union
+from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.floor.disparity.matching import (
+    BLOCK_PX,
+    MEAN_NOISE,
+    NOISE_PX,
+    SIGMAS,
+    TwoScaleMatcher,
+    disparity_range,
+    stereo_view,
+)
+from segfloor_ros.core.floor.disparity.profile import (
+    BINS_PER_PX,
+    FloorProfile,
+    FloorView,
+    column_step,
+    filtered_v_disparity,
+    first_floor_row,
+    fit_profile,
+    last_fine_row,
+    pixels_where,
+)
+from segfloor_ros.core.floor.mask.filling import (
+    NetworkFloor,
+    beside_something,
+    blank_feet,
+    drop_islands,
+    fill_gaps,
+    fill_regions,
+    image_slope,
+    trim_to_edges,
+    upright_above,
+    with_floor,
+)
+from segfloor_ros.core.floor.mask.pixel_evidence import (
+    TEXTURE_WINDOW_PX,
+    Comparison,
+    Evidence,
+    Heights,
+    HeightTable,
+    below_floor,
+    compare,
+    compare_measured,
+    enough_texture,
+    judge,
+    lies_on_floor,
+    mean_height,
+    row_slope,
+    texture_grey,
+    unlike_floor,
+)
+from segfloor_ros.core.floor.observation import (
+    FLOOR,
+    MOVING,
+    NO_EVIDENCE,
+    NOT_FLOOR,
+    FloorObservation,
+    FloorScan,
+    FloorSegmentationSettings,
+    VDisparity,
+)
+from segfloor_ros.core.floor.plane.plane import Fixture, expectations, plane_of_frame
+from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.timing import NoTimes, StageTimes
+
+DISPARITY, DISPARITY_ABOVE = 'disparity', 'disparity above the horizon'
+_PLAIN_TO_SEE = 100.0
+_BORDER_BLOCKS = 2
+"""So near to the border of the right image, in blocks that are matched, matches are unsure."""
+_LEAST_SHARE = 0.5
+"""What has less than this share of the texture that a floor needs shows noise, and stands nowhere.
+"""
+_BOARD = 2
+"""Table tops are thinner than what stands: so many times what is seen of them counts."""
+
+_COLOURS_BGR = {FLOOR: (60, 200, 60), NO_EVIDENCE: (200, 120, 40), NOT_FLOOR: (60, 60, 200)}
+_MOVING_BGR = (200, 40, 225)
+
+MASK_COLOURS = {
+    'floor': _COLOURS_BGR[FLOOR],
+    'not floor': _COLOURS_BGR[NOT_FLOOR],
+    'no evidence': _COLOURS_BGR[NO_EVIDENCE],
+    'moving': _MOVING_BGR,
+}
+"""Blue, green, red of what `mask_overlay` tints."""
+
+
+class FloorSegmentation:
+    """Finds the floor in rectified stereo pairs of one camera. times: gets what each step takes.
+    network: how far what a network says of the floor can be believed.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: FloorSegmentationSettings,
+        times: StageTimes | None = None,
+    ) -> None:
+        self._times = times or NoTimes()
+        self._camera = camera
+        self._settings = settings
+        self.network = NetworkFloor()
+        self._border = BlankBorder()
+        self._mount: Mount | None = None
+        self.fixture = Fixture()
+        self._matcher: TwoScaleMatcher
+        self._overhead: OverheadMatcher
+        self._scanner: FloorScanner
+
+    def process(
+        self,
+        left: NDArray[np.uint8],
+        right: NDArray[Any],
+        mount: Mount,
+        T_map_base: Array | None = None,
+        moving: NDArray[np.uint8] | None = None,
+        said: NDArray[np.uint8] | None = None,
+    ) -> FloorObservation:
+        """Return the floor of a rectified grey pair (H, W) uint8; of a depth camera, right is its
+        disparity (H, W) float32.
+
+        mount: where the left camera sits above the floor. T_map_base: pose (4, 4) of the base in
+        the map, where known: the floor may be level there. moving: mask
+        (H, W) of the left image, 255 where something moves: it is neither floor nor in the way, and
+        what it hides is unknown. The black border that rectification leaves is treated alike. said:
+        (H, W) uint8, what a network says of the left image: `FLOOR`; `NOT_FLOOR`, what stands there
+        whatever its depth; `MOVING`, or `NO_EVIDENCE`.
+        """
+        measure = self._times.measure
+        self._prepare(mount)
+        expected = expectations(mount, T_map_base)
+        first_row = min(first_floor_row(self._camera, _with_angles(mount, one)) for one in expected)
+        columns = np.s_[first_row:, :: column_step(self._camera)]
+        with measure('texture'):
+            moving = union(moving, self._border.see(left))
+            if said is not None:
+                moving = union(moving, np.where(said == MOVING, np.uint8(255), np.uint8(0)))
+            right, measured = stereo_view(left, right)
+            left_rows, right_rows = left[first_row:], right[first_row:]
+            noise = noise_grey(left_rows)
+            enough = enough_texture(noise)
+            texture = texture_grey(left_rows, TEXTURE_WINDOW_PX)[:, columns[1]]
+            if measured is not None:
+                # Depth is measured on plain surfaces, too; a hole in it tells nothing.
+                plain = np.float32(_PLAIN_TO_SEE * enough)
+                texture = np.where(measured[columns] > 0, plain, np.float32(0))
+        with measure(DISPARITY):
+            disparity = self._disparity(first_row, left, right) if measured is None else measured
+            movable = None
+            if said is not None:
+                movable = np.where(said == MOVING, disparity, np.float32(0))
+                disparity[said == NOT_FLOOR] = 0
+            if moving is not None:
+                disparity[moving > 0] = 0
+        below, textured = disparity[columns], texture > enough
+        with measure('plane'):
+            is_fixed = self.fixture.problem is None
+            fit = plane_of_frame(
+                self._camera, first_row, below, texture, enough, expected, is_fixed
+            )
+            self.fixture.note(fit)
+        view = FloorView.of(self._camera, _with_angles(mount, fit.angles_height), first_row)
+        with measure('profile'):
+            most = self._matcher.num_disparities
+            counted = filtered_v_disparity(view, below, texture > 2 * enough, most, BINS_PER_PX)
+            profile = fit_profile(counted, view.line, self._camera)
+        with measure('comparison'):
+            heights = self._heights(view, profile, below, measured is not None)
+            on_floor = lies_on_floor(view, below, heights)
+            if measured is None:
+                compared = compare(view, profile, left_rows, right_rows, below, on_floor, noise)
+            else:
+                compared = compare_measured(view, profile, below, on_floor, NOISE_PX)
+        with measure('evidence'):
+            left_view = left[columns]
+            evidence = _evidence(
+                view, below, left_view, texture, enough, compared, heights, self._settings
+            )
+            clear_hidden(evidence.mask, moving, columns)
+            below_said = None if said is None else said[columns]
+            if below_said is not None:
+                evidence.mask[below_said == NOT_FLOOR] = NOT_FLOOR
+        with measure('filling'):
+            mask = self._fill(
+                view, profile, below, evidence, left_rows, textured, compared, below_said
+            )
+            if not (is_fixed or fit.is_seen):
+                mask[mask == FLOOR] = NO_EVIDENCE
+            clear_hidden(mask, moving, columns)
+        with measure(DISPARITY_ABOVE):
+            hanging_xy = self._overhead.positions(
+                left, right, view.mount, first_row, enough, moving, measured
+            )
+        with measure('scan'):
+            feet_xy = _feet(view, profile, mask, row_slope(left_view), textured)
+            if below_said is not None:
+                feet_xy = np.hstack([feet_xy, _barriers(view, profile, below_said)])
+            movable_xy = None if movable is None else self._positions(view, movable)
+            scan = self._scan(view, profile, below, evidence, mask, hanging_xy, feet_xy, movable_xy)
+        if movable is not None:
+            disparity = np.maximum(disparity, movable)
+        return self._observation(view, profile, disparity, mask, scan, counted)
+
+    @property
+    def remarks(self) -> dict[str, str]:
+        """What is wrong with the mount and with what a network says, in words, by what it is."""
+        said = ('fixture', self.fixture.problem), ('network', self.network.remark)
+        return {about: words for about, words in said if words}
+
+    def _heights(
+        self, view: FloorView, profile: FloorProfile, below: NDArray[np.float32], measured: bool
+    ) -> Heights:
+        constant = self._camera.disparity_times_depth if measured else None
+        most = self._matcher.num_disparities
+        table = HeightTable.of(view.line, profile, most, self._settings, constant)
+        return Heights.of(view, table, below)
+
+    def _observation(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        disparity: NDArray[np.float32],
+        mask: NDArray[np.uint8],
+        scan: FloorScan,
+        counted: VDisparity,
+    ) -> FloorObservation:
+        rows = np.arange(self._camera.height, dtype=np.float64)
+        whole = np.full(disparity.shape, NOT_FLOOR, np.uint8)
+        # On a bump the floor may reach higher than was looked for.
+        whole[max(0, int(view.line.horizon)) : view.first_row] = NO_EVIDENCE
+        whole[view.first_row :] = np.repeat(mask, view.step, axis=1)[:, : self._camera.width]
+        return FloorObservation(
+            disparity_px=disparity,
+            mask=whole,
+            profile_px=profile.at_rows(rows).astype(np.float64),
+            scan=scan,
+            max_disparity_px=max(float(self._matcher.num_disparities), float(disparity.max())),
+            v_disparity=counted,
+        )
+
+    def change_settings(self, settings: FloorSegmentationSettings) -> None:
+        """Segment with changed settings from now on."""
+        self._settings = settings
+        if self._mount is not None:
+            self._make_tools(self._mount)
+
+    def _prepare(self, mount: Mount) -> None:
+        if mount == self._mount:
+            return
+        self._make_tools(mount)
+        self._mount, self.fixture = mount, Fixture()
+
+    def _make_tools(self, mount: Mount) -> None:
+        searched = self._settings.num_disparities or disparity_range(self._camera, mount)
+        self._matcher = TwoScaleMatcher(-(-searched // 16) * 16)
+        self._overhead = OverheadMatcher(self._camera, searched, self._settings)
+        self._scanner = FloorScanner(self._camera, mount, self._settings)
+
+    def _disparity(
+        self, first_row: int, left: NDArray[np.uint8], right: NDArray[np.uint8]
+    ) -> NDArray[np.float32]:
+        settings, camera = self._settings, self._camera
+        top = 0 if settings.disparity_above_horizon else first_row
+        assert self._mount is not None
+        fine_rows = last_fine_row(camera, self._mount) - top
+        disparity = np.zeros(left.shape, np.float32)
+        disparity[top:] = self._matcher.compute(left[top:], right[top:], fine_rows)
+        return disparity
+
+    def _fill(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        disparity: NDArray[np.float32],
+        evidence: Evidence,
+        left_rows: NDArray[np.uint8],
+        textured: NDArray[np.bool_],
+        compared: Comparison,
+        said: NDArray[np.uint8] | None,
+    ) -> NDArray[np.uint8]:
+        """Return the mask with floor where this pair of images alone cannot tell: where it looks
+        like floor. The more floor is known the better is known how it looks, so this is done twice,
+        and what then does not look like it is floor only if it was measured. Nor does it contradict
+        a network that was right so far.
+        """
+        mask, odd = evidence.mask, evidence.odd
+        beside = beside_something(view, mask)
+        left = np.ascontiguousarray(left_rows[:, :: view.step])
+        slope = image_slope(left_rows)
+        upright_px = upright_above(view, disparity, compared, textured)
+        for _ in range(2):
+            mask = fill_regions(
+                view, mask, slope, upright_px, compared, textured, evidence.standing, beside, odd
+            )
+            may_be = compared.consistent & ~compared.denied & ~(beside | odd)
+            mask = fill_gaps(view, profile, mask, may_be)
+            unlike = unlike_floor(left, mask == FLOOR)
+            odd = unlike & (evidence.off | evidence.odd)
+            mask[unlike & evidence.off & textured & (mask == FLOOR)] = NO_EVIDENCE
+        if said is not None:
+            self.network.note(said, mask)
+        if said is not None and self.network.is_trusted:
+            undenied = compared.consistent & ~compared.denied
+            mask = with_floor(mask, (said == FLOOR) & undenied)
+        return drop_islands(mask)
+
+    def _scan(
+        self,
+        view: FloorView,
+        profile: FloorProfile,
+        disparity: NDArray[np.float32],
+        evidence: Evidence,
+        mask: NDArray[np.uint8],
+        hanging_xy: NDArray[np.float32],
+        feet_xy: NDArray[np.float32],
+        movable_xy: NDArray[np.float32] | None,
+    ) -> FloorScan:
+        """Return the scan. hanging_xy, feet_xy, movable_xy: (2, N), what is in the way above the
+        horizon, where blank faces stand, and what is of a class that moves.
+        """
+        standing = (evidence.mask[::2] == NOT_FLOOR) & evidence.above[::2]
+        rows, columns = pixels_where(standing)
+        rows *= 2
+        upright_xy = view.positions(rows, columns, disparity[rows, columns])
+        v, u, floor_px = view.pixels_of_profile(self._scanner.cells_xy, profile)
+        floor = (v >= 0) & (v < mask.shape[0]) & (u >= 0) & (u < mask.shape[1])
+        floor &= mask.take(v * np.int32(mask.shape[1]) + u, mode='clip') == FLOOR
+        border_px = np.float32(_BORDER_BLOCKS * BLOCK_PX)
+        shared = u * view.step >= floor_px + border_px
+        # At half the resolution a pixel tells of four, here of two or, in every other column, four.
+        hanging_xy = np.repeat(hanging_xy, _BOARD * 2 // view.step, axis=1)
+        upright_xy = np.hstack([upright_xy, hanging_xy])
+        density = 1 / (2 * view.step)
+        return self._scanner.scan(floor, shared, upright_xy, feet_xy, density, movable_xy)
+
+    def _positions(self, view: FloorView, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return where in the base's x-y plane a disparity (H, W) shows something, (2, N); as
+        many pixels tell as of what stands.
+        """
+        rows, columns = pixels_where(disparity[::2, :: view.step] > 0)
+        uv_px = np.stack([columns * view.step, rows * 2], axis=1)
+        at = disparity[uv_px[:, 1], uv_px[:, 0]]
+        return self._overhead.in_the_way(uv_px.astype(float), at.astype(float), view.mount)
+
+
+def _evidence(
+    view: FloorView,
+    below: NDArray[np.float32],
+    left: NDArray[np.uint8],
+    texture: NDArray[np.float32],
+    enough: float,
+    compared: Comparison,
+    heights: Heights,
+    settings: FloorSegmentationSettings,
+) -> Evidence:
+    """Return what the pixels (R, W) of the view say by themselves, cut back to edges, and left
+    open where they do not look like floor and are not measured to lie on it.
+    """
+    mask = judge(view, below, texture > enough, compared, heights, settings)
+    seen = trim_to_edges(mask, row_slope(left), TEXTURE_WINDOW_PX // 2 + 3)
+    odd, sigmas = unlike_floor(left, seen == FLOOR), mean_height(heights)
+    off, standing = np.abs(sigmas) > SIGMAS * MEAN_NOISE, sigmas > SIGMAS
+    doubtful = (seen == FLOOR) & odd
+    seen[doubtful] = NO_EVIDENCE
+    seen[doubtful & ~off & below_floor(seen)] = FLOOR
+    above = (heights.height > 0) & (texture >= _LEAST_SHARE * enough)
+    return Evidence(seen, above, off, standing, odd)
+
+
+def _feet(
+    view: FloorView,
+    profile: FloorProfile,
+    mask: NDArray[np.uint8],
+    slope: NDArray[np.int16],
+    textured: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Return where blank faces stand, (2, N) in the base's x-y plane."""
+    rows, columns = blank_feet(view, mask, slope, textured)
+    derolled = rows + view.shear_px[columns] + view.first_row
+    return view.positions(rows, columns, profile.at_rows(derolled).astype(np.float32))
+
+
+def _barriers(
+    view: FloorView, profile: FloorProfile, said: NDArray[np.uint8]
+) -> NDArray[np.float32]:
+    """Return where what stands there whatever its depth, of what a network says (R, W), meets the
+    floor, (2, N) in the base's x-y plane: its lowest pixel in each column, unless the image ends.
+    """
+    rows = said.shape[0] - 1 - (said[::-1] == NOT_FLOOR).argmax(axis=0)
+    found = np.flatnonzero((said == NOT_FLOOR).any(axis=0) & (rows < said.shape[0] - 1))
+    rows = rows[found]
+    derolled = rows + view.shear_px[found] + view.first_row
+    floor_px = profile.at_rows(derolled).astype(np.float32)
+    below = floor_px > 0
+    return view.positions(rows[below], found[below], floor_px[below])
+
+
+def _with_angles(mount: Mount, angles_height: Array) -> Mount:
+    pitch, roll, height = (float(value) for value in angles_height)
+    return dataclasses.replace(mount, height_m=height, pitch_rad=pitch, roll_rad=roll)
+
+
+def clear_hidden(
+    mask: NDArray[np.uint8], hidden: NDArray[np.uint8] | None, columns: tuple[slice, slice]
+) -> None:
+    """Set a mask of the view to no evidence where the left image shows nothing that counts."""
+    if hidden is not None:
+        mask[hidden[columns] > 0] = NO_EVIDENCE
+
+
+def mask_overlay(
+    left: NDArray[np.uint8], mask: NDArray[np.uint8], moving: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Return the left image (H, W) uint8 tinted by the mask (H, W), as (H, W, 3) BGR: green is
+    floor, blue no evidence, red not floor, and magenta what moves, the mask (H, W) of which is 255.
+    """
+    tint = np.zeros((*mask.shape, 3), np.uint8)
+    for value, colour in _COLOURS_BGR.items():
+        tint[mask == value] = colour
+    if moving is not None:
+        tint[moving > 0] = _MOVING_BGR
+    return cv2.addWeighted(cv2.cvtColor(left, cv2.COLOR_GRAY2BGR), 0.65, tint, 0.35, 0)
+
+
+def v_disparity_picture(observation: FloorObservation) -> NDArray[np.uint8]:
+    """Return the filtered v-disparity with the floor's profile in green, (H, B, 3) BGR: rows are
+    rows of the de-rolled image, columns bins of disparity; the brighter the more pixels.
+    """
+    counted, profile = observation.v_disparity, observation.profile_px
+    height, bins = len(profile), counted.counts.shape[1]
+    rows = np.arange(counted.first_row, counted.first_row + len(counted.counts))
+    inside = (rows >= 0) & (rows < height)
+    light = np.log1p(counted.counts[inside].astype(np.float64))
+    grey = np.zeros((height, bins), np.uint8)
+    grey[rows[inside]] = 255 * light / max(light.max(initial=0.0), 1e-6)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    known = np.flatnonzero(np.isfinite(profile))
+    if len(known):
+        points = np.stack([counted.bins_per_px * profile[known], known], axis=1)
+        line = np.rint(points).astype(np.int32)[:, None]
+        cv2.polylines(picture, [line], False, _COLOURS_BGR[FLOOR], 1)
+    return picture.astype(np.uint8)

@@ -1,0 +1,348 @@
+"""The back end of SLAM: what is done with the map between frames (Cadena et al., Past, Present, and
+Future of SLAM, IEEE T-RO 2016, section II).
+
+Runs what takes long, an adjustment or the closing of a loop, beside tracking or at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from enum import Enum, auto
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.files.results import Arrays
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays
+from segfloor_ros.core.slam.mapping.bundle_adjustment import (
+    GlobalResult,
+    apply_global,
+    copy_map,
+    solve_global,
+)
+from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper
+from segfloor_ros.core.slam.places.loop_closing import (
+    Closing,
+    KnownMap,
+    apply_closing,
+    plan_closing,
+    solve_closing,
+)
+from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
+from segfloor_ros.core.slam.results import StereoSlamSettings, Track
+from segfloor_ros.core.slam.rig import OffsetEstimate
+from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.slam.tracking.front_end import FrontEnd
+from segfloor_ros.core.slam.tracking.images import Features, Images
+from segfloor_ros.core.timing import timed
+
+GROWN = 1.25
+"""The whole map is adjusted after a loop once it has so many times the keyframes that it had when
+it was last: that costs a long drive no more than a few adjustments of all it has mapped."""
+
+
+class Submap(Enum):
+    """Which part of the map the camera is in, and is mapped.
+
+    KNOWN: the map of the drive, or a loaded one that it was recognised in. LOADED: a loaded one
+    that it is not yet recognised in. The others are submaps beside a known map, until that is
+    recognised. LOST: results are held back; the camera got lost, or a map was loaded and is still
+    searched. OUTSIDE: a loaded map was searched in vain, and results come.
+    """
+
+    KNOWN = auto()
+    LOADED = auto()
+    OUTSIDE = auto()
+    LOST = auto()
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether it is a submap beside the known map."""
+        return self in (Submap.OUTSIDE, Submap.LOST)
+
+
+class BackEnd:
+    """Adjusts the neighbourhood of every keyframe, closes loops, and adjusts the whole map after a
+    loop that moves it far or once it has grown.
+
+    background: on threads beside tracking; else at once, so that the outcome does not depend on
+    timing. Tracking never waits for an adjustment of the whole map. submap: what the map is.
+    """
+
+    def __init__(
+        self,
+        settings: StereoSlamSettings,
+        sparse_map: SparseMap,
+        front_end: FrontEnd,
+        background: bool,
+    ) -> None:
+        self._front_end = front_end
+        self._longest_frames = settings.keyframe_max_frames
+        self.mapper = LocalMapper(sparse_map)
+        self.places = front_end.places
+        self.loop_count = 0
+        self.submap = Submap.KNOWN
+        self._known: KnownMap | None = None
+        self._map = sparse_map
+        self._rig = sparse_map.rig
+        self.loops = LoopDetector(sparse_map, self.places)
+        self._local = AdjustmentRunner(background)
+        self._global = AdjustmentRunner(background)
+        self._background = background
+        self._is_closing = False
+        self._adjusted_keyframes = 0
+        self._up_world: Up | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being solved that a new keyframe would have to wait for."""
+        return self._local.idle
+
+    @property
+    def is_beside_loaded(self) -> bool:
+        """Whether it maps a submap while the camera is still looked for in a loaded map."""
+        known = self._known
+        return self.submap is Submap.LOST and known is not None and not known.of_drive
+
+    def holds_one(self, of_all: bool = False) -> bool:
+        """Whether there is an adjustment of a neighbourhood that is not in the map yet; of_all: or
+        of the whole map.
+        """
+        return self._local.holds_one or (of_all and self._global.holds_one)
+
+    def wants_keyframe(self, track: Track | None, stamp_ns: int) -> bool:
+        """Whether a frame is to become a keyframe: not while a loop is being closed."""
+        front_end = self._front_end
+        frames_since = front_end.frames_since_keyframe
+        if front_end.is_fixed or (self._is_closing and not self.idle):
+            return False
+        if track is None:
+            return not self._map.keyframes or front_end.is_new_place()
+        if track.is_poor and frames_since < self._longest_frames // 3:
+            return False
+        since_ns = stamp_ns - front_end.keyframe_ns
+        return front_end.local.wants_keyframe(track, frames_since, since_ns, self.idle)
+
+    def take_in(self, keyframe: KeyframeRecord, images: Images, up_world: Up | None) -> bool:
+        """Adjust the map to a new keyframe: close a loop where it sees a place again, and fit its
+        neighbourhood. up_world: as an accelerometer has it. Returns whether the map has changed
+        already.
+        """
+        self._up_world = up_world
+        self.places.add(keyframe)
+        if self._merge(keyframe, images):
+            return True
+        closed = self._close_loop(keyframe, images)
+        if self._background:
+            if not closed:
+                self._adjust(keyframe)
+            return False
+        closed = closed and self.collect(wait=True)
+        self._adjust(keyframe)
+        return self.collect(wait=True) or closed
+
+    def start_submap(self) -> None:
+        """Go on with an empty map, until the known one, which is all there is so far, is
+        recognised.
+        """
+        of_drive = self.submap is Submap.KNOWN
+        known = map_to_arrays(self._map) | self.places.to_arrays()
+        self._known = KnownMap(self._map, known, of_drive)
+        self.reset()
+        self.submap = Submap.LOST
+
+    def reset(self) -> None:
+        """Go on with an empty map; no id is given twice."""
+        self._map.reset(self._map.points.num_ever)
+        self._reset_places()
+
+    def find_in_known(
+        self, images: Images, features: Features, stamp_ns: int
+    ) -> tuple[Track | None, dict[int, Track]]:
+        """Return a frame with its pose in the known map, once several in a row were found there,
+        and those, by stamp.
+        """
+        assert self._known is not None
+        return self._known.find(images, features, stamp_ns)
+
+    def drop_submap(self) -> None:
+        """Go back to the known map; what was mapped beside it is lost."""
+        assert self._known is not None
+        known, self._known = self._known, None
+        self.submap = Submap.KNOWN if known.of_drive else Submap.LOADED
+        arrays = known.to_arrays()
+        known.restore(arrays)
+        self._reset_places(arrays)
+
+    def keep_submap(self) -> bool:
+        """Give the known map up, where the drive made it and the submap has more keyframes. Returns
+        whether it did.
+        """
+        known = self._known
+        if known is None or not known.of_drive or len(self._map.keyframes) <= known.num_keyframes:
+            return False
+        self._known, self.submap = None, Submap.KNOWN
+        return True
+
+    def _reset_places(self, words: Arrays | None = None) -> None:
+        self._global.reset()
+        self.places.reset()
+        self.loops.reset()
+        self._adjusted_keyframes = 0
+        if words is not None:
+            self.places.from_arrays(words)
+
+    def _merge(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Merge the submap into the known map, where that is recognised."""
+        known = self._known
+        if known is None or not known.recognise(keyframe, images):
+            return False
+        self._reset_places(known.merge(self.places.to_arrays()))
+        self._known, self.submap = None, Submap.KNOWN
+        return True
+
+    def collect(self, wait: bool) -> bool:
+        """Bring what is solved into the map; with `wait` a running adjustment of a neighbourhood is
+        waited for. Returns whether there was anything.
+        """
+        finished = [self._local.collect(wait)]
+        if finished[0] is not None:
+            finished[0]()
+        if not self._local.holds_one:
+            finished.append(self._global.collect(wait=False))
+            if finished[1] is not None:
+                finished[1]()
+        return any(apply is not None for apply in finished)
+
+    def to_arrays(self) -> Arrays:
+        """Return the map and what belongs to it, for a file: of a camera that got lost the map
+        that it was lost in.
+        """
+        offset = self._rig.offset.estimate
+        measured: Arrays = {'disparity_offset': np.array([offset.value_px, offset.information])}
+        if self.submap is Submap.LOST and self._known is not None:
+            return self._known.to_arrays() | measured
+        return map_to_arrays(self._map) | self.places.to_arrays() | measured
+
+    def from_arrays(self, arrays: Arrays) -> None:
+        """Go on with what `to_arrays` returned."""
+        fill_map(self._map, arrays)
+        self.places.from_arrays(arrays)
+        self._rig.offset.estimate = OffsetEstimate(*arrays['disparity_offset'].tolist())
+
+    def close(self) -> None:
+        """End the background threads, if there are any."""
+        self._global.reset()
+        self._local.close()
+        self._global.close()
+
+    def _adjust(self, keyframe: KeyframeRecord) -> None:
+        """Adjust the neighbourhood of a new keyframe."""
+        if keyframe.index == 0:
+            return
+        adjustment = self.mapper.plan_adjustment(keyframe, self._up_world)
+        if adjustment is None:
+            return
+        self._local.submit(
+            partial(self.mapper.solve, adjustment), partial(self.mapper.apply, adjustment)
+        )
+
+    @timed
+    def _close_loop(self, keyframe: KeyframeRecord, images: Images) -> bool:
+        """Begin to close a loop where a keyframe sees a place again; returns whether it does."""
+        matches = self.loops.detect(keyframe, images)
+        if not matches:
+            return False
+        closing = plan_closing(self._map, matches)
+        self._is_closing = True
+        self._local.submit(partial(solve_closing, closing), partial(self._apply, closing))
+        return True
+
+    def _apply(self, closing: Closing, result: tuple[Array, Array]) -> None:
+        self._is_closing = False
+        is_closed = apply_closing(self._map, closing, result)
+        loop, verdict = closing.edges[-1], 'closed' if is_closed else 'contradicts the map'
+        self.loops.candidates.append(Candidate(loop.i, loop.j, loop.T_i_j, verdict))
+        if not is_closed:
+            return
+        self.loop_count += 1
+        has_grown = len(self._map.keyframes) >= GROWN * self._adjusted_keyframes
+        if closing.is_far:
+            # What is being adjusted is another map; it goes on beside a loop that moves it little.
+            self._global.reset()
+        if not closing.is_far and (not has_grown or self._global.holds_one):
+            return
+        copied = copy_map(self._map, self._rig.offset.estimate, self._up_world)
+
+        def apply(result: GlobalResult | None) -> None:
+            self._adjusted_keyframes = len(copied.records)
+            apply_global(self._map, result)
+
+        self._global.submit(
+            partial(solve_global, self._rig.camera, copied, self._global.is_wanted()), apply
+        )
+
+
+class AdjustmentRunner:
+    """Holds at most one adjustment.
+
+    Without `background` it is solved when it is submitted, so that the outcome does not depend on
+    timing.
+    """
+
+    def __init__(self, background: bool) -> None:
+        self._worker = ThreadPoolExecutor(1, 'adjustment') if background else None
+        self._apply: Callable[[Any], None] | None = None
+        self._result: Future[Any] = Future()
+        self._dropped = 0
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being solved now."""
+        return self._apply is None or self._result.done()
+
+    @property
+    def holds_one(self) -> bool:
+        """Whether there is an adjustment that was not collected yet."""
+        return self._apply is not None
+
+    def is_wanted(self) -> Callable[[], bool]:
+        """Return whether the next adjustment is still wanted, to be asked while it runs."""
+        number = self._dropped
+        return lambda: self._dropped == number
+
+    def reset(self) -> None:
+        """Drop an adjustment; one that is running is asked to end."""
+        self._dropped += 1
+        self._apply = None
+
+    def submit(self, solve: Callable[[], Any], apply: Callable[[Any], None]) -> None:
+        """Begin an adjustment; the one before must have been collected. solve: works on a copy and
+        shares nothing with the map. apply: brings what it returns into the map.
+        """
+        self._apply = apply
+        if self._worker is not None:
+            self._result = self._worker.submit(solve)
+        else:
+            self._result = Future()
+            self._result.set_result(solve())
+
+    def collect(self, wait: bool) -> Callable[[], None] | None:
+        """Return what applies a finished adjustment, once, or None; with `wait` a running one is
+        waited for.
+        """
+        apply = self._apply
+        if apply is None or not (wait or self._result.done()):
+            return None
+        self._apply = None
+        result = self._result.result()
+        return lambda: apply(result)
+
+    def close(self) -> None:
+        """Wait for a running adjustment and end the thread."""
+        if self._worker is not None:
+            self._worker.shutdown()

@@ -1,0 +1,394 @@
+"""Places that keyframes see again: of their own map after the path has drifted, a loop, or of a
+known one.
+
+Precision comes first: a loop that is missed costs drift, a false one costs the map. The place must
+lie where drift can have put it, several keyframes must see it, each on its own, and they must agree
+on drift and floor, and see the same space from both sides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
+from segfloor_ros.core.slam.places.place_recognition import (
+    PlaceRecognition,
+    Sightings,
+    greatest_speed_mps,
+)
+from segfloor_ros.core.slam.places.views import (
+    ALIKE_SHARE,
+    motion_between,
+    novelty,
+    seen_ahead_m,
+    views_near,
+)
+from segfloor_ros.core.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME
+from segfloor_ros.core.slam.rig import (
+    GATE,
+    LOCAL_KEYFRAMES,
+    MIN_DEPTH_M,
+    NEIGHBOURS,
+    SAME_PX,
+    chi2_limit,
+    in_view,
+)
+from segfloor_ros.core.slam.sparse_map import (
+    LINK_SIGMA,
+    LOOP_FACTOR,
+    KeyframeRecord,
+    Match,
+    SparseMap,
+    features_of,
+    loop_sigma,
+)
+from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
+
+DRIFT_PER_M = 0.04, 0.01
+"""Drift of a path in m and rad per m: stereo odometry drifts by one per cent or less."""
+
+FREE_DRIFT = 0.3, 0.1
+"""Drift, in m and rad, of the shortest of ways."""
+
+MAX_STEP_UP_M, MAX_SLOPE = 0.1, 0.2
+"""Where a robot stands on the same floor again, its camera is about as high and, in rad, as level
+as before: floors slope, and carts shake."""
+
+IN_FRONT_SHARE, MAX_SEEN_THROUGH = 0.1, 0.2
+"""A point is in front of another on its ray where its disparity is larger by the first share. The
+second of all points the other side may see through: edges hide what is behind by a few pixels."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What became of a keyframe that saw a place, both by index, as it seemed from T_keyframe_place
+    (4, 4): verdict is 'seen' for one that counts, else what spoke against it. The last of a loop
+    comes once more, as 'closed', or with what spoke against the loop.
+    """
+
+    keyframe: int
+    place: int
+    T_keyframe_place: Array
+    verdict: str
+
+
+class LoopDetector:
+    """Looks for loops, keyframe by keyframe."""
+
+    def __init__(self, sparse_map: SparseMap, places: PlaceRecognition) -> None:
+        self.candidates: list[Candidate] = []
+        self._map = sparse_map
+        self._places = places
+        self._matcher = PlaceMatcher(sparse_map, sparse_map, places, PROOF)
+
+    def reset(self) -> None:
+        """Believe in no loop."""
+        self._matcher.reset()
+
+    def detect(self, keyframe: KeyframeRecord, images: Pixels) -> list[Match]:
+        """Return the keyframes that see a place again, once there are enough of them, else none."""
+        lengths = path_lengths(self._map, keyframe.index)
+        near = self._linked(keyframe)
+        (free_m, free_rad), (per_m, rad_per_m) = FREE_DRIFT, DRIFT_PER_M
+        reach_m, reach_rad = free_m + per_m * lengths, free_rad + rad_per_m * lengths
+        shown = self._places.shown_from(keyframe.T_world_camera, reach_m, reach_rad)
+        match = self._matcher.look(keyframe, images, ~near & shown, near)
+        match = match or self._from_above(keyframe, ~near, reach_m)
+        if match is not None:
+            reach = float(reach_m[match.place]), float(reach_rad[match.place])
+            objection = objection_to_drift(keyframe, match, reach)
+            objection = objection or self._matcher.objection(keyframe, match)
+            self._note(match, objection or 'seen')
+            match = None if objection else match
+        if not self._matcher.add(match):
+            return []
+        matches = self._matcher.matches
+        self.reset()
+        return matches
+
+    def _note(self, match: Match, verdict: str) -> None:
+        place = self._map.keyframes[match.place]
+        T_keyframe_place = match.T_camera_world @ place.T_world_camera
+        self.candidates.append(Candidate(match.keyframe, match.place, T_keyframe_place, verdict))
+
+    def _linked(self, keyframe: KeyframeRecord) -> NDArray[np.bool_]:
+        """Return which keyframes (K,) a view is linked to already."""
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        linked, shared = self._map.covisible(own)
+        near = np.arange(len(self._map.keyframes)) > keyframe.index - NEIGHBOURS
+        near[linked[shared > max(ENOUGH, ALIKE_SHARE * len(own))]] = True
+        return near
+
+    def _from_above(
+        self, keyframe: KeyframeRecord, others: NDArray[np.bool_], reach_m: Array
+    ) -> Match | None:
+        """Look for the floor of other keyframes (K,), within reach (K,), that look another way."""
+        mount, keyframes = self._map.rig.mount, self._map.keyframes
+        if mount is None or not len(keyframe.ground.xy_m):
+            return None
+        middle = invert(mount.T_base_left) @ np.array([seen_ahead_m(mount), 0.0, 0.0, 1.0])
+        poses = invert(np.stack([k.T_camera_world for k in keyframes]))
+        distance = np.linalg.norm((poses - keyframe.T_world_camera) @ middle, axis=1)
+        turned = poses[:, :3, 2] @ keyframe.T_world_camera[:3, 2] <= MIN_VIEW_COSINE
+        shown = np.array([len(k.ground.xy_m) > 0 for k in keyframes])
+        near = np.flatnonzero(others & turned & shown & (distance < reach_m + seen_ahead_m(mount)))
+        return self._matcher.look_at_floor(keyframe, near[np.argsort(distance[near])])
+
+
+def path_lengths(sparse_map: SparseMap, index: int) -> Array:
+    """Return the length (K,) in metres of the shortest way from a keyframe to each other one, over
+    keyframes that share points: what drift builds up along.
+    """
+    i, j = sparse_map.links()
+    i = np.append(i, [loop.i for loop in sparse_map.loops]).astype(np.int32)
+    j = np.append(j, [loop.j for loop in sparse_map.loops]).astype(np.int32)
+    poses = np.stack([k.T_camera_world for k in sparse_map.keyframes])
+    centres = invert(poses)[:, :3, 3]
+    weight = np.linalg.norm(centres[i] - centres[j], axis=1) + 1e-6
+    graph = sparse.csr_matrix((weight, (i, j)), shape=(len(centres), len(centres)))
+    return np.asarray(dijkstra(graph, directed=False, indices=[index]))[0]
+
+
+def objection_to_drift(keyframe: KeyframeRecord, match: Match, reach: tuple[float, float]) -> str:
+    """Return what speaks against a match in the same map: the path cannot have drifted so far, in m
+    and rad, or has not drifted; '' for nothing.
+    """
+    moved = match.T_camera_world @ keyframe.T_world_camera
+    if is_within(moved, loop_sigma(by_floor=not len(match.rows))):
+        return 'no drift'
+    return '' if is_within(moved, reach) else 'more than drift'
+
+
+class PlaceMatcher:
+    """Matches keyframes with the places of a known map, which may be their own, until enough of
+    them agree. needed: how many that are.
+    """
+
+    def __init__(
+        self, own: SparseMap, known: SparseMap, places: PlaceRecognition, needed: int
+    ) -> None:
+        self._map = own
+        self._camera = own.rig.camera
+        self._known = known
+        self._places = places
+        self._needed = needed
+        self._sightings: Sightings[Match] = Sightings(needed, self.agree)
+
+    def reset(self) -> None:
+        """Believe in no place."""
+        self._sightings.reset()
+
+    @property
+    def matches(self) -> list[Match]:
+        """The keyframes that see the place, the latest last."""
+        return self._sightings.views
+
+    def look(
+        self,
+        keyframe: KeyframeRecord,
+        images: Pixels,
+        may_show: NDArray[np.bool_],
+        near: NDArray[np.bool_],
+    ) -> Match | None:
+        """Look for the place where the keyframes before saw it, else by its look. may_show, near:
+        which keyframes (K,) of the known map may be of the place, and which are of the view itself.
+        """
+        own_ids, track = self._known.points_of(np.flatnonzero(near)), None
+        features = features_of(self._map, keyframe)
+        if self.matches:
+            pose = keyframe.T_camera_world @ drift(self._map, self.matches[-1])
+            depth_m = median_depth_m(self._map, keyframe)
+            around = views_near(self._known, pose, depth_m, len(may_show))
+            ids = self._places.points_of(around[may_show[around]][:NEIGHBOURS], own_ids)
+            track = self._places.confirm(images, features, ids, pose)
+        if track is None:
+            is_bounded = self._known is self._map
+            track = self._places.find(images, features, may_show, own_ids, is_bounded=is_bounded)
+        if track is None:
+            return None
+        assert track.observed is not None
+        rows = np.flatnonzero(track.observed.point_id != NO_POINT)
+        ids = track.observed.point_id[rows]
+        order, _ = self._known.covisible(ids)
+        place = int(order[may_show[order]][0])
+        stable_ids = self._known.stable_id[ids]
+        return Match(keyframe.index, place, track.T_camera_world, rows, ids, stable_ids)
+
+    def look_at_floor(self, keyframe: KeyframeRecord, places: NDArray[np.intp]) -> Match | None:
+        """Look for the floor of the first of known keyframes (N,), by index, from whatever side;
+        None where they do not agree. Floors repeat themselves: where no drift limits where the
+        place is, more of them are tried, and those count where what stands around the keyframe
+        stands, too.
+        """
+        mount, found = self._map.rig.mount, list[Match]()
+        if mount is None:
+            return None
+        is_bounded = self._known is self._map
+        nothing = np.zeros(0, np.intp), np.zeros(0, np.int32), np.zeros(0, np.int32)
+        for place in places[: PROOF if is_bounded else LOCAL_KEYFRAMES].tolist():
+            known = self._known.keyframes[place]
+            T_base_place = motion_between(keyframe.ground, known.ground, mount.height_m)
+            if T_base_place is None:
+                continue
+            T_camera_place = invert(mount.T_base_left) @ T_base_place @ mount.T_base_left
+            pose = T_camera_place @ known.T_camera_world
+            match = Match(keyframe.index, place, pose, *nothing)
+            if is_bounded or self.stands_alike(match):
+                found.append(match)
+        agree = found and all(self.agree(match, found[0]) for match in found[1:])
+        return found[0] if agree else None
+
+    def add(self, match: Match | None) -> bool:
+        """Take in what the next keyframe sees of the place; returns whether enough of them agree,
+        two of them so far apart that each of so many views on the way is new.
+        """
+        if not self._sightings.add(match):
+            return False
+        depth_m = median_depth_m(self._map, self._map.keyframes[self.matches[-1].keyframe])
+        poses = np.stack([match.T_camera_world for match in self.matches])
+        novelties = novelty(poses[:, None] @ invert(poses), depth_m)
+        return bool(novelties.max() >= self._needed - 1)
+
+    def agree(self, before: Match, latest: Match) -> bool:
+        """Whether two keyframes show the same drift, up to what two loops err."""
+        now = self._map.keyframes[latest.keyframe].T_camera_world
+        gap = now @ drift(self._map, before) @ invert(latest.T_camera_world)
+        sigmas = np.sqrt(2 * chi2_limit(6, GATE)) * LOOP_FACTOR
+        return is_within(gap, (sigmas * LINK_SIGMA[0], sigmas * LINK_SIGMA[1]))
+
+    def is_within_reach(self, match: Match) -> bool:
+        """Whether the robot can have come there while it was lost: from the last keyframe of the
+        known map to the first of its own.
+        """
+        first, known = self._map.keyframes[0], self._known.keyframes
+        T_own_known = drift(self._map, match)
+        way = known[-1].T_camera_world @ invert(first.T_camera_world @ T_own_known)
+        lost_s = 1e-9 * (first.stamp_ns - known[-1].stamp_ns)
+        return bool(np.linalg.norm(way[:3, 3]) <= SAME[0] + greatest_speed_mps(known) * lost_s)
+
+    def objection(self, keyframe: KeyframeRecord, match: Match) -> str:
+        """Return what else speaks against a match, '' for nothing."""
+        if not self.is_level(match):
+            return 'another floor'
+        if len(match.rows) and not self._holds_back(keyframe, match):
+            return 'not seen from the other side'
+        if self._seen_through(keyframe, match) > MAX_SEEN_THROUGH:
+            return 'free space through obstacles'
+        return ''
+
+    def is_level(self, match: Match) -> bool:
+        """Whether the robot stands on the floor of the place, as far as the mount is known."""
+        mount = self._map.rig.mount
+        if mount is None:
+            return True
+        place = self._known.keyframes[match.place]
+        T_base_left = mount.T_base_left
+        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
+        T = T_base_left @ T_place_now @ invert(T_base_left)
+        up_m = abs(T[2, 3]) - MAX_SLOPE * float(np.linalg.norm(T[:2, 3]))
+        tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+        return bool(up_m <= MAX_STEP_UP_M and tilt <= MAX_SLOPE)
+
+    def stands_alike(self, match: Match) -> bool:
+        """Whether what stands around the keyframe stands where the known map has it, and not as
+        well in a place beside: floors repeat themselves.
+        """
+        mount = self._map.rig.mount
+        assert mount is not None
+        recent = np.arange(max(0, match.keyframe - NEIGHBOURS), match.keyframe + 1)
+        own = upright(self._map, mount, self._map.points_of(recent))
+        own = transform_points(invert(drift(self._map, match)), own)
+        reach_m = np.sqrt(chi2_limit(3)) * LINK_SIGMA[0]
+        along, aside, _ = mount.T_base_left[:3, :3]
+        angles = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        ring = reach_m * (np.outer(np.cos(angles), along) + np.outer(np.sin(angles), aside))
+        shifts = np.concatenate([np.zeros((1, 3)), 4 * ring, 8 * ring, 12 * ring])
+        gaps_m, _ = self._upright.query(own[:, None] + shifts, distance_upper_bound=reach_m)
+        here, *beside = np.isfinite(gaps_m).sum(axis=0)
+        return bool(here >= ENOUGH and here - np.sqrt(here) > max(beside) + np.sqrt(max(beside)))
+
+    @cached_property
+    def _upright(self) -> cKDTree:
+        """What stands in the known map, once it does not change any more."""
+        assert self._map.rig.mount is not None
+        alive = np.flatnonzero(self._known.alive)
+        return cKDTree(upright(self._known, self._map.rig.mount, alive))
+
+    def _holds_back(self, keyframe: KeyframeRecord, match: Match) -> bool:
+        """Whether the keyframe's own points lie where the place's keyframe sees what they match."""
+        own = keyframe.point_id[match.rows]
+        point, holder, row = self._known.edges_of(match.ids)
+        of_place = holder == match.place
+        slot = np.searchsorted(np.sort(match.ids), point[of_place])
+        slot = np.argsort(match.ids)[slot]
+        measured = own[slot] != NO_POINT
+        slot, row = slot[measured], row[of_place][measured]
+        if len(slot) < ENOUGH:
+            return False
+        place = self._known.keyframes[match.place]
+        T_place_world = place.T_camera_world @ invert(match.T_camera_world)
+        local = transform_points(keyframe.T_camera_world, self._map.xyz_world[own[slot]])
+        uvd, _ = in_view(self._camera, transform_points(T_place_world, local))
+        gap = np.linalg.norm(uvd[:, :2] - place.observations.uvd_px[row, :2], axis=1)
+        return float((gap < SAME_PX).mean()) >= MOST
+
+    def _seen_through(self, keyframe: KeyframeRecord, match: Match) -> float:
+        """Return the larger share of the points of one side that the other sees through, were both
+        the same place: the rays to what is seen are free.
+        """
+        place = self._known.keyframes[match.place]
+        own = keyframe.point_id[keyframe.point_id != NO_POINT]
+        known = place.point_id[place.point_id != NO_POINT]
+        if self._known is self._map:
+            own = np.setdiff1d(own, known)
+        in_now = transform_points(keyframe.T_camera_world, self._map.xyz_world[own])
+        in_place = transform_points(place.T_camera_world, self._known.xyz_world[known])
+        T_place_now = place.T_camera_world @ invert(match.T_camera_world)
+        return max(
+            self._share_in_front(transform_points(T_place_now, in_now), in_place),
+            self._share_in_front(transform_points(invert(T_place_now), in_place), in_now),
+        )
+
+    def _share_in_front(self, points: Array, seen: Array) -> float:
+        """Return the share of points (N, 3) that lie in front of what a camera sees (M, 3) beside
+        them, both in its optical frame; 0 where few can be compared.
+        """
+        uvd, valid = in_view(self._camera, points)
+        uvd_seen, _ = in_view(self._camera, seen)
+        uvd, uvd_seen = uvd[valid], uvd_seen[np.isfinite(uvd_seen[:, 0])]
+        if not len(uvd) or not len(uvd_seen):
+            return 0.0
+        gap, near = cKDTree(uvd_seen[:, :2]).query(uvd[:, :2], distance_upper_bound=SAME_PX)
+        beside = np.isfinite(gap)
+        if beside.sum() < ENOUGH:
+            return 0.0
+        behind = uvd_seen[np.asarray(near)[beside], 2]
+        margin = np.maximum(SAME_PX, IN_FRONT_SHARE * behind)
+        return float((uvd[beside, 2] - behind > margin).mean())
+
+
+def drift(sparse_map: SparseMap, match: Match) -> Array:
+    """Return the (4, 4) that brings a place's coordinates into those of the keyframe's map."""
+    own = sparse_map.keyframes[match.keyframe].T_camera_world
+    return invert(own) @ match.T_camera_world
+
+
+def upright(sparse_map: SparseMap, mount: Mount, ids: NDArray[np.integer]) -> Array:
+    """Return those of points (N,), (M, 3), that stand higher than a step above the floor."""
+    xyz = sparse_map.xyz_world[ids]
+    return xyz[transform_points(mount.T_base_left, xyz)[:, 2] > MAX_STEP_UP_M]
+
+
+def median_depth_m(sparse_map: SparseMap, keyframe: KeyframeRecord) -> float:
+    """Return the median depth of what a keyframe sees."""
+    ids = keyframe.point_id[keyframe.point_id != NO_POINT]
+    depth = transform_points(keyframe.T_camera_world, sparse_map.xyz_world[ids])[:, 2]
+    return max(float(np.median(depth)), MIN_DEPTH_M) if len(ids) else MIN_DEPTH_M

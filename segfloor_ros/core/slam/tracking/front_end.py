@@ -1,0 +1,403 @@
+"""The front end of SLAM: where the camera is, frame by frame, and which images cannot be tracked:
+black, white, only half delivered, or the same as before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.images import Region, union
+from segfloor_ros.core.camera.model import StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.core.geometry import Array, transform_points
+from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
+from segfloor_ros.core.slam.places.place_recognition import (
+    PlaceRecognition,
+    Relocaliser,
+    greatest_speed_mps,
+    is_within,
+)
+from segfloor_ros.core.slam.places.views import ALIKE_SHARE
+from segfloor_ros.core.slam.results import (
+    ENOUGH,
+    MAJORITY,
+    MOST,
+    NO_POINT,
+    SAME,
+    LastPose,
+    ObservedFeatures,
+    StereoSlamSettings,
+    Track,
+)
+from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
+from segfloor_ros.core.slam.tracking.map_tracking import Follower, LocalMap, Tracker
+from segfloor_ros.core.slam.tracking.motion import (
+    CameraMotion,
+    ImageRotation,
+    TrackingState,
+    sigma_m,
+)
+from segfloor_ros.core.slam.tracking.patch_alignment import GREY_NOISE, count_firm, with_patch_noise
+from segfloor_ros.core.slam.tracking.pose import (
+    FIRST_INFORMATION,
+    MIN_FOUND,
+    PoseEstimate,
+    differ,
+    knows_more,
+    refine_pose,
+)
+from segfloor_ros.core.timing import timed
+
+MIN_EXPECTED_SHIFT = 0.004
+"""Motion of the picture, in widths per frame, that cannot stop from one frame to the next."""
+
+PLENTY = 100
+"""With so many points in view the place is certain enough, whatever they are, also where the
+sensors have the camera somewhere else: wheels slip. A view that begins anew needs twice as many: it
+may be of another place. Wheels measure the pose better than fewer than half of them, spread over
+the image, that do not slide along edges, and an IMU alone better than fewer than a quarter."""
+
+
+class FrontEnd:
+    """Tracks frames against the map, and looks for a camera that was lost.
+
+    is_fixed: whether the map stays as it is.
+    """
+
+    def __init__(
+        self, settings: StereoSlamSettings, sparse_map: SparseMap, body: BodyMotion
+    ) -> None:
+        self.motion = CameraMotion(settings.max_speed_mps, body)
+        self.local = LocalMap(sparse_map, settings.keyframe_max_frames)
+        self.follower = Follower(sparse_map)
+        self.tracker = Tracker(sparse_map)
+        self.extractor = FeatureExtractor(settings)
+        self.places = PlaceRecognition(sparse_map)
+        self.is_fixed = False
+        self.frames_since_keyframe = self.keyframe_ns = 0
+        self._camera = sparse_map.rig.camera
+        self._map = sparse_map
+        self.relocaliser = Relocaliser(sparse_map, self.places)
+        self.repeats = RepeatCheck()
+        self._rotation = ImageRotation(self._camera)
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether the camera is looked for in the whole map."""
+        state = self.motion.state
+        is_searched = state.is_lost or state is TrackingState.HELD
+        return is_searched and not self.relocaliser.is_narrow
+
+    def reset(self) -> None:
+        """Begin anew in a map in which the camera must be found."""
+        self.local.point_ids = np.zeros(0, np.int32)
+        self.follower.reset()
+        self.relocaliser.reset()
+        self.motion.lose()
+
+    def resume(self, last: LastPose) -> None:
+        """Go on with a map whose drive was broken off."""
+        # A robot that nobody sees goes three standard deviations at most.
+        self.motion.resume(last, greatest_speed_mps(self._map.keyframes) / 3)
+        seen = self._map.keyframes[-1].point_id
+        self.local.move_to(seen[seen != NO_POINT], last.T_camera_world)
+
+    def search_near(self, T_world_camera: Array, reach: tuple[float, float]) -> None:
+        """Look for the camera around a pose (4, 4) alone, unless it is tracked there."""
+        here = is_within(self.motion.T_camera_world @ T_world_camera, reach)
+        if here and not self.motion.state.is_lost:
+            return
+        self.reset()
+        self.relocaliser.search_near(T_world_camera, reach)
+
+    def follow_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
+        """Move along with a keyframe (T_camera_world, (4, 4)) that the map has moved."""
+        self.motion.move_map(T_reference_before, T_reference_after)
+        self.drop_dead()
+
+    def drop_dead(self) -> None:
+        """Forget points that are not part of the map any more."""
+        self.local.drop_dead()
+        self.follower.drop_dead()
+
+    @timed
+    def fault(self, frame: StereoFrame) -> str:
+        """Return why a pair of images cannot be tracked, or ''."""
+        points = self._map.xyz_world[self.follower.seen_ids]
+        motion = self.motion
+        shift = partial(
+            expected_shift,
+            self._camera,
+            points,
+            motion.T_camera_world,
+            motion.predict(frame.stamp_ns),
+        )
+        frozen = self.repeats.is_frozen(frame.left, shift)
+        fault = image_fault(frame.left, frame.left if is_disparity(frame.right) else frame.right)
+        if frozen and not fault:
+            return 'the image is again the one before although the camera was moving'
+        return fault
+
+    def track(self, frame: StereoFrame, images: Images, found: Track | None = None) -> Track | None:
+        """Find the pose of a frame: from the one before, else by its features. found: where
+        it is in this map, as that was found while the camera was in a submap.
+        """
+        self._rotation.see(images.small)
+        if found is not None:
+            features = self.extractor.extract(frame.left, images.excluded)
+            track = self._relocalise(images, features, frame.stamp_ns, found)
+        else:
+            prediction = self.motion.predict(frame.stamp_ns)
+            track = self.follower.follow(images, self.local.point_ids, prediction)
+        if track is None:
+            track = self._search(frame, images)
+        if track is None or not self.is_believable(track, images, frame.stamp_ns):
+            self.follower.reset()
+            return None
+        if not self.motion.state.is_lost and len(track.point_ids) < PLENTY:
+            nothing = replace(track.estimate, covariance=np.diag(1 / FIRST_INFORMATION))
+            by_patches = _with_prior(self._map, track, images, nothing)
+            track = replace(track, sigma_m=sigma_m(by_patches.covariance))
+        T_seen = track.T_camera_world
+        track = self._weighed(replace(track, prior=self.motion.prior(frame.stamp_ns)), images)
+        self.motion.take(track.T_camera_world, track.covariance, frame.stamp_ns, T_seen)
+        self.follower.see(images, track.point_ids, track.uv_px)
+        self.local.move_to(track.point_ids, track.T_camera_world)
+        if not self.is_fixed:
+            self._map.points.note_tracking(track.visible_ids, track.point_ids)
+        self.frames_since_keyframe += 1
+        return track
+
+    def is_believable(self, track: Track, images: Images, stamp_ns: int) -> bool:
+        """Whether the camera can have come to where the images have it."""
+        motion, pose = self.motion, track.T_camera_world
+        if motion.state.is_lost:
+            return motion.is_heading_possible(pose, stamp_ns)
+        measured = motion.measured(stamp_ns)
+        by_imu = measured is not None and measured.source == 'IMU'
+        few = PLENTY // 2 if motion.prior(stamp_ns) else PLENTY // 4 if by_imu else 0
+        if few and count_firm(images.left, track.uv_px) < few:
+            return False
+        if motion.is_consistent(pose, track.covariance, stamp_ns):
+            return motion.state.is_resuming or motion.is_plausible(pose, stamp_ns)
+        if motion.state.is_resuming:
+            return False
+        if motion.state.is_blind:
+            return len(track.point_ids) >= 2 * PLENTY and _recognised(track, MAJORITY)
+        return len(track.point_ids) >= PLENTY and _recognised(track, ALIKE_SHARE)
+
+    def _weighed(self, track: Track, images: Images) -> Track:
+        """Return a track with the likeliest pose by images and prior; that of the images where the
+        prior contradicts it.
+        """
+        prior = track.prior
+        if prior is None or differ(track.estimate, prior):
+            return replace(track, prior=None, is_prior_better=False)
+        fused = _with_prior(self._map, track, images, prior)
+        return replace(track, estimate=fused, is_prior_better=knows_more(prior, fused))
+
+    def bridge(self, frame: StereoFrame, fault: str) -> None:
+        """Go on without the images, where the sensors allow it."""
+        if self.motion.bridge(frame.stamp_ns):
+            self.local.move_to(np.zeros(0, np.int32), self.motion.T_camera_world)
+            self.frames_since_keyframe += 1
+        elif not fault or self.motion.state is not TrackingState.TRACKING:
+            self.motion.lose(frame.stamp_ns)
+
+    def _predict_poses(self, frame: StereoFrame) -> list[Array]:
+        """Return where the camera may be now, T_camera_world (4, 4) each, the likeliest first."""
+        turned = self._rotation.turn_since_last() @ self.motion.T_camera_world
+        steady = self.motion.steady(frame.stamp_ns)
+        measured = self.motion.measured_pose(frame.stamp_ns)
+        return [steady, turned] if measured is None else [measured, steady, turned]
+
+    def _search(self, frame: StereoFrame, images: Images) -> Track | None:
+        """Find the pose by the features of the frame, without its predecessor."""
+        features = self.extractor.extract(frame.left, images.excluded)
+        predictions = self._predict_poses(frame)
+        track = self.tracker.track(images, features, self.local.point_ids, predictions)
+        if self.motion.state is TrackingState.TRACKING:
+            return self._carry_on(images, features, frame.stamp_ns, track)
+        if track is not None and _recognised(track, MIN_FOUND):
+            return track
+        return self._relocalise(images, features, frame.stamp_ns)
+
+    def _carry_on(
+        self, images: Images, features: Features, stamp_ns: int, track: Track | None
+    ) -> Track | None:
+        """Return the pose that the motion so far leads to, where it explains more points that have
+        a record of standing still, or where a pose is poor, nearly as many: what comes close and
+        fills the image has the most points, and takes the pose along.
+        """
+        is_poor = track is None or not _recognised(track, MIN_FOUND)
+        steady = self.motion.expected(stamp_ns)
+        close = self.tracker.track_at(
+            images, features, self.local.point_ids, steady.T_camera_world, steady, is_given=True
+        )
+        found = None if track is None else replace(track, is_poor=is_poor)
+        if close is None or len(close.point_ids) < ENOUGH:
+            return found
+        if found is not None:
+            by_images, explained = (
+                self.tracker.consensus.proven(t.point_ids, t.T_camera_world).sum()
+                for t in (found, close)
+            )
+            if explained <= (MOST if is_poor else 1.0) * by_images:
+                return found
+        return replace(close, is_poor=True)
+
+    def _relocalise(
+        self, images: Images, features: Features, stamp_ns: int, found: Track | None = None
+    ) -> Track | None:
+        """Look for the view in the whole map, unless it was found there already, and track all that
+        is in view there.
+        """
+        if found is None:
+            motion = self.motion
+            is_possible = partial(motion.is_heading_possible, stamp_ns=stamp_ns)
+            lost_at = motion.T_camera_world if motion.state is TrackingState.LOST_NEAR else None
+            lost_at = motion.steady(stamp_ns) if motion.state.is_resuming else lost_at
+            found = self.relocaliser.find(images, features, stamp_ns, is_possible, lost_at)
+        if found is None:
+            return None
+        around = self.local.points_around(found.point_ids, found.T_camera_world)
+        return self.tracker.track_at(images, features, around, found.T_camera_world)
+
+    def is_new_place(self) -> bool:
+        """Whether the sensors have the camera somewhere new: the map goes on from there."""
+        motion = self.motion
+        state = motion.state
+        is_held = state is TrackingState.HELD
+        if not state.is_blind or is_held or sigma_m(motion.covariance) > SAME[0]:
+            return False
+        return self.local.is_new_view(motion.T_camera_world)
+
+    def exclude(self, images: Images, region: Region | None) -> Images:
+        """Return the images without a region in which something moves."""
+        if region is None:
+            return images
+        self.follower.drop_inside(region)
+        return replace(images, excluded=union(images.excluded, region))
+
+    @timed
+    def observe(
+        self, frame: StereoFrame, images: Images, track: Track | None
+    ) -> ObservedFeatures | None:
+        """Return the features of a frame and which of them show map points, now that the pose is
+        known; it is refined by all of them. None where too few do.
+        """
+        if track is not None and track.observed is not None:
+            inside = is_inside(images.excluded, track.observed.features.uv_px)
+            observed = track.observed.take(np.flatnonzero(~inside))
+            return _with_patch_noise(images, observed, track)
+        features = self.extractor.extract(frame.left, images.excluded)
+        if track is None:
+            if not self._map.keyframes:
+                self.motion.take(self.motion.T_camera_world, np.zeros((6, 6)), frame.stamp_ns)
+            none = np.full(len(features), NO_POINT, np.int32)
+            return ObservedFeatures(features, self.tracker.pixel_observations(features), none)
+        pose = self.motion.T_camera_world
+        matched = self.tracker.track_at(
+            images, features, self.local.point_ids, pose, track.estimate
+        )
+        if matched is None:
+            return None
+        assert matched.observed is not None
+        weighed = self._weighed(replace(matched, prior=track.prior), images)
+        self.motion.T_camera_world = weighed.T_camera_world
+        self._map.points.note_tracking(matched.visible_ids, matched.point_ids)
+        return _with_patch_noise(images, matched.observed, weighed)
+
+    def continue_from(self, images: Images, keyframe: KeyframeRecord) -> None:
+        """Track on from the points of a keyframe, old and new."""
+        rows = np.flatnonzero(keyframe.point_id != NO_POINT)
+        ids = keyframe.point_id[rows]
+        self.follower.see(images, ids, keyframe.observations.uvd_px[rows, :2])
+        self.local.move_to(ids, keyframe.T_camera_world)
+        self.frames_since_keyframe, self.keyframe_ns = 0, keyframe.stamp_ns
+
+
+def _with_prior(
+    sparse_map: SparseMap, track: Track, images: Images, prior: PoseEstimate
+) -> PoseEstimate:
+    """Return the pose by what a track shows, as sure as its patches are, and a prior."""
+    by_images, points = track.estimate, sparse_map.xyz_world[track.point_ids]
+    seen = track.observations.without_offset(sparse_map.rig.offset.value_px)
+    seen = seen.with_noise_factor(by_images.noise_factor)
+    seen = with_patch_noise(images.left, seen, not images.depth_scale)
+    start, camera = by_images.T_camera_world, sparse_map.rig.camera
+    found = refine_pose(camera, start, points, seen, 1.0, prior)
+    return replace(by_images, T_camera_world=found.T_camera_world, covariance=found.covariance)
+
+
+def _with_patch_noise(images: Images, observed: ObservedFeatures, track: Track) -> ObservedFeatures:
+    """Return the features of a frame; with the noise of their patches where wheels know some
+    direction of its pose better than they do.
+    """
+    if not track.is_prior_better:
+        return observed
+    noisy = with_patch_noise(images.left, observed.observations, not images.depth_scale)
+    return replace(observed, observations=noisy)
+
+
+def _recognised(track: Track, ratio: float) -> bool:
+    """Whether a camera that was lost sees enough of what it should see there."""
+    return len(track.point_ids) >= ratio * len(track.visible_ids)
+
+
+def image_fault(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> str:
+    """Return what is wrong with a stereo pair of grey images (H, W), in words, or '' when it
+    can be tracked.
+    """
+    for side, image in (('left', left), ('right', right)):
+        sampled = np.ascontiguousarray(image[::4, ::4])
+        mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(sampled))
+        if spread < GREY_NOISE:
+            return f'{side} image without contrast (mean grey level {mean:.0f})'
+        live = (sampled != sampled[:, :1]).any(axis=1)
+        if live.mean() < MOST:
+            return f'{side} image incomplete: {1 - live.mean():.0%} of its rows are empty'
+    return ''
+
+
+def expected_shift(camera: StereoCamera, points: Array, T_then: Array, T_now: Array) -> float:
+    """Return how far the picture of points (N, 3) should have moved between two poses
+    (T_camera_world, (4, 4)), in image widths; 0 without points.
+    """
+    if len(points) == 0:
+        return 0.0
+    then, now = (camera.project(transform_points(T, points))[:, :2] for T in (T_then, T_now))
+    return float(np.median(np.linalg.norm(now - then, axis=1))) / camera.width
+
+
+class RepeatCheck:
+    """Distinguishes an image that a camera delivers twice, as a Kinect does, from a camera that is
+    frozen: it delivers the same one again and again. A robot that stands still shows the same view,
+    too, but then no motion was to be expected.
+
+    is_repeated: whether the last image is the one before. is_carried: whether its view should have
+    moved since, so that it shows nothing of this moment.
+    """
+
+    def __init__(self) -> None:
+        self._last: NDArray[np.uint8] | None = None
+        self.is_repeated = self.is_carried = self._is_frozen = False
+
+    def is_frozen(self, left: NDArray[np.uint8], expected_shift: Callable[[], float]) -> bool:
+        """Return whether the image (H, W) is the one before for a second time although it was to
+        move by expected_shift(), a share of its width, which is asked for only then.
+        """
+        was_carried = self.is_carried
+        self.is_repeated = self._last is not None and np.array_equal(left, self._last)
+        self._last = left
+        self._is_frozen &= self.is_repeated
+        should_move = self.is_repeated and expected_shift() > MIN_EXPECTED_SHIFT
+        self._is_frozen |= should_move and was_carried
+        self.is_carried = should_move and not self._is_frozen
+        return self._is_frozen

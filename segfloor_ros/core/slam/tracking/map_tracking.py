@@ -1,0 +1,456 @@
+"""Tracking: the pose of a frame from the map points it sees again.
+
+Which map points a camera at a given pose should see, and where; the local map: the part of the map
+that a frame is tracked against, and whether it is enough.
+
+The points of the last frame are followed into an ordinary one. Corners and descriptors are only
+needed where nothing is known of the motion, or where new points are wanted. Between keyframes
+optical flow of some points gives the pose to a pixel, and the patches of a spread selection of map
+points give the rest (Forster et al., SVO: Semidirect Visual Odometry, ICRA 2014). The patches come
+from keyframes: errors do not add up from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from segfloor_ros.core.camera.images import Region
+from segfloor_ros.core.geometry import Array, invert, transform_points
+from segfloor_ros.core.slam.places.views import View, is_keyframe, novelty, view_novelty, views_near
+from segfloor_ros.core.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
+from segfloor_ros.core.slam.rig import (
+    LOCAL_KEYFRAMES,
+    MIN_DEPTH_M,
+    NEIGHBOURS,
+    Observations,
+    in_view,
+)
+from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap
+from segfloor_ros.core.slam.tracking.images import (
+    PYRAMID_LEVELS,
+    PYRAMID_SCALE,
+    SIGMA_FLOW_PX,
+    Features,
+    Images,
+    Matches,
+    follow_pixels,
+    is_inside,
+    match_predicted,
+    match_unguided,
+    spread,
+)
+from segfloor_ros.core.slam.tracking.patch_alignment import (
+    MIN_SIGMA_PIXEL,
+    align_patches,
+    measure_disparity,
+)
+from segfloor_ros.core.slam.tracking.pose import (
+    KNOWN_NOISE,
+    Agreement,
+    Consensus,
+    PoseEstimate,
+    solve_pnp,
+)
+from segfloor_ros.core.timing import timed
+
+SIGMA_PIXEL = 0.6
+"""Standard deviation of a corner's position at the finest pyramid level, px; grows with the
+level.
+"""
+
+NARROW_PX, USUAL_PX, WIDE_PX = 6.0, 15.0, 45.0
+"""Search radius around a predicted pixel, at the finest pyramid level: once a pose is known from
+this very frame; by a prediction; and when that finds too little."""
+
+Pixels = Images | Observations
+"""What the features of a frame are measured in: its images, or where these are gone, as of a saved
+keyframe, what was measured in them."""
+
+MIN_VIEW_COSINE = 0.5
+"""A point is recognised up to 60 degrees from the direction it was last seen from."""
+
+TRACKED_POINTS = 400
+"""Map points, spread over the image, that are measured in a frame between keyframes."""
+
+MAX_FOLLOWED = 250
+
+
+class Tracker:
+    """Finds the pose of frames against the local map."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self.consensus = Consensus(sparse_map)
+        self._map = sparse_map
+
+    def pixel_observations(self, features: Features) -> Observations:
+        """Return the observations of features (N) before any disparity is known."""
+        uvd = np.full((len(features), 3), np.nan)
+        uvd[:, :2] = features.uv_px
+        sigma = np.full((len(features), 3), 1.0)
+        scale = PYRAMID_SCALE ** features.octave.astype(np.float64)
+        sigma[:, :2] = SIGMA_PIXEL * scale[:, None]
+        return Observations(uvd, sigma)
+
+    def track(
+        self,
+        images: Images,
+        features: Features,
+        local_ids: NDArray[np.int32],
+        predictions: Sequence[Array],
+    ) -> Track | None:
+        """Find the pose of a frame near one of the predicted ones, tried in order; its observations
+        have the disparity offset. None when too few points are found again.
+        """
+        if len(features) == 0 or len(local_ids) == 0:
+            return None
+        tree = cKDTree(features.uv_px)
+        observations = self.pixel_observations(features)
+        estimate = self._coarse_pose(features, tree, observations, local_ids, predictions)
+        if estimate is None:
+            return None
+        pose = estimate.T_camera_world
+        return self.track_at(images, features, local_ids, pose)
+
+    @timed
+    def track_at(
+        self,
+        images: Pixels,
+        features: Features,
+        local_ids: NDArray[np.int32],
+        T_camera_world: Array,
+        known: PoseEstimate | None = None,
+        is_given: bool = False,
+    ) -> Track | None:
+        """Find which features show map points, and the pose, which is known to a few pixels; as
+        `track` for the rest. known: the pose by the same images before; or, with is_given,
+        where the camera is, and only its points are looked for.
+        """
+        if len(features) == 0 or len(local_ids) == 0:
+            return None
+        offset_px = self._map.rig.offset.value_px
+        if isinstance(images, Images):
+            observations, excluded = self.pixel_observations(features), images.excluded
+        else:
+            observations, excluded = images, None
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
+        tree = cKDTree(features.uv_px)
+        points, rows = self._search(features, tree, seen, NARROW_PX)
+        if len(rows) < (ENOUGH if known is None else 1):
+            return None
+        ids = seen.ids[points]
+        if isinstance(images, Images):
+            align_pixels(images.left, observations, rows, self._map, ids, T_camera_world)
+            guess_px = seen.uvd_px[points, 2] + offset_px
+            measure_disparity(images, observations, rows, guess_px)
+        measured = observations.take(rows).without_offset(offset_px)
+        found = None
+        if not is_given:
+            found = self.consensus.refine(T_camera_world, ids, measured, known=known)
+        if found is None or not found.is_believable():
+            if known is None:
+                return None
+            found = self.consensus.at(known, ids, measured)
+        estimate = found.estimate
+        rows, ids = rows[estimate.inliers], ids[estimate.inliers]
+        point_id = np.full(len(features), NO_POINT, np.int32)
+        point_id[rows] = ids
+        return Track(
+            estimate,
+            ids,
+            observations.take(rows),
+            seen.ids,
+            ObservedFeatures(
+                features, observations.with_noise_factor(estimate.noise_factor), point_id
+            ),
+        )
+
+    def _coarse_pose(
+        self,
+        features: Features,
+        tree: cKDTree,
+        observations: Observations,
+        local_ids: NDArray[np.int32],
+        predictions: Sequence[Array],
+    ) -> PoseEstimate | None:
+        """Search around the predictions, then wider around the first, then without any."""
+        attempts = [(T, USUAL_PX) for T in predictions] + [(T, WIDE_PX) for T in predictions[:1]]
+        for T_predicted, radius_px in attempts:
+            seen = predict_points(self._map, local_ids, T_predicted)
+            points, rows = self._search(features, tree, seen, radius_px)
+            estimate = self._believable(observations, seen.ids[points], rows, T_predicted)
+            if estimate is not None:
+                return estimate
+        return self.locate(features, tree, observations, local_ids)
+
+    def locate(
+        self, features: Features, tree: cKDTree, observations: Observations, ids: NDArray[np.int32]
+    ) -> PoseEstimate | None:
+        """Find the pose among map points without a prediction: descriptors alone and PnP-RANSAC for
+        a first guess, which then has to find more points where they should be.
+        """
+        points, rows = match_unguided(self._map.descriptor[ids], features.descriptor)
+        found = solve_pnp(
+            self._map.rig.camera, self._map.xyz_world[ids[points]], features.uv_px[rows]
+        )
+        if found is None or found[1].sum() < ENOUGH // 2:
+            return None
+        seen = predict_points(self._map, ids, found[0])
+        points, rows = self._search(features, tree, seen, USUAL_PX)
+        return self._believable(observations, seen.ids[points], rows, found[0])
+
+    def _believable(
+        self,
+        observations: Observations,
+        ids: NDArray[np.int32],
+        rows: NDArray[np.intp],
+        T_start: Array,
+    ) -> PoseEstimate | None:
+        """Refine a pose; None unless enough matches agree with it, and not as a small minority."""
+        if len(rows) < ENOUGH:
+            return None
+        found = self.consensus.refine(T_start, ids, observations.take(rows), KNOWN_NOISE)
+        return found.estimate if found.is_believable() else None
+
+    def _search(
+        self, features: Features, tree: cKDTree, seen: Prediction, radius_px: float
+    ) -> Matches:
+        scale = PYRAMID_SCALE ** np.clip(seen.octave, 0, None)
+        return match_predicted(
+            features,
+            tree,
+            seen.uvd_px[:, :2],
+            seen.octave,
+            self._map.descriptor[seen.ids],
+            radius_px * scale,
+        )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Map points expected in the image: ids (N,), pixel and disparity (N, 3), pyramid level
+    (N,).
+    """
+
+    ids: NDArray[np.int32]
+    uvd_px: Array
+    octave: Array
+
+    def take(self, rows: NDArray[np.intp]) -> Prediction:
+        """Return the chosen rows."""
+        return Prediction(self.ids[rows], self.uvd_px[rows], self.octave[rows])
+
+
+def predict_points(
+    sparse_map: SparseMap,
+    ids: NDArray[np.int32],
+    T_camera_world: Array,
+    excluded: Region | None = None,
+) -> Prediction:
+    """Project points (N,) into the image and keep those that a camera there should recognise:
+    inside the image, from about the known direction, at a size the pyramid has, and not in a region
+    that is excluded.
+    """
+    camera = sparse_map.rig.camera
+    points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
+    uvd, visible = in_view(camera, points)
+    visible[visible] = ~is_inside(excluded, uvd[visible, :2])
+    ids, points, uvd = ids[visible], points[visible], uvd[visible]
+    distance = np.sqrt((points**2).sum(axis=1))
+    direction = points @ T_camera_world[:3, :3] / distance[:, None]
+    cosine = (direction * sparse_map.viewing_direction[ids]).sum(axis=1)
+    zoom = np.log(sparse_map.viewing_distance_m[ids] / distance)
+    octave = sparse_map.viewing_octave[ids] + zoom / np.log(PYRAMID_SCALE)
+    alike = (cosine > MIN_VIEW_COSINE) & (octave > -1.5) & (octave < PYRAMID_LEVELS + 0.5)
+    return Prediction(ids[alike], uvd[alike], octave[alike])
+
+
+class LocalMap:
+    """Chooses points around a view (Mur-Artal et al., ORB-SLAM, 2015, section V-D). max_frames:
+    after which a keyframe is due.
+    """
+
+    def __init__(self, sparse_map: SparseMap, max_frames: int) -> None:
+        self.point_ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._max_frames = max_frames
+        self._map = sparse_map
+        self._depth_m = MIN_DEPTH_M
+        self._asked: tuple[NDArray[np.int32], Covisible] | None = None
+
+    @timed
+    def move_to(self, ids: NDArray[np.int32], T_camera_world: Array) -> None:
+        """Take the points around a camera that sees points `ids` (N,)."""
+        self.point_ids = self.points_around(ids, T_camera_world)
+
+    def points_around(self, ids: NDArray[np.int32], T_camera_world: Array) -> NDArray[np.int32]:
+        """Return the points of keyframes that share points `ids` (N,) with a view, or stand where
+        it is.
+        """
+        order, _ = self._covisible(ids)
+        depth_m = self._median_depth(ids, T_camera_world)
+        here = views_near(self._map, T_camera_world, depth_m, LOCAL_KEYFRAMES)
+        local = self._map.points_of(np.append(order[:NEIGHBOURS], here))
+        # The oldest first: of two points that fit a feature equally well it is the one to keep.
+        return local[np.argsort(self._map.stable_id[local])]
+
+    def drop_dead(self) -> None:
+        """Forget points that are not part of the map any more."""
+        self.point_ids = self.point_ids[self._map.alive[self.point_ids]]
+
+    @timed
+    def wants_keyframe(
+        self, track: Track, frames_since: int, since_ns: int, mapper_idle: bool
+    ) -> bool:
+        """Whether a frame shows enough that is new. frames_since, since_ns: since the last one."""
+        covisible = self._covisible(track.point_ids)
+        reference = self._map.keyframes[covisible[0][0]]
+        known = reference.point_id[reference.point_id != NO_POINT]
+        reliable = known[self._map.observer_count[known] > 1]
+        depth_m = self._median_depth(reliable if len(reliable) else known, track.T_camera_world)
+        novelty = view_novelty(self._map, track.point_ids, track.T_camera_world, depth_m, covisible)
+        num_reliable = min(len(reliable), TRACKED_POINTS)
+        found = len(track.point_ids)
+        share = found / max(1, len(track.visible_ids))
+        view = View(frames_since, found, num_reliable, novelty, mapper_idle, share, since_ns)
+        return is_keyframe(view, self._max_frames)
+
+    def is_new_view(self, T_camera_world: Array) -> bool:
+        """Whether a camera that sees no point has come to where the last keyframe was not."""
+        T_last_now = self._map.keyframes[-1].T_camera_world @ invert(T_camera_world)
+        return bool(novelty(T_last_now, self._depth_m) > 1)
+
+    def _covisible(self, ids: NDArray[np.int32]) -> Covisible:
+        """Return what `covisible` of the map does, once for the points of a frame."""
+        if self._asked is None or self._asked[0] is not ids:
+            self._asked = ids, self._map.covisible(ids)
+        return self._asked[1]
+
+    def _median_depth(self, ids: NDArray[np.int32], T_camera_world: Array) -> float:
+        """Return the depth of points `ids` (N,); without any, that of those seen last."""
+        if len(ids):
+            depth = transform_points(T_camera_world, self._map.xyz_world[ids])[:, 2]
+            self._depth_m = max(float(np.median(depth)), MIN_DEPTH_M)
+        return self._depth_m
+
+
+@timed
+def align_pixels(
+    left: NDArray[np.float32],
+    observations: Observations,
+    rows: NDArray[np.intp],
+    sparse_map: SparseMap,
+    ids: NDArray[np.int32],
+    T_camera_world: Array,
+) -> NDArray[np.bool_]:
+    """Move observations, in place, from where they are to where the patches of their points lie.
+
+    left: (H, W) float32. rows, ids: (N,) the observations and their points. T_camera_world: the
+    pose as known so far. Returns which patches were found (N,); the others stay as they were.
+    """
+    points = transform_points(T_camera_world, sparse_map.xyz_world[ids])
+    zoom = sparse_map.patch_distance_m[ids] / np.linalg.norm(points, axis=1)
+    template = sparse_map.patch[ids].astype(np.float32)
+    found = align_patches(template, left, observations.uvd_px[rows, :2], zoom)
+    sound = rows[found.sound]
+    observations.uvd_px[sound, :2] = found.uv_px[found.sound]
+    observations.sigma_px[sound, :2] = np.clip(found.sigma_px[found.sound], MIN_SIGMA_PIXEL, None)
+    return found.sound
+
+
+class Follower:
+    """Finds the pose of a frame from the one before."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._map = sparse_map
+        self._camera = sparse_map.rig.camera
+        self._consensus = Consensus(sparse_map)
+        self.reset()
+
+    def reset(self) -> None:
+        """Know no frame before."""
+        self._small: NDArray[np.uint8] | None = None
+        self._ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._uv_px: Array = np.zeros((0, 2))
+
+    def see(self, images: Images, ids: NDArray[np.int32], uv_px: Array) -> None:
+        """Take in a frame that shows map points `ids` (N,) at pixels (N, 2)."""
+        self._small, self._ids, self._uv_px = images.small, ids, uv_px
+
+    @property
+    def seen_ids(self) -> NDArray[np.int32]:
+        """The points (N,) of the last frame."""
+        return self._ids
+
+    def drop_inside(self, region: Region) -> None:
+        """Forget the points that the last frame shows in a region."""
+        outside = ~is_inside(region, self._uv_px)
+        self._ids, self._uv_px = self._ids[outside], self._uv_px[outside]
+
+    def drop_dead(self) -> None:
+        """Forget points that are not part of the map any more."""
+        alive = self._map.alive[self._ids]
+        self._ids, self._uv_px = self._ids[alive], self._uv_px[alive]
+
+    def follow(
+        self, images: Images, local_ids: NDArray[np.int32], T_predicted: Array
+    ) -> Track | None:
+        """Find the pose of a frame; None where too little of the last one is found again."""
+        offset_px = self._map.rig.offset.value_px
+        roughly = self._by_flow(images, T_predicted)
+        if roughly is None:
+            return None
+        pose = roughly.estimate.T_camera_world
+        seen = self._select(local_ids, pose, images.excluded)
+        observations = Observations(seen.uvd_px.copy(), np.ones((len(seen.ids), 3)))
+        rows = np.arange(len(seen.ids))
+        rows = rows[align_pixels(images.left, observations, rows, self._map, seen.ids, pose)]
+        measure_disparity(images, observations, rows, seen.uvd_px[rows, 2] + offset_px)
+        if len(rows) < ENOUGH:
+            return None
+        ids = seen.ids[rows]
+        measured = observations.take(rows)
+        found = self._consensus.refine(pose, ids, measured.without_offset(offset_px))
+        if not found.is_believable(len(seen.ids)):
+            return None
+        estimate = found.estimate
+        return Track(estimate, ids[estimate.inliers], measured.take(estimate.inliers), seen.ids)
+
+    @timed
+    def _by_flow(self, images: Images, T_predicted: Array) -> Agreement | None:
+        """Find the pose to about a pixel from where the last frame's points went."""
+        if self._small is None or len(self._ids) < ENOUGH:
+            return None
+        step = -(-len(self._ids) // MAX_FOLLOWED)
+        ids, uv_last = self._ids[::step], self._uv_px[::step]
+        points = transform_points(T_predicted, self._map.xyz_world[ids])
+        front = points[:, 2] > MIN_DEPTH_M
+        ids, uv_last, points = ids[front], uv_last[front], points[front]
+        if len(ids) < ENOUGH:
+            return None
+        guess = self._camera.project(points)[:, :2]
+        width = self._camera.width
+        uv, found = follow_pixels(self._small, images.small, width, uv_last, guess)
+        found &= ~is_inside(images.excluded, uv)
+        if found.sum() < ENOUGH:
+            return None
+        uvd = np.column_stack([uv[found], np.full(int(found.sum()), np.nan)])
+        observations = Observations(uvd, np.full(uvd.shape, SIGMA_FLOW_PX))
+        agreement = self._consensus.refine(T_predicted, ids[found], observations)
+        return agreement if agreement.is_believable(len(ids)) else None
+
+    @timed
+    def _select(
+        self, local_ids: NDArray[np.int32], T_camera_world: Array, excluded: Region | None
+    ) -> Prediction:
+        """Return points that should be seen, spread over the image, the often found first."""
+        seen = predict_points(self._map, local_ids, T_camera_world, excluded)
+        if len(seen.ids) <= TRACKED_POINTS:
+            return seen
+        area = self._camera.width * self._camera.height
+        cell_px = max(1, int(np.sqrt(area / TRACKED_POINTS)))
+        reliability = self._map.points.reliability(seen.ids).astype(np.float32)
+        return seen.take(spread(seen.uvd_px[:, :2], reliability, cell_px, TRACKED_POINTS))

@@ -1,0 +1,382 @@
+"""The motion of the camera: where it is, where it will be next, and the continuous frame `odom`.
+
+How far the camera turned since the last image, from the images alone: on a thumbnail a rotation
+looks like a shift. It is found without features by phase correlation, so that tracking survives a
+turn that its motion model did not foresee (the "small blurry image" of Klein and Murray, Improving
+the Agility of Keyframe-Based SLAM, 2008).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.geometry import (
+    Array,
+    adjoint,
+    invert,
+    is_within,
+    make_transform,
+    rotation_angle,
+    rotation_from_angles,
+    se3_exp,
+    se3_log,
+    without_drift,
+)
+from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion, RelativeMotion
+from segfloor_ros.core.plugins.sensors.inertial_odometry import SPEED_SIGMA
+from segfloor_ros.core.slam.results import SAME, LastPose
+from segfloor_ros.core.slam.rig import is_gated
+from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+
+MAX_TURN_RADPS = 6.0
+"""A robot does not spin faster than once a second."""
+
+MIN_STEP_S = 1e-3
+
+MIN_RESPONSE = 0.05
+"""Of the phase correlation of two images that have something in common."""
+
+ACCELERATION = 2.0
+"""Of a robot on wheels, m/s² and rad/s²."""
+
+
+class TrackingState(Enum):
+    """How the latest pose is known; the words are those of the state of a frame."""
+
+    TRACKING = 'tracking'
+    ON_WHEELS = 'on wheels'
+    ON_IMU = 'on IMU'
+    ON_GYROSCOPE = 'on gyroscope'
+    RESUMING = 'resuming a drive that was broken off'
+    HELD = 'held where the drive was broken off'
+    LOST_NEAR = 'lost near the last pose'
+    LOST = 'lost'
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether there is no pose."""
+        return self in (TrackingState.LOST_NEAR, TrackingState.LOST)
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether there is a pose that no image shows."""
+        seen = self in (TrackingState.TRACKING, TrackingState.RESUMING)
+        return not (seen or self.is_lost)
+
+    @property
+    def is_resuming(self) -> bool:
+        """Whether the drive was broken off, and nothing has measured the pose since."""
+        return self in (TrackingState.RESUMING, TrackingState.HELD)
+
+
+class CameraMotion:
+    """Measured by wheels and gyroscope, or else taken for constant velocity between frames
+    (Mur-Artal et al., ORB-SLAM, 2015, section V-B).
+
+    T_camera_world: the latest pose (4, 4). covariance: (6, 6) of its twist. T_world_odom: the
+    correction of the odometry; both frames are the camera's first pose. state: of the latest frame;
+    while it is lost, `T_camera_world` turns on as a gyroscope measures.
+    """
+
+    def __init__(self, max_speed_mps: float, body: BodyMotion) -> None:
+        self._body = body
+        self._max_speed_mps = max_speed_mps
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at the origin."""
+        self.T_camera_world: Array = np.eye(4)
+        self.covariance: Array = np.zeros((6, 6))
+        self.T_world_odom: Array = np.eye(4)
+        self.state = TrackingState.TRACKING
+        self._velocity: Array = np.zeros(6)
+        self._last_stamp_ns = 0
+        self._heading_sigma_rad: float | None = None
+        self.since_keyframe = KeyframeMotion(self.T_camera_world, self.covariance)
+        self._latest: tuple[tuple[int, int], RelativeMotion | None] | None = None
+        self._broken_off: tuple[LastPose, float] | None = None
+
+    @property
+    def T_odom_camera(self) -> Array:
+        """The camera in the continuous frame."""
+        return invert(self.T_world_odom) @ invert(self.T_camera_world)
+
+    def prior(self, stamp_ns: int) -> PoseEstimate | None:
+        """Return where wheels have the camera by its motion since the last keyframe; None where
+        they did not measure all of it. The same points of several frames err together: they
+        count once.
+        """
+        measured = self.measured(stamp_ns)
+        pose = self.since_keyframe.moved(measured) if measured and measured.by_wheels else None
+        return None if pose is None else PoseEstimate(pose[0], np.zeros(0, bool), pose[1], 1.0)
+
+    def predict(self, stamp_ns: int) -> Array:
+        """Return where the camera will be, T_camera_world (4, 4)."""
+        measured = self.measured_pose(stamp_ns)
+        return self.steady(stamp_ns) if measured is None else measured
+
+    def measured_pose(self, stamp_ns: int) -> Array | None:
+        """Return where the sensors have the camera, T_camera_world (4, 4)."""
+        if self.state.is_lost:
+            turned = self._turned(stamp_ns)
+            return None if turned is None else turned[0]
+        measured = self.measured(stamp_ns)
+        return None if measured is None else measured.T_now_before @ self.T_camera_world
+
+    def steady(self, stamp_ns: int) -> Array:
+        """Return where the camera will be if it moves on as it did, T_camera_world (4, 4)."""
+        return (
+            se3_exp(self._velocity * _step_s(self._last_stamp_ns, stamp_ns)) @ self.T_camera_world
+        )
+
+    def expected(self, stamp_ns: int) -> PoseEstimate:
+        """Return where the camera will be if its motion goes on, as far as that of a robot does."""
+        sigma = 0.5 * _step_s(self._last_stamp_ns, stamp_ns) ** 2 * ACCELERATION
+        covariance = self.covariance + np.diag(np.repeat(sigma**2, 6))
+        return PoseEstimate(self.predict(stamp_ns), np.zeros(0, bool), covariance, 1.0)
+
+    def is_plausible(self, T_camera_world: Array, stamp_ns: int) -> bool:
+        """Whether a robot can have come to a pose since the last frame."""
+        motion = T_camera_world @ invert(self.T_camera_world)
+        step_s = _step_s(self._last_stamp_ns, stamp_ns)
+        return is_within(motion, (self._max_speed_mps * step_s, MAX_TURN_RADPS * step_s))
+
+    def is_consistent(self, T_camera_world: Array, covariance: Array, stamp_ns: int) -> bool:
+        """Whether a pose that the images show, with its covariance (6, 6), fits what the sensors
+        measure.
+        """
+        measured = self.measured(stamp_ns)
+        prior = self._predicted(measured)
+        if measured is None or prior is None:
+            return True
+        error, P = se3_log(T_camera_world @ invert(prior[0])), prior[1] + covariance
+        if not measured.by_wheels:
+            P[:3, :3] += (SPEED_SIGMA * _step_s(self._last_stamp_ns, stamp_ns)) ** 2 * np.eye(3)
+        return is_gated(error, P)
+
+    def is_heading_possible(self, T_camera_world: Array, stamp_ns: int) -> bool:
+        """Whether a camera that was lost may have turned to a pose since."""
+        turned = self._turned(stamp_ns)
+        if turned is None or self._heading_sigma_rad is None:
+            return True
+        off_rad = rotation_angle(T_camera_world[:3, :3] @ turned[0][:3, :3].T)
+        return off_rad < SAME[1] + 3 * (self._heading_sigma_rad + turned[1])
+
+    def last_pose(self) -> LastPose:
+        """Return what a drive that is broken off here goes on from."""
+        return LastPose(
+            self._last_stamp_ns,
+            self.T_camera_world,
+            self.T_world_odom,
+            self.covariance,
+            self._velocity,
+            tuple(self._body.latest_wheels),
+        )
+
+    def resume(self, last: LastPose, sigma_per_s: float) -> None:
+        """Go on where a drive was broken off. sigma_per_s: by how many metres and radians a pose
+        that is held becomes less certain per second.
+        """
+        self.lose()
+        self.state = TrackingState.RESUMING
+        self.T_camera_world, self.T_world_odom = last.T_camera_world, last.T_world_odom
+        self.covariance, self._velocity = last.covariance, last.velocity
+        self._last_stamp_ns = last.stamp_ns
+        self._broken_off = last, sigma_per_s
+        for pose in last.wheels:
+            self._body.add(pose)
+
+    def take(
+        self, T_camera_world: Array, covariance: Array, stamp_ns: int, T_seen: Array | None = None
+    ) -> None:
+        """Go on from the pose of a frame, found in its images. T_seen: (4, 4), as the images alone
+        have it: the sensors learn from that. After a blind stretch `odom` goes on where the sensors
+        had the camera: the error of the stretch is a correction of `odom`.
+        """
+        measured = self.measured(stamp_ns)
+        predicted = self._predicted(measured)
+        if self.state.is_blind and predicted is not None:
+            T_odom_camera = invert(predicted[0] @ self.T_world_odom)
+            self.T_world_odom = without_drift(invert(T_camera_world) @ invert(T_odom_camera))
+        motion = se3_log(T_camera_world @ invert(self.T_camera_world))
+        steady = not (self.state.is_lost or self.state.is_blind)
+        self._velocity = motion / _step_s(self._last_stamp_ns, stamp_ns) if steady else np.zeros(6)
+        self.since_keyframe.add(measured)
+        self.T_camera_world, self.covariance = T_camera_world, covariance
+        self._last_stamp_ns = stamp_ns
+        self.state = TrackingState.TRACKING
+        T_seen = T_camera_world if T_seen is None else T_seen
+        T_odom_seen = invert(self.T_world_odom) @ invert(T_seen)
+        self._body.learn(stamp_ns, T_odom_seen, self.T_world_odom[:3, :3])
+
+    def bridge(self, stamp_ns: int) -> bool:
+        """Go on without the images to where the sensors have the camera. Returns whether they
+        measure it.
+        """
+        measured = self.measured(stamp_ns)
+        predicted = self._predicted(measured)
+        if measured is None or predicted is None:
+            return False
+        if measured.source == 'nothing':
+            self.covariance, self.state = predicted[1], TrackingState.HELD
+            return True
+        if not measured.by_wheels and sigma_m(predicted[1]) > SAME[0]:
+            return False
+        self.since_keyframe.add(measured)
+        self.T_camera_world, self.covariance = without_drift(predicted[0]), predicted[1]
+        self._last_stamp_ns = stamp_ns
+        self.state = TrackingState(f'on {measured.source}')
+        R_world_odom = self.T_world_odom[:3, :3]
+        self._body.carry(stamp_ns, self.T_odom_camera, R_world_odom, measured.by_wheels)
+        return True
+
+    def lose(self, stamp_ns: int | None = None) -> None:
+        """Note that a frame has no pose: the camera is near the last one, unless it was lost.
+        Without a stamp: nothing is known of where it is.
+        """
+        before, turned, sigma_rad = self.state, None, self._heading_sigma_rad
+        if stamp_ns is not None:
+            turned = self._turned(stamp_ns)
+            sigma_rad = sigma_rad if before.is_lost else 0.0
+        is_near = stamp_ns is not None and before is not TrackingState.LOST
+        self.state = TrackingState.LOST_NEAR if is_near else TrackingState.LOST
+        self._velocity = np.zeros(6)
+        self._heading_sigma_rad = self._latest = self.since_keyframe.motion = None
+        self._body.reset()
+        if stamp_ns is not None and turned is not None and sigma_rad is not None:
+            self.T_camera_world = without_drift(turned[0])
+            self._last_stamp_ns = stamp_ns
+            self._heading_sigma_rad = sigma_rad + turned[1]
+
+    def move_map(self, T_reference_before: Array, T_reference_after: Array) -> None:
+        """Move the camera along with a keyframe (T_camera_world, (4, 4)) that the map has moved;
+        `odom` stays where the camera sees it.
+        """
+        T_odom_camera = self.T_odom_camera
+        T_keyframe = self.since_keyframe.T_camera_world @ invert(T_reference_before)
+        self.since_keyframe.T_camera_world = without_drift(T_keyframe @ T_reference_after)
+        T_camera_reference = self.T_camera_world @ invert(T_reference_before)
+        self.T_camera_world = without_drift(T_camera_reference @ T_reference_after)
+        self.T_world_odom = without_drift(invert(self.T_camera_world) @ invert(T_odom_camera))
+
+    def measured(self, stamp_ns: int) -> RelativeMotion | None:
+        """Return the motion since the last pose, by wheels or by an IMU alone, or none where the
+        pose is held; asked for often.
+        """
+        stretch = self._last_stamp_ns, stamp_ns
+        if self._latest is None or self._latest[0] != stretch:
+            measured = self._body.between(*stretch)
+            if measured is None:
+                R_world_odom = self.T_world_odom[:3, :3]
+                measured = self._body.by_inertia(*stretch, self.T_odom_camera, R_world_odom)
+            if measured is None and self._broken_off and self.state.is_resuming:
+                sigma = self._broken_off[1] * _step_s(self._last_stamp_ns, stamp_ns)
+                measured = RelativeMotion(np.eye(4), sigma**2 * np.eye(6), 'nothing')
+            self._latest = stretch, measured
+        return self._latest[1]
+
+    def _turned(self, stamp_ns: int) -> tuple[Array, float] | None:
+        """Return the camera at its last place, turned on as a gyroscope measures, (4, 4), and the
+        standard deviation of the turn in radians.
+        """
+        turn = self._body.turn(self._last_stamp_ns, stamp_ns)
+        if turn is None:
+            return None
+        return make_transform(turn[0], np.zeros(3)) @ self.T_camera_world, turn[1]
+
+    def _predicted(self, measured: RelativeMotion | None) -> tuple[Array, Array] | None:
+        """Return where the sensors have the camera after a motion (4, 4), and the covariance."""
+        if measured is None or self.state.is_lost:
+            return None
+        covariance = self.covariance
+        if self._broken_off is not None and self.state.is_resuming:
+            covariance = self._broken_off[0].covariance
+        return _moved((self.T_camera_world, covariance), measured)
+
+
+class KeyframeMotion:
+    """The motion since the last keyframe as sensors measure it, None where they did not.
+
+    T_camera_world, covariance: (4, 4) and (6, 6), of the keyframe.
+    """
+
+    def __init__(self, T_camera_world: Array, covariance: Array) -> None:
+        self.T_camera_world, self.covariance = T_camera_world, covariance
+        self.motion: RelativeMotion | None = None
+
+    def start(self, T_camera_world: Array, covariance: Array) -> RelativeMotion | None:
+        """Begin at a keyframe; returns the motion before it, if wheels measured it."""
+        before, self.motion = self.motion, RelativeMotion.none()
+        self.T_camera_world, self.covariance = T_camera_world, covariance
+        return before if before is not None and before.by_wheels else None
+
+    def add(self, measured: RelativeMotion | None) -> None:
+        """Add the motion of a frame."""
+        self.motion = self.motion.then(measured) if self.motion and measured else None
+
+    def moved(self, measured: RelativeMotion) -> tuple[Array, Array] | None:
+        """Return the pose after the motion by wheels so far and one of a frame, with covariance."""
+        if self.motion is None or not self.motion.by_wheels:
+            return None
+        return _moved((self.T_camera_world, self.covariance), self.motion.then(measured))
+
+
+def _moved(before: tuple[Array, Array], motion: RelativeMotion) -> tuple[Array, Array]:
+    """Return a pose (4, 4) and its covariance (6, 6) after a motion."""
+    A = adjoint(motion.T_now_before)
+    return motion.T_now_before @ before[0], A @ before[1] @ A.T + motion.covariance
+
+
+def _step_s(before_ns: int, now_ns: int) -> float:
+    return max((now_ns - before_ns) * 1e-9, MIN_STEP_S)
+
+
+def sigma_m(covariance: Array) -> float:
+    """Return the standard deviation of the place of a pose with a covariance (6, 6)."""
+    return float(np.sqrt(np.diag(covariance)[:3].max()))
+
+
+class ImageRotation:
+    """Compares each image with the one before."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        scale = SMALL_WIDTH_PX / 4 / camera.width
+        height = max(8, round(camera.height * scale))
+        self._size = (SMALL_WIDTH_PX // 4, height)
+        self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
+        self._focal = (camera.fx * scale, camera.fy * height / camera.height)
+        self._last: NDArray[np.uint8] | None = None
+        self._now: NDArray[np.uint8] | None = None
+
+    def see(self, image: NDArray[np.uint8]) -> None:
+        """Take in the next image (H, W), shrunk as optical flow takes it."""
+        self._last, self._now = self._now, image
+
+    def turn_since_last(self) -> Array:
+        """Return T_now_last (4, 4) between the last two images, a rotation about the camera's
+        centre.
+
+        The identity where there was no image before, or where the two have too little in common.
+        """
+        if self._last is None or self._now is None:
+            return np.eye(4)
+        last, now = (
+            cv2.GaussianBlur(
+                cv2.resize(image, self._size, interpolation=cv2.INTER_AREA).astype(np.float32),
+                (0, 0),
+                0.75,
+            )
+            for image in (self._last, self._now)
+        )
+        (du, dv), response = cv2.phaseCorrelate(last, now, self._window)
+        if response < MIN_RESPONSE:
+            return np.eye(4)
+        # A scene point that moves right by du lies further to the right now: it turned about +y.
+        turned_down, turned_left = np.arctan2((-dv, du), self._focal[::-1])
+        return make_transform(rotation_from_angles(0.0, turned_left, turned_down), np.zeros(3))

@@ -1,0 +1,447 @@
+"""The pose of one stereo frame against known map points: PnP-RANSAC, robust refinement, how well
+the points determine it, and the consensus of those that stand still.
+
+Most points agreeing is no proof: someone who walks by shows more of them than a plain wall behind.
+So two motions are compared, that of the majority and that of the points which have a record of
+standing still. They are distinguished, not averaged, where they contradict each other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.geometry import (
+    Array,
+    invert,
+    make_transform,
+    se3_exp,
+    se3_log,
+    transform_points,
+)
+from segfloor_ros.core.slam.results import ENOUGH, MAJORITY, PROOF, UNKNOWN_COVARIANCE
+from segfloor_ros.core.slam.rig import (
+    MIN_DEPTH_M,
+    SAME_PX,
+    SMALLEST,
+    Observations,
+    huber_cost,
+    huber_weights,
+    is_gated,
+    residuals,
+    squared_norms,
+)
+from segfloor_ros.core.slam.sparse_map import SparseMap
+from segfloor_ros.core.timing import timed
+
+ROUNDS, STEPS_PER_ROUND = 3, 6
+"""Of an estimate; outliers are looked for anew in each round."""
+
+CONVERGED = 1e-4
+"""Relative decrease of the cost, expected or seen, that ends a round."""
+
+SAME_INLIERS = 0.01
+"""Share of the points that changes sides below which another round would change nothing."""
+
+MAX_NOISE_FACTOR = 4.0
+RANSAC_ITERATIONS = 600
+"""Where a quarter of the matches are right, nine times in ten four right ones are drawn in so many;
+it ends early when more are right."""
+
+FIRST_INFORMATION = np.array([1.0] * 3 + [0.1] * 3) ** -2
+"""Of a pose before any point is seen, in metres and radians: where no point determines it."""
+
+FLOOR_M = 0.05
+"""What is no higher belongs to the floor, which stands still whenever it was first seen, and whose
+disparities repeat and mirror."""
+
+USUAL_SHARE, USUAL_NOISE = 0.8, 1.2
+"""Where at least this share of what has a record fits, at no more than this noise, all is well."""
+
+MIN_FOUND = 0.15
+"""Share of the points that should be in view that must be found and agree: far points alone fit
+many places."""
+
+KNOWN_NOISE = 2.0
+"""Corners of an image are worse by no more than this factor than patches of the same image."""
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A refined pose.
+
+    T_camera_world: (4, 4). inliers: (N,) bool over the observations. covariance: (6, 6) of the
+    twist in T_camera_world <- exp(twist) T_camera_world, order translation (m), rotation (rad).
+    """
+
+    T_camera_world: Array
+    inliers: NDArray[np.bool_]
+    covariance: Array
+    noise_factor: float
+
+
+def solve_pnp(
+    camera: StereoCamera, points_world: Array, uv_px: NDArray[np.floating]
+) -> tuple[Array, NDArray[np.bool_]] | None:
+    """Find T_camera_world from points (N, 3) and pixels (N, 2) by PnP in RANSAC, or None.
+
+    Fischler and Bolles, Random sample consensus (1981), on OpenCV's AP3P (Ke and Roumeliotis,
+    CVPR 2017), which draws four points; its generator is seeded, so that the same input gives the
+    same pose. Also returns the inliers (N,).
+    """
+    if len(points_world) < 6:
+        return None
+    found, rotation_vector, translation, rows = cv2.solvePnPRansac(
+        np.ascontiguousarray(points_world, np.float64),
+        np.ascontiguousarray(uv_px, np.float64),
+        camera.K,
+        None,
+        iterationsCount=RANSAC_ITERATIONS,
+        reprojectionError=SAME_PX,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or rows is None:
+        return None
+    inliers = np.zeros(len(points_world), bool)
+    inliers[np.asarray(rows).ravel()] = True
+    R = np.asarray(cv2.Rodrigues(rotation_vector)[0])
+    return make_transform(R, np.asarray(translation, np.float64).ravel()), inliers
+
+
+def refine_pose(
+    camera: StereoCamera,
+    T_camera_world: Array,
+    points_world: Array,
+    observations: Observations,
+    max_noise_factor: float = MAX_NOISE_FACTOR,
+    prior: PoseEstimate | None = None,
+) -> PoseEstimate:
+    """Refine a pose by Levenberg-Marquardt on (u, v, d) with a Huber cost, dropping outliers
+    between rounds.
+
+    points_world: (N, 3). Points that fall behind the camera count as outliers. Blur, compression
+    and a poor calibration make errors larger than the sigmas of single measurements; the median
+    residual shows by how much, and the bound on outliers follows it. prior: the pose by other
+    sensors; it adds what the points do not determine.
+    """
+    seen = _Seen.of(camera, points_world, observations)
+    inliers = np.ones(len(points_world), bool)
+    if prior is not None and not len(points_world):
+        return replace(prior, inliers=inliers)
+    known = _Prior() if prior is None else _Prior.of(prior)
+    pose, factor = T_camera_world, 1.0
+    for _ in range(ROUNDS):
+        pose = _minimise(pose, seen.take(inliers), known)
+        rays, _, chi2 = seen.at(pose)
+        chi2[rays[2] >= 1 / MIN_DEPTH_M] = np.inf
+        middle = float(np.median(chi2 / seen.median))
+        factor = math.sqrt(min(max(middle, 1.0), max_noise_factor**2))
+        before, inliers = inliers, chi2 <= factor**2 * seen.limit
+        is_enough = prior is not None or inliers.sum() >= 4
+        if not is_enough or (inliers != before).mean() < SAME_INLIERS:
+            break
+    if not is_enough:
+        return PoseEstimate(pose, inliers, np.eye(6) * UNKNOWN_COVARIANCE, factor)
+    # Huber's weight of an inlier is 1.
+    J = seen.take(inliers).jacobian(rays[:, inliers], 1 / factor)
+    covariance = np.linalg.pinv(J @ J.T + known.information, hermitian=True)
+    return PoseEstimate(pose, inliers, covariance, factor)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """What is known of a pose before any point is seen, nothing by default. T_world_camera:
+    (4, 4). information: (6, 6) of the twist.
+    """
+
+    T_world_camera: Array | None = None
+    information: Array | float = 0.0
+
+    @staticmethod
+    def of(estimate: PoseEstimate) -> _Prior:
+        """Return what another estimate tells."""
+        return _Prior(invert(estimate.T_camera_world), np.linalg.inv(estimate.covariance))
+
+    def at(self, T_camera_world: Array) -> tuple[Array | float, float]:
+        """Return the gradient (6,) of half the squared error of a pose, and that squared error."""
+        if self.T_world_camera is None:
+            return 0.0, 0.0
+        error = se3_log(T_camera_world @ self.T_world_camera)
+        gradient = self.information @ error
+        return gradient, float(error @ gradient)
+
+
+def squared_distances(
+    camera: StereoCamera, pose: Array, points_world: Array, observations: Observations
+) -> Array:
+    """Return the squared, normalised residuals (N,) of observations of points (N, 3) at a pose;
+    infinite for points behind the camera.
+    """
+    points = transform_points(pose, points_world)
+    front = points[:, 2] > MIN_DEPTH_M
+    points[~front] = (0.0, 0.0, 1.0)
+    chi2 = squared_norms(residuals(camera, points, observations), observations.information)
+    return np.where(front, chi2, np.inf)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Points and their observations, one long row (N,) for each coordinate, in few arrays: NumPy
+    takes as long to begin as to compute hundreds of numbers.
+
+    rows: (11, N), points of the world, focal lengths and disparity times depth, what was measured
+    from the principal point, both in standard deviations, 0 where nothing is measured; limit and
+    median of chi2.
+    """
+
+    rows: Array
+
+    @staticmethod
+    def of(camera: StereoCamera, points_world: Array, observations: Observations) -> _Seen:
+        """Return them, for points (N, 3)."""
+        rows = np.empty((11, len(points_world)))
+        rows[:3] = points_world.T
+        measured = np.isfinite(observations.uvd_px)
+        certainty = np.where(measured, 1.0 / observations.sigma_px, 0.0)
+        scale = camera.fx, camera.fy, camera.disparity_times_depth
+        np.multiply(certainty, scale, out=rows[3:6].T)
+        from_centre = observations.uvd_px - (camera.cx, camera.cy, 0.0)
+        rows[6:9] = np.where(measured, from_centre * certainty, 0.0).T
+        rows[9], rows[10] = observations.chi2_limit, observations.chi2_median
+        return _Seen(rows)
+
+    @property
+    def limit(self) -> Array:
+        """The bound (N,) of chi2."""
+        return self.rows[9]
+
+    @property
+    def median(self) -> Array:
+        """What chi2 (N,) is in the median, when all is well."""
+        return self.rows[10]
+
+    def take(self, columns: NDArray[np.bool_]) -> _Seen:
+        """Return the chosen ones."""
+        return self if columns.all() else _Seen(self.rows[:, columns])
+
+    def at(self, T_camera_world: Array) -> tuple[Array, Array, Array]:
+        """Return rays (3, N) = (x / z, y / z, 1 / z) to the points at a pose, the residuals (3, N)
+        in standard deviations, and their squares (N,); points that are behind the camera are just
+        before it.
+        """
+        rays = T_camera_world[:3, :3] @ self.rows[:3]
+        rays += T_camera_world[:3, 3:]
+        inverse_z = 1.0 / np.maximum(rays[2], MIN_DEPTH_M)
+        rays[:2] *= inverse_z
+        rays[2] = inverse_z
+        residual = rays * self.rows[3:6]
+        residual -= self.rows[6:9]
+        return rays, residual, np.einsum('an,an->n', residual, residual)
+
+    def jacobian(self, rays: Array, root: Array | float) -> Array:
+        """Return the derivatives (6, 3 N) of what is seen along rays (3, N) by the twist of the
+        pose, in standard deviations times the roots (N,) of weights (Barfoot 2017, eq. 7.183).
+        """
+        x, y, inverse_z = rays
+        by_z = self.rows[3:6] * root
+        u, v = by_z[:2]
+        along = by_z * rays
+        J: Array = np.zeros((6, *rays.shape))
+        np.multiply(u, inverse_z, out=J[0, 0])
+        np.multiply(v, inverse_z, out=J[1, 1])
+        np.multiply(along, -inverse_z, out=J[2])
+        np.multiply(along, -y, out=J[3])
+        J[3, 1] -= v
+        np.multiply(along, x, out=J[4])
+        J[4, 0] += u
+        np.multiply(u, -y, out=J[5, 0])
+        np.multiply(v, x, out=J[5, 1])
+        return J.reshape(6, -1)
+
+
+def _minimise(pose: Array, seen: _Seen, prior: _Prior) -> Array:
+    damping = 1e-4
+    rays, residual, chi2 = seen.at(pose)
+    pull, strain = prior.at(pose)
+    cost = huber_cost(chi2, seen.limit) + strain
+    for _ in range(STEPS_PER_ROUND):
+        root = np.sqrt(huber_weights(chi2, seen.limit))
+        J = seen.jacobian(rays, root)
+        H, g = J @ J.T + prior.information, J @ (residual * root).ravel() + pull
+        diagonal = H.ravel()[::7]
+        diagonal += damping * (diagonal + 1e-9)
+        step = np.linalg.solve(H, -g)
+        candidate = se3_exp(step) @ pose
+        if -g @ step < CONVERGED * cost:
+            return candidate
+        trial = seen.at(candidate)
+        trial_pull, strain = prior.at(candidate)
+        trial_cost = huber_cost(trial[2], seen.limit) + strain
+        if trial_cost <= cost:
+            converged = cost - trial_cost < CONVERGED * cost
+            pose, (rays, residual, chi2), pull, cost = candidate, trial, trial_pull, trial_cost
+            damping *= 0.2
+            if converged:
+                break
+        else:
+            damping *= 10.0
+    return pose
+
+
+def knows_more(prior: PoseEstimate, fused: PoseEstimate) -> bool:
+    """Whether a prior knows some direction of a pose better than the points with which it was
+    fused.
+    """
+    known = np.linalg.inv(prior.covariance)
+    by_points = np.linalg.inv(fused.covariance) - known + np.diag(FIRST_INFORMATION)
+    return bool(np.linalg.eigvals(np.linalg.solve(by_points, known)).real.max() > 1)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A pose and the points that count for it: (N,) bool, all but those of another motion."""
+
+    estimate: PoseEstimate
+    counted: NDArray[np.bool_]
+
+    @property
+    def agreeing(self) -> int:
+        """How many points agree with the pose."""
+        return int(self.estimate.inliers.sum())
+
+    @property
+    def share(self) -> float:
+        """The share of the points that count which agree."""
+        return self.agreeing / max(1, int(self.counted.sum()))
+
+    def is_believable(self, looked_for: int = 0) -> bool:
+        """Whether enough points agree, also of those that were looked for, and most of those that
+        count: a wrong pose has followers too.
+        """
+        enough = max(ENOUGH, MIN_FOUND * looked_for)
+        return self.agreeing >= enough and self.share >= MAJORITY
+
+
+class Consensus:
+    """Finds poses from matched points of a map."""
+
+    def __init__(self, sparse_map: SparseMap) -> None:
+        self._map = sparse_map
+        self._camera = sparse_map.rig.camera
+
+    @timed
+    def refine(
+        self,
+        T_start: Array,
+        ids: NDArray[np.int32],
+        observations: Observations,
+        max_noise_factor: float = MAX_NOISE_FACTOR,
+        known: PoseEstimate | None = None,
+    ) -> Agreement:
+        """Refine a pose by points `ids` (N,) and their observations (N). known: the pose of the
+        same image by other measurements.
+        """
+        points = self._map.xyz_world[ids]
+        if known is not None:
+            max_noise_factor = min(max_noise_factor, KNOWN_NOISE * known.noise_factor)
+        of_most = refine_pose(self._camera, T_start, points, observations, max_noise_factor)
+        problem = _Problem(self._camera, points, observations, of_most)
+        if known is not None and differ(of_most, known):
+            return problem.near(known.T_camera_world, max_noise_factor)
+        proven = self.proven(ids, T_start)
+        if proven.sum() < ENOUGH // 2 or _fits(of_most, proven):
+            return problem.of_everyone()
+        measured = observations.take(proven)
+        of_proven = refine_pose(self._camera, T_start, points[proven], measured, max_noise_factor)
+        found = None
+        if differ(of_most, of_proven):
+            found = problem.choose(of_proven.T_camera_world, of_proven.noise_factor, proven)
+        return problem.of_everyone() if found is None else found
+
+    def at(
+        self, known: PoseEstimate, ids: NDArray[np.int32], observations: Observations
+    ) -> Agreement:
+        """Return a pose as it is, and which of points `ids` (N,) fit it, be they ever so few."""
+        problem = _Problem(self._camera, self._map.xyz_world[ids], observations, known)
+        fitting = problem.fitting(known.T_camera_world, KNOWN_NOISE * known.noise_factor)
+        return Agreement(replace(known, inliers=fitting), fitting)
+
+    def proven(self, ids: NDArray[np.int32], T_camera_world: Array) -> NDArray[np.bool_]:
+        """Return which points (N,) have a record of standing still, or belong to the floor."""
+        proven = self._map.observer_count[ids] >= PROOF
+        if self._map.rig.mount is not None:
+            points = transform_points(T_camera_world, self._map.xyz_world[ids])
+            proven |= np.abs(self._map.rig.mount.heights_m(points)) < FLOOR_M
+        return proven
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Points (N, 3), their observations (N), and the pose that most of them fit."""
+
+    camera: StereoCamera
+    points: Array
+    observations: Observations
+    of_most: PoseEstimate
+
+    def of_everyone(self) -> Agreement:
+        """Return the majority's pose."""
+        return Agreement(self.of_most, np.ones(len(self.points), bool))
+
+    def choose(
+        self, T_other: Array, noise_factor: float, witnesses: NDArray[np.bool_]
+    ) -> Agreement | None:
+        """Return the other motion, refined by all that fits it; None unless most of its witnesses
+        (N,) fit it, and do not fit the majority's.
+        """
+        before = self.fitting(self.of_most.T_camera_world, noise_factor)
+        after = self.fitting(T_other, noise_factor)
+        enough = max(ENOUGH // 2, MAJORITY * witnesses.sum())
+        support = (after & witnesses).sum()
+        if support < enough or (before & witnesses).sum() > MAJORITY * support:
+            return None
+        found = self.near(T_other, noise_factor)
+        return replace(found, counted=found.counted | witnesses)
+
+    def near(self, T_camera_world: Array, noise_factor: float) -> Agreement:
+        """Return a pose refined by what fits it; nothing else counts. With too few points none
+        agrees.
+        """
+        near = self.fitting(T_camera_world, noise_factor)
+        if near.sum() < ENOUGH // 2:
+            nobody = np.zeros(len(self.points), bool)
+            return Agreement(replace(self.of_most, inliers=nobody), near)
+        estimate = refine_pose(
+            self.camera,
+            T_camera_world,
+            self.points[near],
+            self.observations.take(near),
+            noise_factor,
+        )
+        inliers = np.zeros(len(self.points), bool)
+        inliers[near] = estimate.inliers
+        return Agreement(replace(estimate, inliers=inliers), near)
+
+    def fitting(self, T_camera_world: Array, noise_factor: float) -> NDArray[np.bool_]:
+        """Return which observations (N,) fit a pose."""
+        chi2 = squared_distances(self.camera, T_camera_world, self.points, self.observations)
+        return np.asarray(chi2 <= noise_factor**2 * self.observations.chi2_limit)
+
+
+def _fits(estimate: PoseEstimate, proven: NDArray[np.bool_]) -> bool:
+    """Whether nothing hints at a second motion; to look for one costs as much as the pose."""
+    fitting = bool(estimate.inliers[proven].mean() > USUAL_SHARE)
+    return fitting and estimate.noise_factor < USUAL_NOISE
+
+
+def differ(a: PoseEstimate, b: PoseEstimate) -> bool:
+    """Whether two poses differ by more than their joint uncertainty."""
+    error = se3_log(a.T_camera_world @ invert(b.T_camera_world))
+    covariance = a.covariance + b.covariance + SMALLEST * np.eye(6)
+    return not is_gated(error, covariance)

@@ -1,0 +1,85 @@
+"""What is filled in and what is dropped, on masks drawn by hand and in a scene."""
+
+import numpy as np
+import pytest
+from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
+
+from segfloor_ros.core.floor.disparity.profile import FloorView
+from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands
+from segfloor_ros.core.floor.observation import (
+    FLOOR,
+    NO_EVIDENCE,
+    NOT_FLOOR,
+    FloorSegmentationSettings,
+)
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+
+
+def test_patches_much_smaller_than_the_floor_are_dropped():
+    mask = np.full((120, 200), NO_EVIDENCE, np.uint8)
+    mask[60:, :100] = FLOOR  # 6000 pixels
+    mask[10:40, 150:180] = FLOOR  # 900, a sixth
+    mask[90:100, 180:190] = FLOOR  # 100, a sixtieth
+    mask[80:110, 192:] = NOT_FLOOR
+    dropped = drop_islands(mask)
+    assert (dropped[90:100, 180:190] == NO_EVIDENCE).all()
+    others = np.ones(mask.shape, bool)
+    others[90:100, 180:190] = False
+    np.testing.assert_array_equal(dropped[others], mask[others])
+
+
+def test_what_stands_at_the_border_of_the_left_strip_goes_on_in_it():
+    view = FloorView.of(CAMERA, MOUNT, 220)
+    mask = np.full(view.derolled.shape, NO_EVIDENCE, np.uint8)
+    strip = view.columns < view.line.slope * (view.derolled - view.line.horizon)
+    mask[~strip] = FLOOR
+    box, blank = slice(100, 140), slice(180, 220)
+    mask[box][~strip[box]] = NOT_FLOOR
+    mask[blank, :100] = NO_EVIDENCE
+    beside = beside_something(view, mask)
+    assert not beside[~strip].any()
+    for rows in (box, blank):
+        inner = slice(rows.start + 8, rows.stop - 8)
+        assert beside[inner][strip[inner]].all()
+    assert not beside[145:170].any()
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_blank_board_of_the_shade_of_the_floor_is_not_filled(floor_kind):
+    """Floor is seen left and right of it, and nothing tells the two apart but the texture."""
+    width_m, ahead_m, grey = 1.6, 1.5, floor_kind.get('grey', 120.0)
+    corner = (ahead_m, -width_m / 2, 0.0)
+    board = Patch(corner, (0, width_m, 0), (0, 0, 1.5), False, grey=grey, contrast=0.0)
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), board])
+    left, right, floor, _ = scene.render()
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    # No more than three rows at its foot.
+    assert ((mask == FLOOR) & ~floor).sum() < 3 * CAMERA.fx * width_m / ahead_m
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+@pytest.mark.parametrize('contrast', [2.0, 3.0])
+def test_a_near_board_of_hardly_any_texture_is_not_filled(floor_kind, contrast):
+    """What it shows is too little to deny the floor; its disparities say that it stands."""
+    grey, shared = floor_kind.get('grey', 120.0), {'seed': 7, 'contrast': contrast}
+    board = Patch((0.7, -1.5, 0.0), (0, 1.6, 0), (0, 0, 1.5), False, grey=grey, **shared)
+    scene = Scene([floor_patch(**floor_kind), wall(4.0), board])
+    left, right, floor, depth = scene.render()
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.02
+
+
+@pytest.mark.parametrize('floor_kind', FLOORS)
+def test_a_wall_right_beside_the_camera_is_not_filled(floor_kind):
+    """So near and so askew it is not matched, and it has hardly more texture than noise."""
+    faint = {'grey': floor_kind.get('grey', 120.0), 'contrast': 10.0, 'seed': 9}
+    beside = Patch((-0.5, -0.2, 0.0), (4.5, 0, 0), (0, 0, 1.5), False, **faint)
+    *images, floor, depth = Scene([floor_patch(**floor_kind), wall(4.0), beside]).render()
+    rng = np.random.default_rng(1)
+    left, right = (
+        np.clip(np.rint(image + rng.normal(0, 3, image.shape)), 0, 255).astype(np.uint8)
+        for image in images
+    )
+    mask = FloorSegmentation(CAMERA, FloorSegmentationSettings()).process(left, right, MOUNT).mask
+    assert (mask == FLOOR)[~floor & (depth < 0.8)].mean() < 0.05
+    assert (mask == FLOOR)[floor & (depth > 0.5) & (depth < 3.0)].mean() > 0.95

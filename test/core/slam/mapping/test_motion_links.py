@@ -1,0 +1,106 @@
+"""Measured motions between keyframes in a bundle adjustment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.geometry import invert, make_transform, se3_exp, se3_log
+from segfloor_ros.core.plugins.sensors.body_motion import RelativeMotion
+from segfloor_ros.core.slam.mapping.normal_equations import (
+    Levels,
+    Links,
+    System,
+    cost,
+    squared_errors,
+    with_factors,
+)
+from segfloor_ros.core.slam.rig import chi2_limit
+
+UP = np.array([0.03, -0.99, -0.12]) / np.linalg.norm([0.03, -0.99, -0.12])
+
+RNG = np.random.default_rng(4)
+POSES = np.stack([se3_exp(RNG.normal(size=6) * 0.4) for _ in range(3)])
+COVARIANCE = np.diag([4e-4, 9e-4, 4e-4, 1e-4, 1e-4, 4e-4])
+
+
+def link(before, now, error):
+    """A motion that its poses miss by a twist."""
+    moved = POSES[now] @ invert(POSES[before])
+    return before, now, RelativeMotion(se3_exp(-np.array(error)) @ moved, COVARIANCE)
+
+
+def empty_system(count):
+    none = np.zeros
+    return System(
+        none((count, 6, 6)), none((3, 3, 0)), none((6, 3, 0)), none(count + 1, np.intp),
+        none(0, np.intp), none((count, 6)), none((3, 0)), none((count, 6)), none((3, 0)), 1.0, 0.0,
+        np.tile(np.eye(6), (count, 1, 1)),
+    )  # fmt: skip
+
+
+def test_the_error_is_the_twist_by_which_the_poses_miss():
+    error = np.array([0.01, -0.02, 0.03, 0.002, 0.001, -0.003])
+    (links,) = Links.of([link(0, 1, error), link(2, 0, 2 * error)])
+    np.testing.assert_allclose(links.errors(POSES), [error, 2 * error], atol=1e-9)
+
+
+def test_poses_that_move_as_measured_cost_nothing_and_slip_costs_less_than_its_square():
+    none, small, large = (Links.of([link(0, 1, [x, 0, 0, 0, 0, 0])])[0] for x in (0, 0.01, 1.0))
+    assert cost(none, POSES) == pytest.approx(0.0, abs=1e-9)
+    assert cost(small, POSES) == pytest.approx(0.01**2 / (4e-4 + 1e-6), rel=1e-3)
+    assert cost(large, POSES) < 0.2 * squared_errors(large, POSES)[0]
+
+
+def test_the_right_hand_side_is_the_slope_of_the_cost():
+    links = Links.of(
+        [link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0])]
+    )
+    system = with_factors(empty_system(2), POSES, links)
+    for k in range(2):
+        for axis in range(6):
+            twist = np.zeros(6)
+            twist[axis] = 1e-5
+            costs = []
+            for sign in (1, -1):
+                moved = POSES.copy()
+                moved[k] = se3_exp(sign * twist) @ moved[k]
+                costs.append(sum(cost(item, moved) for item in links))
+            slope = (costs[0] - costs[1]) / 2e-5
+            # The cost is a sum of squares: its slope is twice the gradient's half.
+            assert -2 * system.camera_rhs[k, axis] == pytest.approx(slope, rel=0.02, abs=0.3)
+
+
+def test_a_step_brings_free_poses_where_they_were_measured():
+    links = Links.of(
+        [link(0, 1, [0.01, 0, 0.01, 0.003, 0, 0]), link(1, 2, [0, 0.02, 0, 0, 0.002, 0])]
+    )
+    step = with_factors(empty_system(2), POSES, links).solve(0.0)
+    moved = POSES.copy()
+    moved[:2] = se3_exp(step.twists) @ moved[:2]
+    assert (squared_errors(links[0], moved) < 1e-3 * chi2_limit(6)).all()
+    # The third pose was held; both others moved.
+    for k in range(2):
+        assert np.linalg.norm(se3_log(moved[k] @ invert(POSES[k]))) > 1e-3
+
+
+def test_without_links_the_system_stays_as_it_is():
+    system = empty_system(2)
+    assert with_factors(system, POSES, ()) is system
+
+
+def test_a_keyframe_that_tilts_is_turned_back():
+    tilt = Rotation.from_rotvec([0.02, 0.3, -0.01]).as_matrix()
+    poses = np.stack([make_transform(tilt, np.zeros(3))])
+    up = Up(Rotation.from_rotvec([0.0, 0.3, 0.0]).apply(UP), 0.01)
+    levels = Levels.of([(0, up)], UP)
+    before = np.linalg.norm(levels[0].errors(poses))
+    assert before > 0.015
+    for _ in range(3):
+        step = with_factors(empty_system(1), poses, levels).solve(0.0)
+        poses = se3_exp(step.twists) @ poses
+    assert np.linalg.norm(levels[0].errors(poses)) < 0.01 * before
+    # Turning about up is free.
+    assert Rotation.from_matrix(poses[0, :3, :3]).magnitude() == pytest.approx(0.3, abs=0.03)

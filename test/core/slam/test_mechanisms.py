@@ -1,0 +1,57 @@
+"""Each mechanism at work in the whole SLAM stage, where a drive needs it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hand_made_maps import row_of_views
+from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
+
+from segfloor_ros.core.geometry import invert
+from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates
+from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
+from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Images
+from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Tracker
+
+SETTINGS = StereoSlamSettings(num_features=600)
+
+
+def drive(slam, room, poses, change=lambda frame: frame):
+    for k, pose in enumerate(poses):
+        result = slam.process(change(room.frame(k, pose)))[0]
+        assert result.tracked
+    return slam.map.keyframes[-1]
+
+
+def test_what_is_seen_again_is_not_mapped_twice():
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    there = [planar_pose(0.05 * k, 0, 0.04 * k) for k in range(12)]
+    last = drive(slam, StereoRoom(), there + there[::-1])
+    assert len(np.unique(last.point_id)) > 200
+    pairs = find_duplicates(slam.map, last)
+    assert (~slam.map.seen_together(*pairs)).sum() <= 5
+
+
+def test_points_of_a_place_are_tracked_again_though_none_of_them_was_seen_lately():
+    # Keyframe 0 sees points 0 to 4, the others, right beside it, only 5 to 9.
+    sparse_map = row_of_views(4, [NO_POINT] * 5 + list(range(5, 10)), 0.05)
+    sparse_map.unlink(0, np.arange(5, 10))
+    local = LocalMap(sparse_map, 30)
+    local.move_to(np.arange(5, 10, dtype=np.int32), np.eye(4))
+    np.testing.assert_array_equal(local.point_ids, np.arange(10))
+
+
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_patches_give_the_pose_better_than_corners(seed):
+    room = StereoRoom(seed)
+    slam = StereoSlam(CAMERA, SETTINGS, MOUNT)
+    slam.process(room.frame(0, planar_pose(0, 0, 0)))
+    moved = planar_pose(0.06, 0.02, 0.05)
+    frame = room.frame(1, moved)
+    features = FeatureExtractor(SETTINGS).extract(frame.left)
+    ids = slam.map.points_of(np.array([0]))
+    track = Tracker(slam.map).track(Images.of(frame, CAMERA), features, ids, [np.eye(4)])
+    truth = invert(MOUNT.T_base_left) @ moved @ MOUNT.T_base_left
+    error = track.T_camera_world @ truth
+    assert np.linalg.norm(error[:3, 3]) < 0.0015

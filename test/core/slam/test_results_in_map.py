@@ -1,0 +1,89 @@
+"""Results leave SLAM in ROS frames: the base on its mount, with the covariance of its pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from segfloor_ros.core.geometry import invert, make_transform, se3_exp
+from segfloor_ros.core.slam.results import FrameResult, MovingPoints, in_map
+
+RNG = np.random.default_rng(11)
+T_BASE_LEFT = se3_exp(np.array([0.3, -0.1, 0.5, -1.4, 0.2, -1.5]))
+T_CAMERA_WORLD = se3_exp(np.array([1.0, 0.4, -2.0, 0.3, 1.1, -0.4]))
+
+
+def result(covariance: np.ndarray) -> FrameResult:
+    T_odom_camera = invert(T_CAMERA_WORLD)
+    return FrameResult(0, 0, True, T_odom_camera, np.eye(4), covariance, 50, 'tracking', 0)
+
+
+def test_the_base_is_where_its_camera_is_mounted() -> None:
+    found = in_map(result(np.eye(6)), T_BASE_LEFT)
+    # The first camera is T_BASE_LEFT in `map`, this one has moved from there.
+    expected = T_BASE_LEFT @ invert(T_CAMERA_WORLD) @ invert(T_BASE_LEFT)
+    np.testing.assert_allclose(found.T_odom_base, expected, atol=1e-12)
+
+
+def test_a_correction_of_the_odometry_brings_the_base_to_where_its_camera_is_in_the_map() -> None:
+    T_world_odom = se3_exp(np.array([0.2, -0.3, 0.1, 0.1, -0.2, 0.5]))
+    found = in_map(replace(result(np.eye(6)), T_map_odom=T_world_odom), T_BASE_LEFT)
+    expected = T_BASE_LEFT @ T_world_odom @ invert(T_CAMERA_WORLD) @ invert(T_BASE_LEFT)
+    np.testing.assert_allclose(found.T_map_odom @ found.T_odom_base, expected, atol=1e-12)
+
+
+def test_what_moves_goes_in_the_map_from_where_it_was_to_where_it_is() -> None:
+    before = RNG.normal(size=(5, 3)) + np.array([0.0, 0.0, 4.0])
+    velocity = RNG.normal(size=(5, 3))
+    was, will = (
+        in_map(replace(result(np.eye(6)), moving=MovingPoints(xyz, velocity)), T_BASE_LEFT).moving
+        for xyz in (before, before + 0.1 * velocity)
+    )
+    assert was is not None and will is not None
+    gone = was.xyz_map + 0.1 * was.velocity_m_s
+    np.testing.assert_allclose(gone, will.xyz_map, atol=1e-5)
+
+
+def test_the_covariance_is_that_of_the_place_and_the_turn_of_the_base_in_odom() -> None:
+    scale = np.diag([0.02, 0.005, 0.01, 0.004, 0.008, 0.002])
+    mixed = scale @ (np.eye(6) + 0.3 * RNG.normal(size=(6, 6)))
+    covariance = mixed @ mixed.T
+    T_odom_base = in_map(result(covariance), T_BASE_LEFT).T_odom_base
+    errors = []
+    for twist in RNG.multivariate_normal(np.zeros(6), covariance, 20_000):
+        camera = se3_exp(twist) @ T_CAMERA_WORLD
+        base = T_BASE_LEFT @ invert(camera) @ invert(T_BASE_LEFT)
+        turned = base[:3, :3] @ T_odom_base[:3, :3].T
+        axis = 0.5 * np.array(
+            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+        )
+        errors.append(np.append(base[:3, 3] - T_odom_base[:3, 3], axis))
+    expected = np.cov(np.array(errors).T)
+    found = in_map(result(covariance), T_BASE_LEFT).covariance
+    sigma = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.05
+    )
+
+
+def test_a_tilted_mount_turns_the_axes_of_the_covariance() -> None:
+    """What is unsure along the view of a camera that looks left is unsure to the left."""
+    along_view = np.diag([0.0, 0.0, 1e-4, 0.0, 0.0, 0.0])
+    R_base_left = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    still = FrameResult(0, 0, True, np.eye(4), np.eye(4), along_view, 50, 'tracking', 0)
+    found = in_map(still, make_transform(R_base_left, np.zeros(3))).covariance
+    np.testing.assert_allclose(found, np.diag([0.0, 1e-4, 0.0, 0.0, 0.0, 0.0]), atol=1e-12)
+
+
+def test_the_covariance_in_the_map_is_turned_along_with_the_odometry() -> None:
+    """A quarter turn to the left: what is unsure ahead in `odom` is unsure to the left in `map`."""
+    T_map_odom = make_transform(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([3.0, 1.0, 0.0])
+    )
+    covariance = np.diag([4.0, 1.0, 0.5, 0.3, 0.1, 0.2])
+    covariance[0, 5] = covariance[5, 0] = 0.25
+    found = replace(result(covariance), T_map_odom=T_map_odom).covariance_in_map
+    expected = np.diag([1.0, 4.0, 0.5, 0.1, 0.3, 0.2])
+    expected[1, 5] = expected[5, 1] = 0.25
+    np.testing.assert_allclose(found, expected, atol=1e-12)
