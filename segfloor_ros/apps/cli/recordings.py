@@ -320,6 +320,7 @@ def calibrate(
 def _print_calibration(result: CalibrationResult, pictures: Path, out: Path | None) -> None:
     """Print figures of a calibration and the errors of each pair, and write its report."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
+    from segfloor_ros.apps.evaluation.report import calibration_page
 
     folder = out or pictures
     table = figure_table('pair', 'left px', 'right px', 'rows px')
