@@ -28,7 +28,7 @@ from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, st
 from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.results import add_files
 from segfloor_ros.core.files.whole import read_bytes
-from segfloor_ros.core.floor.segmentation import MASK_COLOURS
+from segfloor_ros.core.floor.pictures import MASK_COLOURS
 
 STYLE = Path(__file__).with_name('report.css')
 
