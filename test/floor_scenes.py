@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from drawing import drawn
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 320.0, 240.0, 0.12)
 SMALL_CAMERA = StereoCamera(320, 240, 160.0, 160.0, 160.0, 120.0, 0.12)

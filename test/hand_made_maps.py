@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import make_transform
-from segfloor_ros.core.slam.results import NO_POINT
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.images import Features

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import invert, transform_points
 
 BOARD_HALF_WIDTH_M = 0.3

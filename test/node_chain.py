@@ -16,7 +16,7 @@ from ros_graph import Graph
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.programs import program_of
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
     image_message,

@@ -6,10 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, LabelledPoints
-from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.contracts import (
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    FloorScan,
+    KeyframeFeatures,
+    KeyframePath,
+    LabelledPoints,
+    SparseCloud,
+)
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 from segfloor_ros.nodes.messages.arrays import (
     features_message,
     image_message,
@@ -33,7 +39,7 @@ MASK = np.repeat(np.array([0] * 5 + [255] * 5, np.uint8)[:, None], 10, axis=1)
 LABELLED = LabelledPoints(
     np.array([2, 5], np.int32),
     np.array([[1.0, 0, 0], [2, 0.3, 0.5]], np.float32),
-    np.array([FLOOR, OBSTACLE], np.uint8),
+    np.array([POINT_FLOOR, POINT_OBSTACLE], np.uint8),
     np.ones(2, np.float32),
 )
 SCAN = FloorScan(-0.5, 0.25, np.array([1.5, 1.5, 1.5, 1.5, 1.5], np.float32))

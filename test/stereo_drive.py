@@ -9,7 +9,7 @@ import numpy as np
 from stereo_room import CAMERA, StereoRoom, planar_pose
 
 from segfloor_ros.apps.recordings import open_source
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.nodes.configuration import resolve

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from drawing import drawn
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.geometry import make_transform
 
 ROOM_MIN = np.array([-3.0, -2.5, 0.0])

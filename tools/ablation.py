@@ -28,16 +28,15 @@ from segfloor_ros.apps.evaluation.map_score import MapScore, score_map
 from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.contracts import FloorScan, Keyframe, Mount, StereoFrame
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.pipeline import make_slam
-from segfloor_ros.core.slam.results import Keyframe
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import noisy
 from tools.mechanisms import FLOOR as FLOOR_MECHANISMS

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.floor.disparity.matching import DisparityMatcher, TwoScaleMatcher
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 TRUTH_STEPS_PER_PX = 4
 NUM_DISPARITIES = 64

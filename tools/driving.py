@@ -15,9 +15,9 @@ from segfloor_ros.apps.cli.terminal import Announce
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import render_once
-from segfloor_ros.core.camera.model import MeasurementLog, RecordedSensor, StereoFrame
+from segfloor_ros.core.camera.recording import MeasurementLog, RecordedSensor
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.slam.results import FrameResult
+from segfloor_ros.core.contracts import FrameResult, StereoFrame
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 

@@ -20,9 +20,9 @@ from segfloor_ros.apps.simulation.simulation import (
     render_once,
 )
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.floor.observation import FLOOR
+from segfloor_ros.core.contracts import FLOOR, Mount
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from tools.driving import open_recording

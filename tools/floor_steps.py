@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.apps.benchmark import CAMERA, DRIVE, MOUNT, CorridorImages
 from segfloor_ros.apps.cli.terminal import Announce
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE, FloorSegmentation
 from segfloor_ros.core.geometry import Array

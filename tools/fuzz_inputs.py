@@ -22,8 +22,8 @@ from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
 from segfloor_ros.core.camera.calibration import EyeCalibration
-from segfloor_ros.core.camera.model import StereoCameraSettings
-from segfloor_ros.core.floor.observation import FLOOR, NOT_FLOOR
+from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.contracts import FLOOR, NOT_FLOOR
 
 FRAMES = 4
 SCALE = 4

@@ -22,12 +22,11 @@ from rich.progress import track
 from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.terminal import console
 from segfloor_ros.apps.recordings import open_source
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, FloorObservation, Keyframe
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, FloorObservation
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import UNKNOWN, OccupancyGrid
 from segfloor_ros.core.pipeline import Pipeline
-from segfloor_ros.core.slam.results import Keyframe
 from segfloor_ros.nodes.configuration import resolve
 
 Picture = NDArray[np.uint8]

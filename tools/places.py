@@ -28,15 +28,14 @@ import typer
 
 from segfloor_ros.apps.evaluation.trajectory import TrajectoryScore, match, score_trajectory
 from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory, read_trajectory
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import FrameResult, KeyframePath, StereoFrame
 from segfloor_ros.core.files.results import from_bytes, to_bytes
 from segfloor_ros.core.geometry import Array, invert, rotation_angle
 from segfloor_ros.core.pipeline import make_slam
 from segfloor_ros.core.plugins.saved_slam import load_slam, save_slam
+from segfloor_ros.core.processes import rss_mb
 from segfloor_ros.core.slam.places.loops import Candidate
-from segfloor_ros.core.slam.results import FrameResult, KeyframePath
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
-from segfloor_ros.core.timing import rss_mb
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import open_recording
 

@@ -24,8 +24,8 @@ from segfloor_ros.apps.evaluation.maps import load_truth
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import render_once
 from segfloor_ros.apps.trajectory import TrackedPose, corrected_trajectory
+from segfloor_ros.core.contracts import FrameResult, KeyframePath
 from segfloor_ros.core.pipeline import Pipeline, make_slam
-from segfloor_ros.core.slam.results import FrameResult, KeyframePath
 from segfloor_ros.nodes.configuration import resolve
 from tools.driving import after_sensors, open_recording
 

@@ -22,6 +22,7 @@ import typer
 from segfloor_ros.apps.evaluation.maps import load_truth, resample
 from segfloor_ros.apps.simulation.scene_file import scene_from_mapping
 from segfloor_ros.apps.simulation.simulation import render_once
+from segfloor_ros.core.contracts import FrameResult
 from segfloor_ros.core.files.results import MapFile, read_map_file, write_map_file
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, OccupancyGrid
@@ -29,7 +30,6 @@ from segfloor_ros.core.pipeline import Pipeline, prune
 from segfloor_ros.core.plugins.saved_slam import fill_map
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
-from segfloor_ros.core.slam.results import FrameResult
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.nodes.configuration import resolve

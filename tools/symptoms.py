@@ -21,10 +21,11 @@ from segfloor_ros.apps.cli.main import run_command
 from segfloor_ros.apps.cli.terminal import announcing, console
 from segfloor_ros.apps.evaluation.map_score import compare, draw_overlay
 from segfloor_ros.apps.evaluation.maps import load_truth
+from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, render_once
 from segfloor_ros.apps.suite.job import ProgramError, run_segfloor
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, read_ply
+from segfloor_ros.core.contracts import POINT_FLOOR, POINT_OBSTACLE
 from segfloor_ros.nodes.map_files import load_map
 
 SMALL = ('camera.width=480', 'camera.height=360')
@@ -133,7 +134,10 @@ def _side_view(result: Path) -> Picture:
     cloud = read_ply(result / 'labelled_cloud.ply')
     figure = Figure(figsize=(8, 2.6), layout='constrained', dpi=160)
     axes = figure.subplots()
-    for label, name, colour in ((FLOOR, 'floor', 'tab:green'), (OBSTACLE, 'obstacle', 'tab:red')):
+    for label, name, colour in (
+        (POINT_FLOOR, 'floor', 'tab:green'),
+        (POINT_OBSTACLE, 'obstacle', 'tab:red'),
+    ):
         of_label = cloud.xyz_map[cloud.label == label]
         axes.scatter(of_label[:, 0], of_label[:, 2], s=1, color=colour, label=name)
     axes.axhline(0.0, color='black', linewidth=1, label='where the floor is')

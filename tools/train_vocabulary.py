@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.core.slam.places import place_recognition as vocabulary
 from segfloor_ros.core.slam.places.place_recognition import BRANCHES, LEVELS
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor
 from segfloor_ros.nodes.configuration import resolve
 

@@ -23,15 +23,13 @@ from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.simulation.scene_file import open_scene
 from segfloor_ros.apps.simulation.solids import floors, obstacles, true_map
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import Mount
-from segfloor_ros.core.cloud import LabelledPoints
 from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import KeyframeFeatures, LabelledPoints, Mount
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import invert, planar
 from segfloor_ros.core.grid.keyframe_evidence import gather_evidence
 from segfloor_ros.core.grid.mapper import EvidenceFolder, EvidenceHistory
 from segfloor_ros.core.grid.occupancy import FREE, OccupancyGrid, render
-from segfloor_ros.core.slam.results import KeyframeFeatures
 from segfloor_ros.nodes.configuration import resolve
 from tools.ablation import print_row
 from tools.mechanisms import FLOOR, GRID, NOTHING

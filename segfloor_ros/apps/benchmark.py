@@ -27,23 +27,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros import __version__
+from segfloor_ros.apps.profiling import MemoryLog, ReferenceWorkload
 from segfloor_ros.apps.recordings import StereoSource
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.configuration import Configuration
-from segfloor_ros.core.errors import SegfloorError, SettingsError
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR, FloorScan
-from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
-from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.pipeline import KeyframeStages, MapInput, make_slam
-from segfloor_ros.core.processes import how_it_ended, start_apart
-from segfloor_ros.core.slam.results import (
+from segfloor_ros.core.contracts import (
+    FLOOR,
+    NO_EVIDENCE,
+    NOT_FLOOR,
+    FloorScan,
     FrameResult,
     Keyframe,
     KeyframeFeatures,
     KeyframePath,
+    Mount,
     SparseCloud,
+    StereoFrame,
 )
-from segfloor_ros.core.timing import MemoryLog, Profile, ReferenceWorkload, StageTimes, spread_of
+from segfloor_ros.core.errors import SegfloorError, SettingsError
+from segfloor_ros.core.geometry import Array, invert, make_transform, transform_points
+from segfloor_ros.core.grid.occupancy import OccupancyGrid
+from segfloor_ros.core.pipeline import KeyframeStages, MapInput, make_slam
+from segfloor_ros.core.processes import how_it_ended, start_apart
+from segfloor_ros.core.timing import Profile, StageTimes, spread_of
 
 CAMERA = StereoCamera(640, 480, 320.0, 320.0, 319.5, 239.5, 0.12)
 MOUNT = Mount(height_m=0.3, pitch_rad=0.12)

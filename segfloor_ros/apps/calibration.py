@@ -18,7 +18,8 @@ from segfloor_ros.apps.recordings.calibration_files import ros_calibration
 from segfloor_ros.apps.recordings.image_folders import find_image_pairs
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import CalibrationError, InputError, os_errors
 from segfloor_ros.core.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.core.files.writing import PAGE as HTML

@@ -18,32 +18,32 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from segfloor_ros.apps import results_folder
+from segfloor_ros.apps.profiling import MemoryLog
 from segfloor_ros.apps.recordings import StereoSource, prefetched
 from segfloor_ros.apps.trajectory import TrackedPose, Trajectory, corrected_trajectory
-from segfloor_ros.core.camera.model import MeasurementLog, Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.recording import MeasurementLog
 from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import (
+    UNKNOWN_COVARIANCE,
+    FloorObservation,
+    FrameResult,
+    Keyframe,
+    KeyframePath,
+    Mount,
+    StereoFrame,
+)
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
 from segfloor_ros.core.files.writing import check_output
-from segfloor_ros.core.floor.observation import FloorObservation
-from segfloor_ros.core.floor.segmentation import (
-    FloorSegmentation,
-    mask_overlay,
-    v_disparity_picture,
-)
+from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.pipeline import CAMERA_AS_BASE, Pipeline
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.plugins.saved_slam import check_camera, new_keyframes
 from segfloor_ros.core.plugins.semantics.network import Network
-from segfloor_ros.core.slam.results import (
-    MAJORITY,
-    FrameResult,
-    Keyframe,
-    KeyframePath,
-    left_out,
-    lost_frame,
-)
-from segfloor_ros.core.timing import MemoryLog
+from segfloor_ros.core.slam.held_results import left_out
+from segfloor_ros.core.slam.thresholds import MAJORITY
 
 logger = logging.getLogger(__name__)
 
@@ -415,3 +415,12 @@ class LockstepRun:
             stages=pipeline.times.summary(),
             rss_mb=self._memory.summary(),
         )
+
+
+def lost_frame(frame: StereoFrame) -> FrameResult:
+    """Return the outcome of a frame that nothing came of."""
+    nowhere = np.eye(4)
+    unknown = np.eye(6) * UNKNOWN_COVARIANCE
+    return FrameResult(
+        frame.index, frame.stamp_ns, False, nowhere, nowhere, unknown, 0, 'lost: failed', 0
+    )

@@ -19,7 +19,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.floor.observation import CELL_M, FloorScan
+from segfloor_ros.core.contracts import CELL_M, FloorScan
 from segfloor_ros.core.geometry import Array, invert, planar, transform_points
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, Cells, OccupancyGrid
 

@@ -21,10 +21,10 @@ import yaml
 from numpy.typing import NDArray
 
 from segfloor_ros.apps.label_files import draw_labels, save_labels
+from segfloor_ros.apps.ply import write_ply
 from segfloor_ros.apps.trajectory import Trajectory, write_tum
-from segfloor_ros.core.camera.model import Mount
-from segfloor_ros.core.cloud import LabelledPoints, write_ply
 from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import FrameResult, LabelledPoints, Mount
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.files.images import png_bytes
 from segfloor_ros.core.files.whole import read_json
@@ -37,7 +37,6 @@ from segfloor_ros.core.files.writing import (
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.plugins.semantics.label_map import Labels
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
-from segfloor_ros.core.slam.results import FrameResult
 from segfloor_ros.nodes.map_files import save_map
 
 MAP, REPORT = 'map.yaml', 'report.html'

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.contracts import KeyframePath
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.whole import read_table
-from segfloor_ros.core.geometry import Array, invert, quaternion_xyzw, rotations_of
-from segfloor_ros.core.slam.results import KeyframePath
+from segfloor_ros.core.geometry import Array, invert
+from segfloor_ros.core.quaternions import quaternion_xyzw, rotations_of
 
 TUM_COLUMNS = ['t', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
 FARTHEST = 1e10

@@ -11,19 +11,24 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.files.whole import read_bytes
-from segfloor_ros.core.floor.observation import CELL_M, NOT_FLOOR
-from segfloor_ros.core.floor.observation import FLOOR as MASK_FLOOR
+from segfloor_ros.core.contracts import (
+    CELL_M,
+    NOT_FLOOR,
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    POINT_UNKNOWN,
+    KeyframeFeatures,
+    LabelledPoints,
+    SparseCloud,
+)
+from segfloor_ros.core.contracts import FLOOR as MASK_FLOOR
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.settings import RobotSettings
-from segfloor_ros.core.slam.results import KeyframeFeatures, SparseCloud
 
 _HEIGHT_SIGMA_M, _HEIGHT_SIGMA_PER_M = 0.02, 0.01
 """Error of a height close to the robot, and its growth with the distance, one sigma."""
@@ -51,21 +56,6 @@ _COLUMNS = {
 """All begin with 0. belief: what the evidence says, with hysteresis; label, confidence: what
 gets it. judged_z_m: where the point was when that was decided, in frame `map`.
 """
-
-UNKNOWN, FLOOR, OBSTACLE = range(3)
-"""Labels of a point."""
-
-VERTEX = np.dtype(
-    [
-        ('x', '<f4'),
-        ('y', '<f4'),
-        ('z', '<f4'),
-        ('id', '<i4'),
-        ('label', 'u1'),
-        ('confidence', '<f4'),
-    ]
-)
-_PLY_TYPES = {'f4': 'float', 'i4': 'int', 'u1': 'uchar'}
 
 
 class CloudLabelling:
@@ -123,7 +113,7 @@ class CloudLabelling:
         wrong match.
         """
         seen = list(self._seen) or [points.point_id]
-        row = np.flatnonzero(points.label == OBSTACLE)
+        row = np.flatnonzero(points.label == POINT_OBSTACLE)
         row = row[np.isin(points.point_id[row], np.concatenate(seen))]
         row = row[count_around(points.xyz_map[row, :2]) >= _ENOUGH_POINTS]
         return row[np.isin(points.point_id[row], seen[-1])]
@@ -151,17 +141,17 @@ class CloudLabelling:
         log_odds = table['mask_log_odds'][row] + by_height
         belief = table['belief'][row]
         # Between the thresholds it stays as it is.
-        belief[log_odds >= _LABEL_LOG_ODDS] = OBSTACLE
-        belief[log_odds <= -_LABEL_LOG_ODDS] = FLOOR
-        belief[~looked] = UNKNOWN
+        belief[log_odds >= _LABEL_LOG_ODDS] = POINT_OBSTACLE
+        belief[log_odds <= -_LABEL_LOG_ODDS] = POINT_FLOOR
+        belief[~looked] = POINT_UNKNOWN
         concerned = height_m <= settings.robot_height_m
         concerned &= height_m >= -(settings.drop_height_m + 2 * sigma_m)
-        label = np.where(concerned, belief, UNKNOWN)
-        towards = np.where(label == OBSTACLE, log_odds, -log_odds)
+        label = np.where(concerned, belief, POINT_UNKNOWN)
+        towards = np.where(label == POINT_OBSTACLE, log_odds, -log_odds)
         certainty = np.clip(np.tanh(towards / 2), 0, 1)
         table['belief'][row], table['judged_z_m'][row] = belief, z_m[row]
         table['label'][row] = label
-        table['confidence'][row] = np.where(label == UNKNOWN, 0, certainty)
+        table['confidence'][row] = np.where(label == POINT_UNKNOWN, 0, certainty)
 
 
 def mask_evidence(mask: NDArray[np.uint8], uv_px: NDArray[np.float32]) -> Array:
@@ -280,19 +270,6 @@ def _empty(count: int) -> dict[str, NDArray[Any]]:
     return {name: np.zeros(count, kind) for name, kind in _COLUMNS.items()}
 
 
-@dataclass(frozen=True)
-class LabelledPoints:
-    """The labelled cloud as arrays over points. point_id: (N,) int32 ascending. xyz_map: (N,
-    3) float32, metres. label: (N,) uint8 of `UNKNOWN`, `FLOOR`, `OBSTACLE`. confidence: (N,)
-    float32 in [0, 1], how sure the label is.
-    """
-
-    point_id: NDArray[np.int32]
-    xyz_map: NDArray[np.float32]
-    label: NDArray[np.uint8]
-    confidence: NDArray[np.float32]
-
-
 def count_around(points: NDArray[np.floating]) -> NDArray[np.intp]:
     """Return how many of the points (N, 2) lie around each, itself among them: in its square of
     half a cell and the eight beside it.
@@ -306,42 +283,6 @@ def count_around(points: NDArray[np.floating]) -> NDArray[np.intp]:
         row = np.minimum(np.searchsorted(taken, beside), len(taken) - 1)
         around += np.where(taken[row] == beside, here[row], 0)
     return around[at]
-
-
-def _header(count: int) -> bytes:
-    lines = ['ply', 'format binary_little_endian 1.0', 'comment frame map, metres']
-    lines.append('comment label 0 unknown, 1 floor, 2 obstacle')
-    lines.append(f'element vertex {count}')
-    names = VERTEX.names or ()
-    lines += [f'property {_PLY_TYPES[VERTEX[name].str[1:]]} {name}' for name in names]
-    return ('\n'.join([*lines, 'end_header']) + '\n').encode()
-
-
-def write_ply(path: Path, points: LabelledPoints) -> None:
-    """Write the points with x y z id label confidence, frame `map`, metres."""
-    vertices = np.zeros(len(points.point_id), VERTEX)
-    for axis, name in enumerate('xyz'):
-        vertices[name] = points.xyz_map[:, axis]
-    vertices['id'] = points.point_id
-    vertices['label'] = points.label
-    vertices['confidence'] = points.confidence
-    path.write_bytes(_header(len(vertices)) + vertices.tobytes())
-
-
-def read_ply(path: Path) -> LabelledPoints:
-    """Read a file of `write_ply`. Raises InputError naming the file when it is not one."""
-    content = read_bytes(path)
-    head, mark, body = content.partition(b'end_header\n')
-    count = len(body) // VERTEX.itemsize
-    if not mark or head + mark != _header(count) or len(body) != count * VERTEX.itemsize:
-        raise InputError(f'{path}: not a whole labelled cloud')
-    vertices = np.frombuffer(body, VERTEX)
-    return LabelledPoints(
-        point_id=vertices['id'].astype(np.int32),
-        xyz_map=np.stack([vertices[name] for name in 'xyz'], axis=1).astype(np.float32),
-        label=vertices['label'].copy(),
-        confidence=vertices['confidence'].astype(np.float32),
-    )
 
 
 @dataclass(frozen=True)

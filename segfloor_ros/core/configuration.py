@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.cloud import CloudLabellingSettings
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 from segfloor_ros.core.settings import StageSettings
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 
 MAX_KEYFRAMES_UNDER_WAY = 4
 """Keyframes that may be between SLAM and the grid while the next frame is taken."""

@@ -9,8 +9,6 @@ SciPy is imported where it is used: it takes 20 MB of every process, and not all
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -164,54 +162,6 @@ def rotations_by(vectors: Array) -> Array:
     return np.asarray(se3_exp(np.concatenate([np.zeros_like(vectors), vectors], 1))[:, :3, :3])
 
 
-def quaternion_xyzw(R: Array) -> Array:
-    """Return the unit quaternion (4,) in the order x, y, z, w with w >= 0 of a (3, 3) rotation."""
-    return quaternions_of(R[None])[0]
-
-
-def transform_from_quaternion(translation: Array, quat_xyzw: Array) -> Array:
-    """Return the (4, 4) transform of a translation (3,) and a quaternion (4,) in the order x, y,
-    z, w.
-    """
-    return make_transform(rotations_of(quat_xyzw[None])[0], translation)
-
-
-def rotations_of(quat_xyzw: Array) -> Array:
-    """Return rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
-    x, y, z, w = (quat_xyzw / np.linalg.norm(quat_xyzw, axis=1, keepdims=True)).T
-    rotations = np.empty((len(quat_xyzw), 3, 3))
-    rotations[:, 0] = np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1
-    )
-    rotations[:, 1] = np.stack(
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1
-    )
-    rotations[:, 2] = np.stack(
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1
-    )
-    return rotations
-
-
-def quaternions_of(rotations: Array) -> Array:
-    """Return quaternions (N, 4), x y z w with w >= 0, of rotations (N, 3, 3).
-
-    4 q qᵀ has the trace and the differences and sums of the entries for its own; its longest row is
-    the best conditioned (Shepperd, 1978).
-    """
-    R = rotations
-    squares = np.empty((len(R), 4, 4))
-    trace = np.trace(R, axis1=1, axis2=2)
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        squares[:, i, i] = 1 + 2 * R[:, i, i] - trace
-        squares[:, j, k] = squares[:, k, j] = R[:, j, k] + R[:, k, j]
-        squares[:, i, 3] = squares[:, 3, i] = R[:, k, j] - R[:, j, k]
-    squares[:, 3, 3] = 1 + trace
-    longest = np.argmax(np.diagonal(squares, axis1=1, axis2=2), axis=1)
-    found = squares[np.arange(len(R)), longest]
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
-    return found * np.where(found[:, 3:] < 0, -1.0, 1.0)
-
-
 def rotation_from_angles(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Array:
     """Return the rotation (3, 3) about z by yaw, then the new y by pitch, then the new x by roll
     (REP 103).
@@ -250,93 +200,6 @@ def is_within(motion: Array, reach: tuple[float, float]) -> bool:
     return moved_m <= reach[0] and rotation_angle(motion[:3, :3]) <= reach[1]
 
 
-class FrameTree:
-    """Keeps fixed transforms for good and moving ones for ten seconds.
-
-    A moving frame whose stamps jump back by more than half a second starts anew: a recording plays
-    again. The latest word on a frame's parent counts.
-    """
-
-    def __init__(self) -> None:
-        self._fixed: dict[str, tuple[str, Array]] = {}
-        self._moving: dict[str, tuple[str, list[int], list[Array]]] = {}
-
-    def add_fixed(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Take in a transform that holds at all times."""
-        self._moving.pop(child, None)
-        self._fixed[child] = parent, T_parent_child
-
-    def add_moving(self, stamp_ns: int, parent: str, child: str, T_parent_child: Array) -> None:
-        """Take in a transform at one time; of several at the same time the first counts."""
-        known = self._moving.get(child)
-        if known is None or known[0] != parent or stamp_ns < known[1][-1] - MAX_DISORDER_NS:
-            self._moving[child] = parent, [stamp_ns], [T_parent_child]
-            return
-        _, stamps, transforms = known
-        place = bisect_left(stamps, stamp_ns)
-        if stamps[place : place + 1] == [stamp_ns]:
-            return
-        stamps.insert(place, stamp_ns)
-        transforms.insert(place, T_parent_child)
-        old = bisect_left(stamps, stamps[-1] - HISTORY_NS)
-        del stamps[:old], transforms[:old]
-
-    def clear_moving(self) -> None:
-        """Keep the fixed transforms alone."""
-        self._moving.clear()
-
-    def root_of(self, frame: str) -> str:
-        """Return the frame above all others of the tree that a frame is in; itself if unknown."""
-        for ancestor, _ in self._upwards(frame, None):
-            frame = ancestor
-        return frame
-
-    def latest_ns(self, frame: str) -> int | None:
-        """Return up to when it is known where a frame is on its parent; None where that is not
-        known or always.
-        """
-        return self._moving[frame][1][-1] if frame in self._moving else None
-
-    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Array | None:
-        """Return T_target_source (4, 4) at a time, or from the latest transforms; None where the
-        frames are not connected, or not at that time.
-        """
-        T_ancestor_target: dict[str, Array] = {target: np.eye(4)}
-        T_ancestor_target.update(self._upwards(target, stamp_ns))
-        if source in T_ancestor_target:
-            return invert(T_ancestor_target[source])
-        for ancestor, T_ancestor_source in self._upwards(source, stamp_ns):
-            if ancestor in T_ancestor_target:
-                return invert(T_ancestor_target[ancestor]) @ T_ancestor_source
-        return None
-
-    def _upwards(self, frame: str, stamp_ns: int | None) -> Iterator[tuple[str, Array]]:
-        """Yield the ancestors of a frame and T_ancestor_frame, the nearest first."""
-        T_ancestor_frame: Array = np.eye(4)
-        child, passed = frame, {frame}
-        while (link := self._link(child, stamp_ns)) is not None and link[0] not in passed:
-            child, T_parent_child = link
-            passed.add(child)
-            T_ancestor_frame = T_parent_child @ T_ancestor_frame
-            yield child, T_ancestor_frame
-
-    def _link(self, child: str, stamp_ns: int | None) -> tuple[str, Array] | None:
-        if child in self._fixed:
-            return self._fixed[child]
-        if child not in self._moving:
-            return None
-        parent, stamps, transforms = self._moving[child]
-        if stamp_ns is None:
-            return parent, transforms[-1]
-        if not stamps[0] <= stamp_ns <= stamps[-1]:
-            return None
-        after = bisect_left(stamps, stamp_ns)
-        if stamps[after] == stamp_ns:
-            return parent, transforms[after]
-        share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        return parent, between(transforms[after - 1], transforms[after], share)
-
-
 def between(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the pose (4, 4) at a share of the way from one pose to another: the position on the
     straight line, the rotation on the shortest turn.
@@ -344,3 +207,23 @@ def between(T_a: Array, T_b: Array, share: float) -> Array:
     turn = rotation_vectors((T_a[:3, :3].T @ T_b[:3, :3])[None])[0]
     rotation = T_a[:3, :3] @ rotations_by(share * turn[None])[0]
     return make_transform(rotation, (1 - share) * T_a[:3, 3] + share * T_b[:3, 3])
+
+
+def quaternions_of(rotations: Array) -> Array:
+    """Return quaternions (N, 4), x y z w with w >= 0, of rotations (N, 3, 3).
+
+    4 q qᵀ has the trace and the differences and sums of the entries for its own; its longest row is
+    the best conditioned (Shepperd, 1978).
+    """
+    R = rotations
+    squares = np.empty((len(R), 4, 4))
+    trace = np.trace(R, axis1=1, axis2=2)
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        squares[:, i, i] = 1 + 2 * R[:, i, i] - trace
+        squares[:, j, k] = squares[:, k, j] = R[:, j, k] + R[:, k, j]
+        squares[:, i, 3] = squares[:, 3, i] = R[:, k, j] - R[:, j, k]
+    squares[:, 3, 3] = 1 + trace
+    longest = np.argmax(np.diagonal(squares, axis1=1, axis2=2), axis=1)
+    found = squares[np.arange(len(R)), longest]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found * np.where(found[:, 3:] < 0, -1.0, 1.0)

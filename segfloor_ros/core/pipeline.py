@@ -15,11 +15,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.core.cloud import CloudLabelling, LabelledPoints
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.configuration import MAX_KEYFRAMES_UNDER_WAY, Configuration
+from segfloor_ros.core.contracts import (
+    FloorObservation,
+    FloorScan,
+    FrameResult,
+    Keyframe,
+    KeyframeFeatures,
+    KeyframePath,
+    LabelledPoints,
+    Mount,
+    SparseCloud,
+    StereoFrame,
+)
 from segfloor_ros.core.files.results import Arrays, MapFile, read_map_file, take, write_map_file
-from segfloor_ros.core.floor.observation import FloorObservation, FloorScan
 from segfloor_ros.core.floor.plane.mount import MountEstimator
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.grid.keyframe_evidence import LENGTHS
@@ -35,14 +46,7 @@ from segfloor_ros.core.plugins.saved_slam import (
 )
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, SEEN_LENGTHS, LabelMap, Labels
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, Network
-from segfloor_ros.core.slam.results import (
-    FrameResult,
-    Keyframe,
-    KeyframeFeatures,
-    KeyframePath,
-    SparseCloud,
-    StereoSlamSettings,
-)
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.timing import StageTimes
 

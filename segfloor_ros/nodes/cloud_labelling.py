@@ -11,10 +11,10 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
 
-from segfloor_ros.core.cloud import FLOOR, CloudLabelling, LabelledPoints
+from segfloor_ros.core.cloud import CloudLabelling
+from segfloor_ros.core.contracts import POINT_FLOOR, LabelledPoints, SparseCloud
 from segfloor_ros.core.files.results import MapFile
 from segfloor_ros.core.settings import RobotSettings
-from segfloor_ros.core.slam.results import SparseCloud
 from segfloor_ros.nodes.configuration import ROBOT_PARAMETERS, CloudLabellingNodeSettings
 from segfloor_ros.nodes.messages import arrays
 from segfloor_ros.nodes.messages.arrays import grey8_image
@@ -117,7 +117,7 @@ class CloudLabellingNode(StageNode[CloudLabellingNodeSettings]):
     def _publish_by_label(self, stamp_ns: int, frame_id: str, labelled: LabelledPoints) -> None:
         """Publish floor and obstacles, each while someone listens."""
         if self.outputs.listeners('floor_points'):
-            rows = np.flatnonzero(labelled.label == FLOOR)
+            rows = np.flatnonzero(labelled.label == POINT_FLOOR)
             floor = arrays.points_at(stamp_ns, frame_id, labelled, rows)
             self.outputs.publish('floor_points', floor)
         self._newest, self._listeners = (frame_id, labelled), 0

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.cloud import CloudLabellingSettings
 from segfloor_ros.core.configuration import Configuration, merge
 from segfloor_ros.core.errors import SettingsError, about
 from segfloor_ros.core.files.whole import shortened
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 from segfloor_ros.core.settings import GONE, RobotSettings, StageSettings, setting, suggestion
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.nodes.yaml_files import read_yaml, yaml_value
 
 # Parameters of every ROS node: allowed in a parameter file, no concern of the stages.

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.images import eye_calibration
-from segfloor_ros.core.camera.model import Mount, StereoCamera
-from segfloor_ros.core.floor.segmentation import (
-    FloorSegmentation,
-    mask_overlay,
-    v_disparity_picture,
-)
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.floor.pictures import mask_overlay, v_disparity_picture
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.nodes.configuration import FloorSegmentationNodeSettings
 from segfloor_ros.nodes.messages.arrays import (
     disparity_message,

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.plugins.semantics.label_map import LabelMap, numbered
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller, NetworkSettings
-from segfloor_ros.core.slam.results import KeyframePath
 from segfloor_ros.nodes.configuration import SegfloorMasksNodeSettings
 from segfloor_ros.nodes.messages.arrays import (
     colour8_image,

@@ -27,7 +27,7 @@ from segfloor_ros.core.camera.images import (
     eye_calibration,
     grey_image,
 )
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.plugins.rig.check import InputFault
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings

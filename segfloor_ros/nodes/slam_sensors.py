@@ -19,7 +19,8 @@ from sensor_msgs.msg import Image, Imu
 
 from segfloor_ros.core.camera.calibration import StereoRectifier
 from segfloor_ros.core.camera.images import imu_sample, measures_motion, wheel_pose, xyz
-from segfloor_ros.core.camera.model import Measurement, WheelPose, is_upright
+from segfloor_ros.core.camera.recording import is_upright
+from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.core.slam.rig import GATE, chi2_limit
 from segfloor_ros.core.slam.stereo_slam import StereoSlam

@@ -17,20 +17,19 @@ from rosgraph_msgs.msg import Clock
 
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.images import Grey
-from segfloor_ros.core.camera.model import (
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.recording import (
     DEPTH,
     IMU_FRAME,
     MAX_LAG_S,
     SENSORS,
-    Measurement,
     MeasurementLog,
     RawPair,
     RecordedSensor,
-    StereoCamera,
     StereoCameraSettings,
-    WheelPose,
 )
 from segfloor_ros.core.configuration import MAX_KEYFRAMES_UNDER_WAY
+from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, SegfloorError
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.nodes.configuration import StereoCameraNodeSettings, StereoSlamNodeSettings

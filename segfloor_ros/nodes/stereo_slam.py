@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.results import MapFile
 from segfloor_ros.core.geometry import MAX_DISORDER_NS

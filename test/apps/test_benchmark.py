@@ -25,12 +25,12 @@ from segfloor_ros.apps.benchmark import (
 from segfloor_ros.apps.cli.commands import DRIVE
 from segfloor_ros.apps.cli.evaluate import benchmark
 from segfloor_ros.apps.evaluation.maps import sample_states
+from segfloor_ros.apps.profiling import ReferenceWorkload
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.geometry import invert, transform_points
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED
 from segfloor_ros.core.pipeline import Pipeline
-from segfloor_ros.core.timing import ReferenceWorkload
 from segfloor_ros.nodes.configuration import resolve
 
 CONFIGURATION = resolve()

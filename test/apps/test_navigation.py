@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.navigation import STOP, Body, Costmap, Explorer, Goal
-from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.contracts import FloorScan
 from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 

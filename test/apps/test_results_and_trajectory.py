@@ -10,10 +10,9 @@ from segfloor_ros.apps.results_folder import (
     submap_intervals,
 )
 from segfloor_ros.apps.trajectory import TrackedPose, Trajectory, corrected_trajectory, write_tum
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert, se3_exp
-from segfloor_ros.core.slam.results import KeyframePath
 from segfloor_ros.core.timing import StageTimes
 
 

@@ -4,23 +4,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.geometry import (
     R_ROS_OPTICAL,
     angles_of_rotation,
     invert,
     make_transform,
-    quaternion_xyzw,
     rotation_angle,
     rotation_from_angles,
     rotation_vectors,
     rotations_by,
     se3_exp,
     se3_log,
-    transform_from_quaternion,
     transform_points,
 )
+from segfloor_ros.core.quaternions import quaternion_xyzw, transform_from_quaternion
 
 
 @pytest.mark.parametrize('scale', [1e-9, 1e-3, 0.5, 2.5])

@@ -3,16 +3,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from segfloor_ros.core.cloud import (
-    FLOOR,
-    OBSTACLE,
-    UNKNOWN,
-    CloudLabelling,
-    CloudLabellingSettings,
+from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
+from segfloor_ros.core.contracts import (
+    NO_POINT,
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    POINT_UNKNOWN,
+    KeyframeFeatures,
     LabelledPoints,
+    SparseCloud,
 )
 from segfloor_ros.core.geometry import make_transform
-from segfloor_ros.core.slam.results import NO_POINT, KeyframeFeatures, SparseCloud
 
 MASK = np.full((40, 60), 127, np.uint8)
 MASK[20:] = 255
@@ -42,7 +43,7 @@ def test_mask_and_height_give_the_label() -> None:
     points = {1: (1.0, 0.0, 0.0), 5: (2.0, 0.0, 0.4), 9: (1.0, 1.0, 0.02)}
     seen = features({1: ON_FLOOR, 5: ON_OBSTACLE, NO_POINT: ON_FLOOR})
     labelled = labelling.update(cloud(points), seen, MASK, HERE)
-    assert label_of(labelled) == {1: FLOOR, 5: OBSTACLE, 9: UNKNOWN}
+    assert label_of(labelled) == {1: POINT_FLOOR, 5: POINT_OBSTACLE, 9: POINT_UNKNOWN}
     assert labelled.confidence[0] > 0.5
     assert labelled.confidence[1] > 0.5
     assert labelled.confidence[2] == 0
@@ -58,12 +59,14 @@ def test_every_look_counts_and_one_wrong_mask_changes_nothing() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     points = cloud({1: (1.0, 0.0, AT_THE_STEP_M)})
     # One look, 0.6, is less than the 0.8 a label takes; two are enough.
-    assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)) == {1: UNKNOWN}
+    assert label_of(labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)) == {
+        1: POINT_UNKNOWN
+    }
     labelled = labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
-    assert label_of(labelled) == {1: FLOOR}
+    assert label_of(labelled) == {1: POINT_FLOOR}
     assert labelled.confidence[0] == pytest.approx(np.tanh(0.6))
     # Contradicted, it keeps its label until the evidence for the other exceeds 0.8: 1.2 - 4 * 0.6.
-    for expected in (FLOOR, FLOOR, FLOOR, OBSTACLE):
+    for expected in (POINT_FLOOR, POINT_FLOOR, POINT_FLOOR, POINT_OBSTACLE):
         labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK, HERE)
         assert label_of(labelled) == {1: expected}
 
@@ -74,7 +77,7 @@ def test_evidence_of_the_mask_is_bounded() -> None:
     for _ in range(50):
         labelling.update(points, features({1: ON_FLOOR}), MASK, HERE)
     # From the bound, 3, seven looks of 0.6 lead beyond the 0.8 that a label takes.
-    for expected in [FLOOR] * 6 + [OBSTACLE]:
+    for expected in [POINT_FLOOR] * 6 + [POINT_OBSTACLE]:
         labelled = labelling.update(points, features({1: ON_OBSTACLE}), MASK, HERE)
         assert label_of(labelled) == {1: expected}
 
@@ -88,7 +91,7 @@ def test_borders_of_the_mask_say_nothing() -> None:
         labelled = labelling.update(
             points, features({1: (30.0, 20.0), 2: (30.0, 21.0)}), mask, np.eye(4)
         )
-    assert label_of(labelled) == {1: UNKNOWN, 2: FLOOR}
+    assert label_of(labelled) == {1: POINT_UNKNOWN, 2: POINT_FLOOR}
 
 
 def test_points_above_the_robot_and_far_below_the_floor_are_neither() -> None:
@@ -96,9 +99,9 @@ def test_points_above_the_robot_and_far_below_the_floor_are_neither() -> None:
     points = cloud({1: (1.0, 0.0, 0.9), 2: (1.0, 0.0, 0.7), 3: (1.0, 0.0, -0.5)})
     seen = features({1: ON_OBSTACLE, 2: ON_OBSTACLE, 3: ON_FLOOR})
     assert label_of(labelling.update(points, seen, MASK, HERE)) == {
-        1: UNKNOWN,
-        2: OBSTACLE,
-        3: UNKNOWN,
+        1: POINT_UNKNOWN,
+        2: POINT_OBSTACLE,
+        3: POINT_UNKNOWN,
     }
 
 
@@ -110,7 +113,7 @@ def test_removed_points_disappear_moved_ones_move_ids_stay() -> None:
     after = {1: (9.0, 0.0, 0.0), 4: (2.5, 0.1, 0.5), 7: (3.0, 0.0, 2.0)}
     labelled = labelling.update(cloud(after), features({}), MASK, HERE)
     # 7 was corrected to above the robot; 1 was never looked at; 2 is gone.
-    assert label_of(labelled) == {1: UNKNOWN, 4: OBSTACLE, 7: UNKNOWN}
+    assert label_of(labelled) == {1: POINT_UNKNOWN, 4: POINT_OBSTACLE, 7: POINT_UNKNOWN}
     np.testing.assert_allclose(labelled.xyz_map[1], [2.5, 0.1, 0.5])
 
 
@@ -123,10 +126,10 @@ def test_what_is_known_of_a_cloud_waits_until_its_points_are_there_again() -> No
     labelling.update(cloud(first), seen, MASK, HERE)
     seen = features({10: ON_OBSTACLE, 11: ON_OBSTACLE, 12: ON_FLOOR})
     labelled = labelling.update(cloud(second), seen, MASK, HERE)
-    of_second = {10: OBSTACLE, 11: OBSTACLE, 12: FLOOR}
+    of_second = {10: POINT_OBSTACLE, 11: POINT_OBSTACLE, 12: POINT_FLOOR}
     assert label_of(labelled) == of_second
     both = labelling.update(cloud(first | second), features({}), MASK, HERE)
-    assert label_of(both) == {2: FLOOR, 4: OBSTACLE} | of_second
+    assert label_of(both) == {2: POINT_FLOOR, 4: POINT_OBSTACLE} | of_second
 
 
 def test_heights_are_those_above_the_floor_below_the_base() -> None:
@@ -135,7 +138,7 @@ def test_heights_are_those_above_the_floor_below_the_base() -> None:
     seen = features({1: NOWHERE, 2: NOWHERE})
     upstairs = make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
     labelled = labelling.update(points, seen, MASK, upstairs)
-    assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE}
+    assert label_of(labelled) == {1: POINT_FLOOR, 2: POINT_OBSTACLE}
 
 
 def test_on_a_ramp_heights_are_those_above_the_ramp() -> None:
@@ -147,7 +150,7 @@ def test_on_a_ramp_heights_are_those_above_the_ramp() -> None:
     in_base = {1: (1.2, 0.3, 0.0), 2: (1.2, -0.3, 0.4), 3: (-1.2, 0.0, 0.0)}
     points = cloud({i: tuple(R @ xyz + ramp[:3, 3]) for i, xyz in in_base.items()})
     labelled = labelling.update(points, features(dict.fromkeys(in_base, NOWHERE)), MASK, ramp)
-    assert label_of(labelled) == {1: FLOOR, 2: OBSTACLE, 3: FLOOR}
+    assert label_of(labelled) == {1: POINT_FLOOR, 2: POINT_OBSTACLE, 3: POINT_FLOOR}
 
 
 def test_heights_of_far_points_count_less() -> None:
@@ -155,15 +158,19 @@ def test_heights_of_far_points_count_less() -> None:
     seen = features({1: NOWHERE})
     close = near.update(cloud({1: (1.0, 0.0, 0.07)}), seen, MASK, HERE)
     distant = far.update(cloud({1: (9.0, 0.0, 0.07)}), seen, MASK, HERE)
-    assert label_of(close) == {1: OBSTACLE}
-    assert label_of(distant) == {1: UNKNOWN}
+    assert label_of(close) == {1: POINT_OBSTACLE}
+    assert label_of(distant) == {1: POINT_UNKNOWN}
 
 
 def test_the_nearest_look_says_how_exact_a_height_is() -> None:
     labelling, seen = CloudLabelling(CloudLabellingSettings()), features({1: NOWHERE})
     point, far_base = cloud({1: (1.0, 0.0, 0.07)}), np.eye(4)
     far_base[0, 3] = -8.0
-    for base, expected in ((far_base, UNKNOWN), (HERE, OBSTACLE), (far_base, OBSTACLE)):
+    for base, expected in (
+        (far_base, POINT_UNKNOWN),
+        (HERE, POINT_OBSTACLE),
+        (far_base, POINT_OBSTACLE),
+    ):
         assert label_of(labelling.update(point, seen, MASK, base)) == {1: expected}
     assert labelling.to_arrays()['distance_m'] == [1.0]
 
@@ -198,7 +205,7 @@ def test_labels_do_not_depend_on_which_points_were_judged_anew() -> None:
         np.testing.assert_array_equal(one.label, other.label)
         np.testing.assert_array_equal(one.confidence, other.confidence)
         unmoved += len(xyz) - len(pixels)
-    assert set(one.label.tolist()) == {UNKNOWN, FLOOR, OBSTACLE}
+    assert set(one.label.tolist()) == {POINT_UNKNOWN, POINT_FLOOR, POINT_OBSTACLE}
     assert unmoved > 1000
 
 
@@ -206,9 +213,9 @@ def test_changed_settings_judge_points_that_are_out_of_sight() -> None:
     labelling = CloudLabelling(CloudLabellingSettings())
     seen = features({1: ON_OBSTACLE})
     points = cloud({1: (1.0, 0.0, 0.5)})
-    assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: OBSTACLE}
+    assert label_of(labelling.update(points, seen, MASK, HERE)) == {1: POINT_OBSTACLE}
     labelling.settings = dataclasses.replace(labelling.settings, robot_height_m=0.4)
-    assert label_of(labelling.update(points, features({}), MASK, HERE)) == {1: UNKNOWN}
+    assert label_of(labelling.update(points, features({}), MASK, HERE)) == {1: POINT_UNKNOWN}
 
 
 @pytest.mark.parametrize('at', [(0.0, 0.0), (-1.512, 1.26), (0.0249, -0.0249)])
@@ -217,7 +224,7 @@ def test_a_costmap_gets_obstacles_with_several_corners_and_no_lone_point(at) -> 
     points = {i: (x + at[0], y + at[1], z) for i, (x, y, z) in enumerate(places)}
     labelling, seen = CloudLabelling(CloudLabellingSettings()), dict.fromkeys(points, ON_OBSTACLE)
     labelled = labelling.update(cloud(points), features(seen), MASK, HERE)
-    assert set(label_of(labelled).values()) == {OBSTACLE}
+    assert set(label_of(labelled).values()) == {POINT_OBSTACLE}
     assert labelling.standing(labelled).tolist() == [0, 1, 2]
 
 

@@ -3,7 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segfloor_ros.core.cloud import LabelledPoints, read_ply, write_ply
+from segfloor_ros.apps.ply import read_ply, write_ply
+from segfloor_ros.core.contracts import LabelledPoints
 from segfloor_ros.core.errors import InputError
 
 POINTS = LabelledPoints(

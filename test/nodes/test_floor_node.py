@@ -6,8 +6,9 @@ import numpy as np
 from node_messages import AT_ORIGIN, STAMP_NS, pose_message_at, publish
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
-from segfloor_ros.core.floor.segmentation import FloorSegmentation, mask_overlay
+from segfloor_ros.core.floor.pictures import mask_overlay
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.programs import program_of
-from segfloor_ros.core.geometry import quaternions_of, rotations_of
+from segfloor_ros.core.geometry import quaternions_of
+from segfloor_ros.core.quaternions import rotations_of
 
 USE = """
 import sys

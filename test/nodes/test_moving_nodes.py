@@ -15,8 +15,7 @@ from segfloor_ros.apps.cli.replay_recorder import DriveNotes
 from segfloor_ros.apps.evaluation.exploration import Exploration
 from segfloor_ros.apps.navigation import Body, Explorer
 from segfloor_ros.core.camera.calibration import StereoRectifier
-from segfloor_ros.core.floor.observation import FLOOR
-from segfloor_ros.core.slam.results import MovingPoints, SparseCloud
+from segfloor_ros.core.contracts import FLOOR, MovingPoints, SparseCloud
 from segfloor_ros.core.slam.tracking.images import is_inside
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.messages.arrays import (

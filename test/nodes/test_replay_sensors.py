@@ -13,8 +13,8 @@ from stereo_room import MOUNT, depth_of_room
 from test_replay import segfloor
 
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import StereoFrame
-from segfloor_ros.core.geometry import quaternion_xyzw
+from segfloor_ros.core.contracts import StereoFrame
+from segfloor_ros.core.quaternions import quaternion_xyzw
 
 FRAMES, BLIND = 16, range(8, 11)
 GRAVITY_M_S2 = 9.81

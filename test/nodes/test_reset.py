@@ -14,7 +14,7 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
-from segfloor_ros.core.camera.model import Mount, StereoFrame
+from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.configuration import resolve

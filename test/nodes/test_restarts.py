@@ -14,8 +14,7 @@ from node_messages import grid_arrays
 from ros_graph import fresh_graph, surroundings
 from stereo_drive import room_drive, write_kitti
 
-from segfloor_ros.core.camera.model import StereoFrame
-from segfloor_ros.core.cloud import UNKNOWN, LabelledPoints
+from segfloor_ros.core.contracts import POINT_UNKNOWN, LabelledPoints, StereoFrame
 from segfloor_ros.core.files.results import MapFile
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
@@ -172,10 +171,10 @@ def test_a_node_that_is_killed_goes_on_where_it_was(journey, node) -> None:
     assert np.mean(same) > 0.97
     ids = cloud_after.point_id
     assert (np.diff(ids) > 0).all()
-    both = np.intersect1d(cloud.point_id[cloud.label != UNKNOWN], ids)
+    both = np.intersect1d(cloud.point_id[cloud.label != POINT_UNKNOWN], ids)
     assert len(both) > 100
     rows = np.searchsorted(ids, both)
-    assert (cloud_after.label[rows] != UNKNOWN).mean() > 0.95
+    assert (cloud_after.label[rows] != POINT_UNKNOWN).mean() > 0.95
     assert 'Traceback' not in chain.log(node)
     assert ('resumed with the map' in chain.log(node)) == (node != FLOOR)
 

@@ -12,10 +12,17 @@ from node_messages import publish
 from small_network import constant_network, grey_network
 from stereo_room import CAMERA, MOUNT
 
+from segfloor_ros.core.contracts import (
+    FLOOR,
+    MOVING,
+    NO_POINT,
+    FloorObservation,
+    FloorScan,
+    KeyframeFeatures,
+    KeyframePath,
+)
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.floor.observation import FLOOR, MOVING, FloorObservation, FloorScan
 from segfloor_ros.core.grid.occupancy import FREE, UNKNOWN, OccupancyGrid
-from segfloor_ros.core.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
 from segfloor_ros.core.slam.tracking.images import is_inside
 from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,

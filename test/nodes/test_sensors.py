@@ -15,8 +15,9 @@ from stereo_room import MOUNT, depth_of_room
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.core.camera.images import imu_sample, wheel_pose
-from segfloor_ros.core.camera.model import ImuSample, StereoFrame, WheelPose
-from segfloor_ros.core.geometry import invert, make_transform, quaternion_xyzw
+from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
+from segfloor_ros.core.geometry import invert, make_transform
+from segfloor_ros.core.quaternions import quaternion_xyzw
 from segfloor_ros.nodes import slam_camera
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode

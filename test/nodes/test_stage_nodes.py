@@ -28,18 +28,19 @@ from stereo_room import CAMERA, MOUNT
 
 from segfloor_ros.apps.stereo_camera import make_stereo_camera
 from segfloor_ros.core.camera.images import eye_calibration
-from segfloor_ros.core.camera.model import Mount
-from segfloor_ros.core.cloud import FLOOR, CloudLabelling, CloudLabellingSettings
-from segfloor_ros.core.floor.observation import (
-    FloorSegmentationSettings,
-    free_ranges,
-    near_obstacles,
+from segfloor_ros.core.cloud import CloudLabelling, CloudLabellingSettings
+from segfloor_ros.core.contracts import (
+    POINT_FLOOR,
+    KeyframeFeatures,
+    KeyframePath,
+    Mount,
+    SparseCloud,
 )
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
-from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 from segfloor_ros.nodes.cloud_labelling import CloudLabellingNode
 from segfloor_ros.nodes.floor_segmentation import FloorSegmentationNode
 from segfloor_ros.nodes.map_files import load_map
@@ -61,6 +62,7 @@ from segfloor_ros.nodes.messages.poses import (
     transform_array,
     transform_message,
 )
+from segfloor_ros.nodes.messages.scans import free_ranges, near_obstacles
 from segfloor_ros.nodes.messages.topics import to_ns
 from segfloor_ros.nodes.occupancy_grid import OccupancyGridNode
 from segfloor_ros.nodes.stereo_slam import StereoSlamNode
@@ -298,7 +300,7 @@ def test_cloud_labelling_is_the_stage(make_graph) -> None:
     for name in ('point_id', 'xyz_map', 'label', 'confidence'):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     ids = sparse_cloud_arrays(floor[0], '').point_id
-    np.testing.assert_array_equal(ids, expected.point_id[expected.label == FLOOR])
+    np.testing.assert_array_equal(ids, expected.point_id[expected.label == POINT_FLOOR])
 
 
 def test_a_missing_partner_is_named_and_the_next_keyframe_goes_through(make_graph) -> None:

@@ -10,8 +10,9 @@ from node_chain import NodeChain
 from stereo_drive import room_drive
 from stereo_room import MOUNT
 
-from segfloor_ros.core.camera.model import Mount
-from segfloor_ros.core.geometry import FrameTree, invert, make_transform
+from segfloor_ros.core.contracts import Mount
+from segfloor_ros.core.geometry import invert, make_transform
+from segfloor_ros.nodes.frame_tree import FrameTree
 from segfloor_ros.nodes.messages.poses import pose_array, transform_array, transform_message
 from segfloor_ros.nodes.messages.topics import KEYFRAMES, LATCHED, LATCHED_BY_MANY, SLAM, to_ns
 

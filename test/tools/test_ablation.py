@@ -8,9 +8,10 @@ from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA, MOUNT
 from typer.testing import CliRunner
 
-from segfloor_ros.core.camera.model import RecordedSensor, StereoFrame, WheelPose
+from segfloor_ros.core.camera.recording import RecordedSensor
+from segfloor_ros.core.contracts import StereoFrame, WheelPose
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.nodes.configuration import resolve
 from tools.ablation import app

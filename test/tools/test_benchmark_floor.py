@@ -10,8 +10,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from segfloor_ros.core.errors import InputError, MapError
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
 from segfloor_ros.core.floor.segmentation import DISPARITY, DISPARITY_ABOVE
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.nodes.configuration import resolve
 from tools.benchmark_floor import benchmark_floor, disparity_table, steps_table
 from tools.disparity_choices import TruePair, choices, read_pairs, score, visible

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from segfloor_ros.apps.cli.terminal import Json, console, print_json, value_table
 from segfloor_ros.apps.evaluation.maps import resample
 from segfloor_ros.apps.label_files import draw_labels, filter_mask, save_labels
+from segfloor_ros.core.contracts import KeyframePath, SparseCloud
 from segfloor_ros.core.errors import InputError, MapError, SettingsError
 from segfloor_ros.core.files.images import png_bytes
 from segfloor_ros.core.files.results import (
@@ -28,7 +29,7 @@ from segfloor_ros.core.files.results import (
     write_map_file,
 )
 from segfloor_ros.core.files.writing import PNG, check_output, marked_png, write_output
-from segfloor_ros.core.floor.segmentation import MASK_COLOURS
+from segfloor_ros.core.floor.pictures import MASK_COLOURS
 from segfloor_ros.core.geometry import planar
 from segfloor_ros.core.grid.keyframe_evidence import evidence_from_arrays, evidence_to_arrays
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
@@ -54,7 +55,6 @@ from segfloor_ros.core.plugins.saved_slam import (
 from segfloor_ros.core.plugins.semantics.label_map import LABELS, LabelMap, Labels
 from segfloor_ros.core.slam.places.loop_closing import OFFSET, as_seen_by, merge_slam
 from segfloor_ros.core.slam.places.loops import MAX_SLOPE, MAX_STEP_UP_M
-from segfloor_ros.core.slam.results import KeyframePath, SparseCloud
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.nodes.map_files import check_map_output, save_map
 

@@ -30,7 +30,7 @@ from segfloor_ros.apps.recordings.bag_writer import convert as write_bag
 from segfloor_ros.apps.recordings.opening import Inspection, Stream, inspect_recording, size_mb
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.apps.results_folder import read_summary
-from segfloor_ros.core.camera.model import DEPTH
+from segfloor_ros.core.camera.recording import DEPTH
 from segfloor_ros.core.errors import InputError, SettingsError, os_errors
 from segfloor_ros.core.files.results import is_map_file
 from segfloor_ros.core.files.whole import user_path

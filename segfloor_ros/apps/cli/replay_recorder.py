@@ -22,12 +22,12 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo
 
 from segfloor_ros.apps.cli.view import View
+from segfloor_ros.apps.profiling import MemoryLog
 from segfloor_ros.apps.results_folder import DriveFrame
 from segfloor_ros.apps.trajectory import TrackedPose
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import KeyframePath, Mount
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.results import KeyframePath
-from segfloor_ros.core.timing import MemoryLog, StageTimes
+from segfloor_ros.core.timing import StageTimes
 from segfloor_ros.nodes.messages import diagnostics
 from segfloor_ros.nodes.messages.arrays import (
     bgr_image,

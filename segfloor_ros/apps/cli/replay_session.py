@@ -34,16 +34,15 @@ from segfloor_ros.apps.label_files import labels_of
 from segfloor_ros.apps.lockstep import NO_MAPS, MapOptions, ProgressListener, no_floor
 from segfloor_ros.apps.results_folder import RunResult, summarise
 from segfloor_ros.apps.trajectory import Trajectory, corrected_trajectory
-from segfloor_ros.core.camera.model import DEPTH, SENSORS
-from segfloor_ros.core.cloud import CloudLabelling, LabelledPoints
+from segfloor_ros.core.camera.recording import DEPTH, SENSORS
+from segfloor_ros.core.cloud import CloudLabelling
 from segfloor_ros.core.configuration import Configuration
+from segfloor_ros.core.contracts import KeyframePath, LabelledPoints
 from segfloor_ros.core.errors import InputError, MapError, SegfloorError
 from segfloor_ros.core.files.results import MapFile
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
 from segfloor_ros.core.plugins.saved_slam import loaded_map, new_keyframes
-from segfloor_ros.core.processes import Interrupt
-from segfloor_ros.core.slam.results import KeyframePath
-from segfloor_ros.core.timing import rss_mb
+from segfloor_ros.core.processes import Interrupt, rss_mb
 from segfloor_ros.nodes.map_files import load_map
 from segfloor_ros.nodes.messages.arrays import grid_of, labelled_arrays, sparse_cloud_arrays
 from segfloor_ros.nodes.messages.diagnostics import HEALTH_PERIOD_S, Level, Status

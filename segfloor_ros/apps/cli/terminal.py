@@ -36,7 +36,7 @@ from segfloor_ros.apps.results_folder import (
     stage_rows,
     summary_rows,
 )
-from segfloor_ros.core.camera.model import RecordedSensor
+from segfloor_ros.core.camera.recording import RecordedSensor
 from segfloor_ros.core.configuration import Configuration
 from segfloor_ros.core.errors import SettingsError, printable
 from segfloor_ros.core.processes import Interrupt

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from segfloor_ros.apps.cli.terminal import console, progress_bar
 from segfloor_ros.apps.label_files import class_colours, draw_labels
+from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.recordings import StereoSource, open_source
 from segfloor_ros.apps.results_folder import (
     MAP,
@@ -32,19 +33,27 @@ from segfloor_ros.apps.results_folder import (
     summary_rows,
 )
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import Mount, StereoFrame
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, LabelledPoints, read_ply
+from segfloor_ros.core.contracts import (
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    FloorObservation,
+    FrameResult,
+    Keyframe,
+    KeyframePath,
+    LabelledPoints,
+    Mount,
+    MovingPoints,
+    StereoFrame,
+)
 from segfloor_ros.core.errors import InputError, SettingsError
 from segfloor_ros.core.files.images import jpeg_bytes, read_mask, read_picture
 from segfloor_ros.core.files.whole import read_text
 from segfloor_ros.core.files.writing import VIEW, check_output
-from segfloor_ros.core.floor.observation import FloorObservation
-from segfloor_ros.core.floor.segmentation import MASK_COLOURS, mask_overlay
+from segfloor_ros.core.floor.pictures import MASK_COLOURS, mask_overlay
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import UNKNOWN_PIXEL, OccupancyGrid
 from segfloor_ros.core.pipeline import Pipeline
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
-from segfloor_ros.core.slam.results import FrameResult, Keyframe, KeyframePath, MovingPoints
 from segfloor_ros.nodes.configuration import resolve
 from segfloor_ros.nodes.map_files import load_map
 
@@ -280,8 +289,8 @@ class View:
             return
         levels = np.clip(255 / HIGH_M * points.xyz_map[:, 2], 0, 255).astype(np.uint8)
         rgb = cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA).reshape(-1, 3)[:, ::-1].copy()
-        rgb[points.label != OBSTACLE] = UNKNOWN_PIXEL
-        rgb[points.label == FLOOR] = FLOOR_RGB
+        rgb[points.label != POINT_OBSTACLE] = UNKNOWN_PIXEL
+        rgb[points.label == POINT_FLOOR] = FLOOR_RGB
         cloud = self._rr.Points3D(points.xyz_map, colors=rgb, radii=POINT_M)
         self.canvas.log(stamp_ns, 'world/cloud', cloud)
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import check_same_size, read_mask
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.nodes.yaml_files import read_yaml
 
 OUTLINES = ('floor', 'obstacle', 'unsure')

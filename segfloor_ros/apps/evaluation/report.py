@@ -29,7 +29,7 @@ from segfloor_ros.apps.results_folder import REPORT, SEMANTIC, STAGE_COLUMNS, st
 from segfloor_ros.core.errors import os_errors
 from segfloor_ros.core.files.whole import read_bytes
 from segfloor_ros.core.files.writing import MARK, add_files
-from segfloor_ros.core.floor.segmentation import MASK_COLOURS
+from segfloor_ros.core.floor.pictures import MASK_COLOURS
 
 NO_TEXT = re.compile('[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]')
 """In names of files: what controls a terminal, and bytes that are not UTF-8."""

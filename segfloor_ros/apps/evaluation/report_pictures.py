@@ -21,18 +21,26 @@ from numpy.typing import NDArray
 
 from segfloor_ros.apps.calibration import CalibrationResult, eight_bit, rectified_pixels
 from segfloor_ros.apps.evaluation.maps import MapTruth, load_truth, thinned
+from segfloor_ros.apps.ply import read_ply
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.results_folder import MOUNT_FIGURES, read_summary
 from segfloor_ros.apps.trajectory import read_trajectory
 from segfloor_ros.core.camera.calibration import StereoRectifier
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
-from segfloor_ros.core.cloud import FLOOR as FLOOR_POINT
-from segfloor_ros.core.cloud import OBSTACLE, LabelledPoints, read_ply
-from segfloor_ros.core.cloud import UNKNOWN as UNKNOWN_POINT
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import (
+    CELL_M,
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    POINT_UNKNOWN,
+    LabelledPoints,
+    Mount,
+    StereoFrame,
+)
 from segfloor_ros.core.files.images import check_same_size, jpeg_bytes, read_grey, read_mask
 from segfloor_ros.core.files.whole import read_text
-from segfloor_ros.core.floor.observation import CELL_M, FloorSegmentationSettings
-from segfloor_ros.core.floor.segmentation import FloorSegmentation, mask_overlay
+from segfloor_ros.core.floor.pictures import mask_overlay
+from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.grid.occupancy import (
     FREE_PIXEL,
@@ -72,10 +80,10 @@ def cloud_picture(data: ReportData) -> bytes:
     """Draw the labelled cloud from above: floor green, obstacles by height."""
     figure, axes = _figure(data.grid)
     axes.set_facecolor('#f4f4f4')
-    for label, colour in ((UNKNOWN_POINT, NO_EVIDENCE), (FLOOR_POINT, FLOOR)):
+    for label, colour in ((POINT_UNKNOWN, NO_EVIDENCE), (POINT_FLOOR, FLOOR)):
         points = thinned(data.cloud.xyz_map[data.cloud.label == label])
         axes.scatter(points[:, 0], points[:, 1], s=1.0, color=colour, linewidths=0)
-    points = thinned(data.cloud.xyz_map[data.cloud.label == OBSTACLE])
+    points = thinned(data.cloud.xyz_map[data.cloud.label == POINT_OBSTACLE])
     drawn = axes.scatter(
         points[:, 0], points[:, 1], s=1.6, c=points[:, 2], cmap='plasma', vmin=0, vmax=2,
         linewidths=0,

@@ -40,17 +40,13 @@ from segfloor_ros.core.camera.images import (
     wheel_pose,
     xyz,
 )
-from segfloor_ros.core.camera.model import (
-    Measurement,
-    RecordedSensor,
-    StereoCamera,
-    StereoCameraSettings,
-    WheelPose,
-    is_upright,
-)
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings, is_upright
+from segfloor_ros.core.contracts import Measurement, WheelPose
 from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.files.whole import checked_ns
-from segfloor_ros.core.geometry import Array, FrameTree, make_transform
+from segfloor_ros.core.geometry import Array, make_transform
+from segfloor_ros.nodes.frame_tree import FrameTree
 from segfloor_ros.nodes.shared.joining import Stamped
 
 FIRST_MESSAGES = 50

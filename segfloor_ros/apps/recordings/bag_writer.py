@@ -19,19 +19,14 @@ from segfloor_ros.apps.recordings.bag_file import CAMERA_INFO, COMPRESSED, IMAGE
 from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.images import NOT_MEASURED
-from segfloor_ros.core.camera.model import (
-    IMU_FRAME,
-    ImuSample,
-    Measurement,
-    MeasurementLog,
-    RawPair,
-    WheelPose,
-    is_disparity,
-)
+from segfloor_ros.core.camera.model import is_disparity
+from segfloor_ros.core.camera.recording import IMU_FRAME, MeasurementLog, RawPair
+from segfloor_ros.core.contracts import ImuSample, Measurement, WheelPose
 from segfloor_ros.core.errors import InputError, os_errors
 from segfloor_ros.core.files.images import jpeg_bytes, png_bytes
 from segfloor_ros.core.files.writing import scratch_folder
-from segfloor_ros.core.geometry import Array, make_transform, quaternion_xyzw
+from segfloor_ros.core.geometry import Array, make_transform
+from segfloor_ros.core.quaternions import quaternion_xyzw
 
 SIDES = ('left', 'right')
 FRAME_IDS = ('left_camera_optical_frame', 'right_camera_optical_frame')

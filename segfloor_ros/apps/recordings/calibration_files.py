@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.files.whole import number, read_lines
 from segfloor_ros.core.files.writing import MARK

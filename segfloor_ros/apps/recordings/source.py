@@ -19,14 +19,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.calibration import StereoCalibration, StereoRectifier
 from segfloor_ros.core.camera.images import EightBitScale, to_grey
-from segfloor_ros.core.camera.model import (
-    DEPTH,
-    RawPair,
-    RecordedSensor,
-    StereoCamera,
-    StereoFrame,
-    is_disparity,
-)
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.recording import DEPTH, RawPair, RecordedSensor
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import CorruptImageError, Grey, check_same_size, read_mask
 from segfloor_ros.nodes.shared.joining import Stamped, StampJoiner

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros import MAX_PIXELS
 from segfloor_ros.apps.simulation.scene import CameraRig, DepthSensor, Scene
 from segfloor_ros.core.camera.calibration import FISHEYE_RESOLUTION, EyeCalibration
-from segfloor_ros.core.camera.images import SAME_SURFACE_SHARE
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import SAME_SURFACE_SHARE
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.apps.simulation.scene import Route, Scene, Vibration, Wheels
 from segfloor_ros.apps.simulation.solids import Prism, floor_height_m
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import Array, make_transform
 

@@ -18,17 +18,16 @@ from segfloor_ros.apps.simulation.scene import Car, Imu, Mover, MovingBox, Perso
 from segfloor_ros.apps.simulation.scene_file import EXPECTED, shipped
 from segfloor_ros.apps.simulation.solids import Prism, floor_height_m, floors, obstacles, place
 from segfloor_ros.apps.simulation.world import import_mujoco
-from segfloor_ros.core.camera.model import ImuSample, Mount, WheelPose
+from segfloor_ros.core.contracts import ImuSample, Mount, WheelPose
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import (
     Array,
     invert,
     make_transform,
-    quaternion_xyzw,
     rotation_from_angles,
-    transform_from_quaternion,
     transform_points,
 )
+from segfloor_ros.core.quaternions import quaternion_xyzw, transform_from_quaternion
 from segfloor_ros.core.settings import suggestion
 from segfloor_ros.nodes.yaml_files import read_yaml
 

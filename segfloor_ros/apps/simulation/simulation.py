@@ -41,8 +41,9 @@ from segfloor_ros.apps.simulation.world import CAMERAS, View, WorldRenderer, bui
 from segfloor_ros.core.errors import InputError, os_errors
 from segfloor_ros.core.files.images import png_bytes
 from segfloor_ros.core.files.writing import check_target, folder_in_the_making, move_into_place
-from segfloor_ros.core.geometry import Array, invert, quaternion_xyzw
+from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.core.grid.occupancy import OCCUPIED, OccupancyGrid
+from segfloor_ros.core.quaternions import quaternion_xyzw
 from segfloor_ros.nodes.map_files import save_map
 
 DISPARITY_SCALE = 256

@@ -31,7 +31,8 @@ from segfloor_ros.apps.simulation.solids import (
 )
 from segfloor_ros.apps.simulation.textures import Texture, make_texture
 from segfloor_ros.core.errors import SegfloorError
-from segfloor_ros.core.geometry import Array, quaternion_xyzw
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.quaternions import quaternion_xyzw
 
 SHADOW_PX = 4096
 """Side of the picture of the shadows, which the sun casts within 12 m of the origin."""

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from segfloor_ros import __version__
+from segfloor_ros.apps.profiling import ReferenceWorkload
 from segfloor_ros.apps.suite.description import REPLAY, RESULTS, SCENE, Entry
 from segfloor_ros.apps.suite.measures import Outcome, measure_run, start_pose_of
 from segfloor_ros.apps.suite.result_files import Cache, digest_of, local_copy, pack, unpack
@@ -39,7 +40,6 @@ from segfloor_ros.core.processes import (
     interrupts_deferred,
     start_apart,
 )
-from segfloor_ros.core.timing import ReferenceWorkload
 
 LOG = 'log.txt'
 

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from segfloor_ros import MAX_PIXELS
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.model import ImuSample, StereoCamera, WheelPose, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import Disparity
+from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import (
     CorruptImageError,
@@ -32,10 +34,8 @@ from segfloor_ros.core.files.images import (
     decode_colour,
     decode_file,
 )
-from segfloor_ros.core.geometry import Array, transform_from_quaternion
-
-Region = NDArray[np.uint8]
-"""A mask (H, W) uint8 of the left image, 255 where something is left out, e.g. moves."""
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.quaternions import transform_from_quaternion
 
 USUAL_BIT_DEPTHS = (8, 10, 12, 14, 16)
 
@@ -55,44 +55,18 @@ CHANNELS = {
 """Channels by encoding, as in `sensor_msgs/image_encodings.hpp` and cv_bridge's generic names."""
 
 
-SUBPIXEL = 16
-"""OpenCV's semi-global disparities are in 1/16 px, and their number is a multiple of as many."""
-
 DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
 DEPTH_HEADER = struct.Struct('<iff')
 """What compressed_depth_image_transport writes before the PNG: a format, and for depth in metres a
 and b of the pixel's value a / depth + b."""
 
-_STEP_PX = 2
-_MARGIN_PX = 12
-"""Blocks that are matched and windows of texture reach so far: the border's edge is no texture."""
-_BLACK = 2
-"""So bright a black border is at most: JPEG is not exact."""
-_SURELY = 3
-"""What was seen so often to be bright is part of the scene."""
-_LEAST_PX = 40
-"""Black pixels of the scene that touch the image's edge are fewer, at half the resolution."""
 
 NOT_MEASURED = -1.0
 """First element of a covariance of what an IMU does not measure (sensor_msgs/Imu)."""
 
 VIRTUAL_BASELINE_M = 0.075
 """Between projector and camera of the first depth cameras; any value would do."""
-
-SIGMA_PER_M = 0.0025
-"""Error of a depth, in metres per square metre (Khoshelham and Elberink, Accuracy and resolution of
-Kinect depth data, Sensors 2012: 0.0014 to 0.0029)."""
-
-SIGMA_M = 0.002
-"""Error of any depth: steps of a millimetre, and a registration that is not perfect."""
-
-SAME_SURFACE_SHARE = 0.05
-"""Depths around a pixel that differ by more are those of two surfaces."""
-
-Disparity = NDArray[np.float32]
-
-SHRUNK_WIDTH_PX = 240
 
 
 def grey_image(message: Any, name: str) -> Grey:
@@ -243,57 +217,6 @@ def _grey_of(pixels: Grey, encoding: str) -> Grey:
     return to_grey(pixels)
 
 
-def union(a: Region | None, b: Region | None) -> Region | None:
-    """Return the region that is in either; None for none at all."""
-    if a is None or b is None:
-        return b if a is None else a
-    return np.maximum(a, b)
-
-
-class BlankBorder:
-    """The black border that rectification leaves in the images of one eye: what is black, joined to
-    an edge, and was never seen to be anything else. A dark thing at the edge moves on.
-    """
-
-    def __init__(self) -> None:
-        self._shape: tuple[int, ...] = ()
-
-    def see(self, image: NDArray[np.uint8]) -> Region | None:
-        """Take in a rectified grey image (H, W). Returns a mask (H, W) uint8, 255 in the border and
-        near it, or None where there is none.
-        """
-        is_black = image[::_STEP_PX, ::_STEP_PX] <= _BLACK
-        if self._shape != image.shape:
-            self._shape, self._black = image.shape, np.zeros(0, np.uint8)
-            self._times_bright = np.zeros(is_black.shape, np.uint8)
-        # A single image may be spoilt.
-        bright = self._times_bright
-        bright[~is_black & (bright < _SURELY)] += 1
-        black = (is_black & (bright < _SURELY)).astype(np.uint8)
-        if not np.array_equal(black, self._black):
-            self._black, self._region = black, _border(black, image.shape)
-        return self._region
-
-
-def _border(black: NDArray[np.uint8], shape: tuple[int, ...]) -> Region | None:
-    """Return what is black (h, w), 0 or 1, along the edges, and a margin around it, as a mask of an
-    image of a shape (H, W); None for nothing.
-    """
-    edges = (black[0], black[-1], black[:, 0], black[:, -1])
-    if sum(int(np.count_nonzero(edge)) for edge in edges) < _LEAST_PX:
-        return None
-    _, label, stats, _ = cv2.connectedComponentsWithStats(black, connectivity=4)
-    touching = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
-    large = touching[(touching > 0) & (stats[touching, cv2.CC_STAT_AREA] >= _LEAST_PX)]
-    if len(large) == 0:
-        return None
-    chosen = np.zeros(len(stats), np.uint8)
-    chosen[large] = 255
-    size = _MARGIN_PX // _STEP_PX * 2 + 1
-    border = cv2.dilate(chosen[label], np.ones((size, size), np.uint8))
-    return np.asarray(cv2.resize(border, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
-
-
 def stamp_ns(message: Any) -> int:
     """Return the stamp in a message's header in ns."""
     stamp = message.header.stamp
@@ -380,106 +303,3 @@ def disparity_of_depth(
     with np.errstate(divide='ignore', invalid='ignore'):
         disparity = np.float32(camera.disparity_times_depth) / metres
     return np.where(np.isfinite(metres) & (metres > 0), disparity, np.float32(np.nan))
-
-
-def disparity_at(disparity: Disparity, camera_depth: float, uv_px: Array) -> tuple[Array, Array]:
-    """Return the disparity (N,) at pixels (N, 2), the median of the neighbours, and its standard
-    deviation (N,); NaN at holes and where two surfaces meet. camera_depth: disparity times depth.
-    """
-    height, width = disparity.shape
-    columns, rows = np.rint(uv_px).astype(np.intp).T
-    steps = np.array([-1, 0, 1])
-    around = disparity[
-        np.clip(rows[:, None, None] + steps[:, None], 0, height - 1),
-        np.clip(columns[:, None, None] + steps, 0, width - 1),
-    ].reshape(len(uv_px), 9)
-    found = np.full(len(uv_px), np.nan)
-    whole = np.isfinite(around).sum(axis=1) >= 6
-    near = around[whole].astype(np.float64)
-    middle = np.nanmedian(near, axis=1) if len(near) else np.zeros(0)
-    spread = np.nanmax(near, axis=1) - np.nanmin(near, axis=1) if len(near) else np.zeros(0)
-    found[whole] = np.where(spread < SAME_SURFACE_SHARE * middle, middle, np.nan)
-    return found, measured_sigma_px(camera_depth, found)
-
-
-def measured_sigma_px(camera_depth: float, disparity_px: Array) -> Array:
-    """Return the error (N,), one sigma, of the disparities (N,) of a depth camera. camera_depth:
-    disparity times depth.
-    """
-    sigma: Array = np.hypot(camera_depth * SIGMA_PER_M, SIGMA_M * disparity_px**2 / camera_depth)
-    return sigma
-
-
-def shrunk(disparity: Disparity, size: tuple[int, int]) -> Disparity:
-    """Return the disparity of an image shrunk to `size` (width, height), in its own pixels, 0 where
-    there is none.
-    """
-    factor = size[0] / disparity.shape[1]
-    small = cv2.resize(disparity, size, interpolation=cv2.INTER_NEAREST)
-    return np.nan_to_num(small * np.float32(factor), nan=0.0).astype(np.float32)
-
-
-def shrunk_disparity(disparity: Disparity, factor: int) -> Disparity:
-    """Return the disparity at (H // factor, W // factor) in the pixels of the shrunk image."""
-    height, width = disparity.shape[0] // factor, disparity.shape[1] // factor
-    half = factor // 2
-    part = disparity[half::factor, half::factor][:height, :width]
-    return np.ascontiguousarray(part / np.float32(factor))
-
-
-def noise_grey(image: NDArray[np.uint8]) -> float:
-    """Return the standard deviation of the image noise in grey levels.
-
-    Immerkaer, Fast Noise Variance Estimation (1996), with a median in place of the mean, so that
-    texture does not count.
-    """
-    part = image[::2]
-    kernel = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
-    response = cv2.filter2D(part, cv2.CV_16S, kernel)
-    return float(np.median(np.abs(response[:, ::4]))) / 0.6745 / float(np.linalg.norm(kernel))
-
-
-def seen_from_right(left: NDArray[np.uint8], disparity: Disparity) -> NDArray[np.uint8]:
-    """Return the right image (H, W) as the virtual right camera would see it: what is nearer hides
-    what is farther; what no depth is known of is as in the left image.
-    """
-    right = left.copy()
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    shift = disparity[rows, columns]
-    order = np.argsort(shift, kind='stable')
-    rows, columns = rows[order], columns[order]
-    target = np.rint(columns - shift[order]).astype(np.intp)
-    inside = target >= 0
-    right[rows[inside], target[inside]] = left[rows[inside], columns[inside]]
-    return right
-
-
-def shrink_factor(camera: StereoCamera) -> int:
-    """Return by how much images of a camera are shrunk, at least 1."""
-    return max(1, round(camera.width / SHRUNK_WIDTH_PX))
-
-
-def shrunk_image(image: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Return an image (H, W) at (H // factor, W // factor), each pixel the mean of a square; of a
-    disparity, float32, one of its pixels.
-    """
-    if is_disparity(image):
-        return shrunk_disparity(image, factor)
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    whole = image[: height * factor, : width * factor]
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
-
-
-def shrunk_camera(camera: StereoCamera, factor: int) -> StereoCamera:
-    """Return the camera of shrunk images. Pixel centres are at whole numbers, so the principal
-    point moves by half a pixel less than the size.
-    """
-    return StereoCamera(
-        camera.width // factor,
-        camera.height // factor,
-        camera.fx / factor,
-        camera.fy / factor,
-        (camera.cx + 0.5) / factor - 0.5,
-        (camera.cy + 0.5) / factor - 0.5,
-        camera.baseline_m,
-    )

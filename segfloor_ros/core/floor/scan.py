@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import SUBPIXEL, shrunk
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import SUBPIXEL, shrunk
+from segfloor_ros.core.contracts import RANGE_MAX_ERROR_M, SAME_SURFACE_SHARE, FloorScan, Mount
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_BLOCK_PX,
     MEAN_NOISE,
@@ -24,12 +25,7 @@ from segfloor_ros.core.floor.disparity.matching import (
     DisparityMatcher,
 )
 from segfloor_ros.core.floor.mask.pixel_evidence import texture_grey
-from segfloor_ros.core.floor.observation import (
-    RANGE_MAX_ERROR_M,
-    SAME_SURFACE_SHARE,
-    FloorScan,
-    FloorSegmentationSettings,
-)
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array, transform_points
 
 RANGE_STEP_M = 0.025

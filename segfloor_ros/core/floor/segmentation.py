@@ -9,12 +9,21 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import BlankBorder, noise_grey, union
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import BlankBorder, noise_grey, union
+from segfloor_ros.core.contracts import (
+    FLOOR,
+    MOVING,
+    NO_EVIDENCE,
+    NOT_FLOOR,
+    FloorObservation,
+    FloorScan,
+    Mount,
+    VDisparity,
+)
 from segfloor_ros.core.floor.disparity.matching import (
     BLOCK_PX,
     MEAN_NOISE,
@@ -64,18 +73,9 @@ from segfloor_ros.core.floor.mask.pixel_evidence import (
     texture_grey,
     unlike_floor,
 )
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    MOVING,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorObservation,
-    FloorScan,
-    FloorSegmentationSettings,
-    VDisparity,
-)
 from segfloor_ros.core.floor.plane.plane import Fixture, expectations, plane_of_frame
 from segfloor_ros.core.floor.scan import FloorScanner, OverheadMatcher
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.timing import NoTimes, StageTimes
 
@@ -88,17 +88,6 @@ _LEAST_SHARE = 0.5
 """
 _BOARD = 2
 """Table tops are thinner than what stands: so many times what is seen of them counts."""
-
-_COLOURS_BGR = {FLOOR: (60, 200, 60), NO_EVIDENCE: (200, 120, 40), NOT_FLOOR: (60, 60, 200)}
-_MOVING_BGR = (200, 40, 225)
-
-MASK_COLOURS = {
-    'floor': _COLOURS_BGR[FLOOR],
-    'not floor': _COLOURS_BGR[NOT_FLOOR],
-    'no evidence': _COLOURS_BGR[NO_EVIDENCE],
-    'moving': _MOVING_BGR,
-}
-"""Blue, green, red of what `mask_overlay` tints."""
 
 
 class FloorSegmentation:
@@ -422,37 +411,3 @@ def clear_hidden(
     """Set a mask of the view to no evidence where the left image shows nothing that counts."""
     if hidden is not None:
         mask[hidden[columns] > 0] = NO_EVIDENCE
-
-
-def mask_overlay(
-    left: NDArray[np.uint8], mask: NDArray[np.uint8], moving: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
-    """Return the left image (H, W) uint8 tinted by the mask (H, W), as (H, W, 3) BGR: green is
-    floor, blue no evidence, red not floor, and magenta what moves, the mask (H, W) of which is 255.
-    """
-    tint = np.zeros((*mask.shape, 3), np.uint8)
-    for value, colour in _COLOURS_BGR.items():
-        tint[mask == value] = colour
-    if moving is not None:
-        tint[moving > 0] = _MOVING_BGR
-    return cv2.addWeighted(cv2.cvtColor(left, cv2.COLOR_GRAY2BGR), 0.65, tint, 0.35, 0)
-
-
-def v_disparity_picture(observation: FloorObservation) -> NDArray[np.uint8]:
-    """Return the filtered v-disparity with the floor's profile in green, (H, B, 3) BGR: rows are
-    rows of the de-rolled image, columns bins of disparity; the brighter the more pixels.
-    """
-    counted, profile = observation.v_disparity, observation.profile_px
-    height, bins = len(profile), counted.counts.shape[1]
-    rows = np.arange(counted.first_row, counted.first_row + len(counted.counts))
-    inside = (rows >= 0) & (rows < height)
-    light = np.log1p(counted.counts[inside].astype(np.float64))
-    grey = np.zeros((height, bins), np.uint8)
-    grey[rows[inside]] = 255 * light / max(light.max(initial=0.0), 1e-6)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    known = np.flatnonzero(np.isfinite(profile))
-    if len(known):
-        points = np.stack([counted.bins_per_px * profile[known], known], axis=1)
-        line = np.rint(points).astype(np.int32)[:, None]
-        cv2.polylines(picture, [line], False, _COLOURS_BGR[FLOOR], 1)
-    return picture.astype(np.uint8)

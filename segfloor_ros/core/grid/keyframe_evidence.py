@@ -16,12 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.core.contracts import (
+    CELL_M,
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    SAME_SURFACE_SHARE,
+    FloorScan,
+    KeyframeFeatures,
+    LabelledPoints,
+)
 from segfloor_ros.core.files.results import Arrays, joined, split
-from segfloor_ros.core.floor.observation import CELL_M, SAME_SURFACE_SHARE, FloorScan
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
-from segfloor_ros.core.slam.results import KeyframeFeatures
 
 _LEAST_DEEP_M = 0.03
 """What stands on the floor is at least this deep behind the face that is seen."""
@@ -159,7 +165,7 @@ def _seen_points(
     row = row[points.point_id[row] == features.point_id]
     in_base = transform_points(invert(T_map_base), points.xyz_map[row].astype(np.float64))
     label = points.label[row]
-    return in_base[label == FLOOR, :2], in_base[label == OBSTACLE, :2]
+    return in_base[label == POINT_FLOOR, :2], in_base[label == POINT_OBSTACLE, :2]
 
 
 def _floor_end(scan: FloorScan, faces_m: Array) -> Array:

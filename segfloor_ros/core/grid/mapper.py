@@ -16,10 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.cloud import LabelledPoints
+from segfloor_ros.core.contracts import (
+    CELL_M,
+    FloorScan,
+    KeyframeFeatures,
+    KeyframePath,
+    LabelledPoints,
+)
 from segfloor_ros.core.errors import MapError
 from segfloor_ros.core.files.results import Arrays, check_lengths
-from segfloor_ros.core.floor.observation import CELL_M, FloorScan
 from segfloor_ros.core.geometry import Array, Pose2d, planar
 from segfloor_ros.core.grid.keyframe_evidence import (
     SUBPIXEL_BITS,
@@ -51,7 +56,7 @@ from segfloor_ros.core.grid.occupancy import (
     render,
     steps,
 )
-from segfloor_ros.core.slam.results import MAJORITY, KeyframeFeatures, KeyframePath
+from segfloor_ros.core.slam.thresholds import MAJORITY
 
 _LEVER_M = 2.5
 """A turn of the base moves its evidence by the turn times this, about half a ray."""

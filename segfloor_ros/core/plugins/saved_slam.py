@@ -17,13 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera, WheelPose
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import (
+    NO_POINT,
+    KeyframePath,
+    LastPose,
+    Mount,
+    SparseCloud,
+    WheelPose,
+)
 from segfloor_ros.core.errors import CalibrationError, InputError, MapError
 from segfloor_ros.core.files.results import Arrays, MapFile, joined, split, take
 from segfloor_ros.core.geometry import Array, invert, transform_points, without_drift
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS
 from segfloor_ros.core.slam.places.views import views_to_keep
-from segfloor_ros.core.slam.results import NO_POINT, KeyframePath, LastPose, SparseCloud
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M, Observations
 from segfloor_ros.core.slam.sparse_map import (
     NOTHING,

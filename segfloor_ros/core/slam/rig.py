@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import MAX_OFFSET_PX, OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.plugins.rig.estimates import MAX_OFFSET_PX, OFFSET_SIGMA_PX
 
 LOCAL_KEYFRAMES = 10
 """Keyframes that move in a local adjustment, and adjustments that a keyframe takes part in: what is

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.contracts import NO_POINT, RelativeMotion, Up
 from segfloor_ros.core.files.results import Arrays, check_lengths
 from segfloor_ros.core.geometry import Array, invert
-from segfloor_ros.core.plugins.sensors.body_motion import RelativeMotion
-from segfloor_ros.core.slam.results import NO_POINT, PROOF
 from segfloor_ros.core.slam.rig import Observations, Rig
+from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.patch_alignment import SIDE_PX
 

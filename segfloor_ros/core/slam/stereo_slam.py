@@ -13,36 +13,37 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import BlankBorder, Region
-from segfloor_ros.core.camera.model import Measurement, Mount, StereoCamera, StereoFrame, Up
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import BlankBorder, Region
+from segfloor_ros.core.contracts import (
+    NO_POINT,
+    UNKNOWN_COVARIANCE,
+    FrameResult,
+    Keyframe,
+    LastPose,
+    Measurement,
+    Mount,
+    StereoFrame,
+    Up,
+)
 from segfloor_ros.core.files.results import Arrays
 from segfloor_ros.core.geometry import Array, adjoint, invert, rotation_angle, transform_points
 from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions, Searched
 from segfloor_ros.core.plugins.rig.check import RigCheck
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.gyroscope import STEP_NS
+from segfloor_ros.core.slam.held_results import HeldResults, in_map, left_out
 from segfloor_ros.core.slam.mapping.back_end import BackEnd, Submap
 from segfloor_ros.core.slam.places.views import GroundViews
-from segfloor_ros.core.slam.results import (
-    NO_POINT,
-    UNKNOWN_COVARIANCE,
-    FrameResult,
-    HeldResults,
-    Keyframe,
-    LastPose,
-    StereoSlamSettings,
-    Track,
-    in_map,
-    in_merged_map,
-    left_out,
-    take_snapshot,
-)
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, Rig
+from segfloor_ros.core.slam.settings import StereoSlamSettings
+from segfloor_ros.core.slam.snapshot import in_merged_map, take_snapshot
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Images, dilate, is_inside
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState
 from segfloor_ros.core.slam.tracking.patch_alignment import sample_patches
+from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import StageTimes
 
 LOST_NS = 1_500_000_000

@@ -28,18 +28,19 @@ from stereo_msgs.msg import DisparityImage
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.images import colour_image, depth_image, grey_image
 from segfloor_ros.core.camera.model import StereoCamera
-from segfloor_ros.core.cloud import LabelledPoints
+from segfloor_ros.core.contracts import (
+    FloorObservation,
+    FloorScan,
+    KeyframeFeatures,
+    LabelledPoints,
+    MovingPoints,
+    SparseCloud,
+)
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.images import Grey
 from segfloor_ros.core.files.results import FORMAT, MapFile, from_bytes, to_bytes
-from segfloor_ros.core.floor.observation import (
-    FloorObservation,
-    FloorScan,
-    free_ranges,
-    near_obstacles,
-)
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.slam.results import KeyframeFeatures, MovingPoints, SparseCloud
+from segfloor_ros.nodes.messages.scans import free_ranges, near_obstacles
 from segfloor_ros.nodes.messages.topics import make_header, to_ns, to_time
 
 _XYZ = [('x', '<f4'), ('y', '<f4'), ('z', '<f4')]

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import FrameResult, Mount
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.geometry import Array, FrameTree, invert
-from segfloor_ros.core.slam.results import FrameResult
+from segfloor_ros.core.geometry import Array, invert
 from segfloor_ros.nodes.configuration import StereoSlamNodeSettings
+from segfloor_ros.nodes.frame_tree import FrameTree
 from segfloor_ros.nodes.messages.poses import transform_array, transform_message
 from segfloor_ros.nodes.messages.topics import (
     IMAGES,

@@ -14,7 +14,7 @@ from command_line import segfloor
 from stereo_drive import room_drive, write_kitti
 from stereo_room import CAMERA
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 
 FRAMES = 64
 

@@ -24,16 +24,12 @@ from stereo_room import MOUNT
 from segfloor_ros.apps.recordings import open_source
 from segfloor_ros.apps.recordings.bag_writer import convert
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import (
-    ImuSample,
-    RecordedSensor,
-    StereoCameraSettings,
-    WheelPose,
-    is_sound,
-)
+from segfloor_ros.core.camera.recording import RecordedSensor, StereoCameraSettings
+from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.files.results import read_map_file
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
 from segfloor_ros.core.geometry import make_transform
+from segfloor_ros.core.plugins.sensors.body_motion import is_sound
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 FRAMES = 30

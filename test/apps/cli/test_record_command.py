@@ -19,7 +19,7 @@ from stereo_drive import room_drive
 
 from segfloor_ros.apps.cli.topic_recorder import TopicRecord, stamp_of
 from segfloor_ros.apps.recordings import open_source
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.nodes.messages.arrays import camera_info_message, image_message
 
 STOP_S = 30.0

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from segfloor_ros.apps.evaluation.floor import draw_outline, score_floor_folders
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 SQUARE = [10, 10, 50, 10, 50, 40, 10, 40]
 

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.apps.recordings import StereoSource
 from segfloor_ros.apps.recordings.bag_writer import BagWriter, ImageCoding, convert
 from segfloor_ros.apps.recordings.calibration_files import write_ros_calibration
-from segfloor_ros.core.camera.model import ImuSample, MeasurementLog
+from segfloor_ros.core.camera.recording import MeasurementLog
+from segfloor_ros.core.contracts import ImuSample
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import make_transform
 

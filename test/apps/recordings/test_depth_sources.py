@@ -32,11 +32,10 @@ from segfloor_ros.core.camera.images import (
     VIRTUAL_BASELINE_M,
     depth_calibration,
     depth_image,
-    disparity_at,
     disparity_of_depth,
-    seen_from_right,
 )
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.pixels import disparity_at, seen_from_right
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import InputError, SegfloorError
 
 SCALE = FX * VIRTUAL_BASELINE_M

@@ -13,7 +13,7 @@ from test_bag_writer import assert_same_recording
 from segfloor_ros.apps.calibration import Board, calibrate_folder
 from segfloor_ros.apps.recordings import StereoSource
 from segfloor_ros.apps.recordings.bag_writer import ImageCoding, convert
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 
 
 def frame_of(source: StereoSource, index: int) -> StereoFrame:

@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from segfloor_ros.apps.recordings import StereoSource
 from segfloor_ros.apps.recordings.bag import IMU_TYPE, ODOMETRY_TYPE, TF_TYPE
 from segfloor_ros.core.camera.calibration import StereoCalibration
-from segfloor_ros.core.camera.model import ImuSample, MeasurementLog, WheelPose
+from segfloor_ros.core.camera.recording import MeasurementLog
+from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.errors import InputError, SettingsError
 from segfloor_ros.core.geometry import se3_exp
 

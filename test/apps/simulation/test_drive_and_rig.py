@@ -15,7 +15,7 @@ from segfloor_ros.apps.simulation.camera import (
 from segfloor_ros.apps.simulation.motion import RigMotion, plan_drive, shake
 from segfloor_ros.apps.simulation.scene import CameraRig, Lighting, Route, Scene, Slope, Vibration
 from segfloor_ros.apps.simulation.solids import floors
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import InputError
 
 DISTORTION = (-0.12, 0.016, 0.0004, -0.0003, 0.0)

@@ -15,7 +15,7 @@ from segfloor_ros.apps.simulation.scene_file import scene_from_mapping
 from segfloor_ros.apps.simulation.simulation import RecordingOptions, Simulation, record
 from segfloor_ros.apps.simulation.world import RenderingError
 from segfloor_ros.apps.trajectory import read_trajectory
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.grid.occupancy import OCCUPIED

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from segfloor_ros.core.camera.images import BlankBorder
+from segfloor_ros.core.camera.pixels import BlankBorder
 
 
 def bordered(seed=0):

@@ -32,7 +32,7 @@ from segfloor_ros.apps.recordings.calibration_files import (
     write_ros_calibration,
 )
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
-from segfloor_ros.core.camera.model import StereoCameraSettings
+from segfloor_ros.core.camera.recording import StereoCameraSettings
 from segfloor_ros.core.errors import CalibrationError
 from segfloor_ros.core.geometry import make_transform, transform_points
 

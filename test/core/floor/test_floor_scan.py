@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT
 
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
 from segfloor_ros.core.floor.scan import FloorScanner
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 SETTINGS = FloorSegmentationSettings()
 

@@ -19,15 +19,10 @@ from floor_scenes import (
 )
 
 from segfloor_ros.core.camera.images import disparity_of_depth
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR, Mount
 from segfloor_ros.core.floor.disparity.profile import FloorLine
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorSegmentationSettings,
-)
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 SETTINGS = FloorSegmentationSettings()
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from segfloor_ros.core.cloud import LabelledPoints
-from segfloor_ros.core.floor.observation import FloorScan
+from segfloor_ros.core.contracts import FloorScan, KeyframeFeatures, KeyframePath, LabelledPoints
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath
 
 FIELD_OF_VIEW_RAD = np.pi / 2
 SIGHT_M = 8.0

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.core.cloud import FLOOR, LabelledPoints
-from segfloor_ros.core.floor.observation import RANGE_MAX_ERROR_M, FloorScan
+from segfloor_ros.core.contracts import (
+    POINT_FLOOR,
+    RANGE_MAX_ERROR_M,
+    FloorScan,
+    KeyframeFeatures,
+    LabelledPoints,
+)
 from segfloor_ros.core.grid.keyframe_evidence import (
     Fan,
     find_jumps,
@@ -15,7 +20,6 @@ from segfloor_ros.core.grid.keyframe_evidence import (
     unit_vectors,
 )
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
-from segfloor_ros.core.slam.results import KeyframeFeatures
 
 ERROR_PER_M = 0.01
 BLIND = FloorScan(
@@ -27,7 +31,7 @@ def rays_to(points_m: np.ndarray) -> np.ndarray:
     """Return the lengths of the rays to floor points (N, 2) that a keyframe at the origin sees."""
     ids = np.arange(len(points_m), dtype=np.int32)
     xyz = np.column_stack([points_m, np.zeros(len(points_m))]).astype(np.float32)
-    labels = np.full(len(ids), FLOOR, np.uint8)
+    labels = np.full(len(ids), POINT_FLOOR, np.uint8)
     points = LabelledPoints(ids, xyz, labels, np.ones(len(ids), np.float32))
     features = KeyframeFeatures(np.zeros((len(ids), 2), np.float32), ids, xyz)
     settings = OccupancyGridSettings(max_range_m=50.0)
@@ -67,7 +71,7 @@ def test_rays_through_what_the_scan_saw_standing_on_their_bearing_are_dropped() 
     bearing = np.radians([0.0, 30.0])
     xyz = 3 * np.stack([np.cos(bearing), np.sin(bearing), [0, 0]], axis=1).astype(np.float32)
     ids = np.arange(2, dtype=np.int32)
-    points = LabelledPoints(ids, xyz, np.full(2, FLOOR, np.uint8), np.ones(2, np.float32))
+    points = LabelledPoints(ids, xyz, np.full(2, POINT_FLOOR, np.uint8), np.ones(2, np.float32))
     features = KeyframeFeatures(np.zeros((2, 2), np.float32), ids, xyz)
     settings = OccupancyGridSettings(max_range_m=50.0)
     found = gather_evidence(points, features, np.eye(4), scan, settings)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import Drive, World, cells_at, centres, no_points, path_of
 
+from segfloor_ros.core.contracts import FloorScan, KeyframeFeatures, KeyframePath
 from segfloor_ros.core.errors import MapError
-from segfloor_ros.core.floor.observation import FloorScan
 from segfloor_ros.core.grid import mapper as history
 from segfloor_ros.core.grid.mapper import OccupancyGridMapper
 from segfloor_ros.core.grid.occupancy import (
@@ -19,7 +19,6 @@ from segfloor_ros.core.grid.occupancy import (
     OccupancyGridSettings,
     render,
 )
-from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath
 
 MakeDrive = Callable[..., Drive]
 ROOM = World(discs=((1.5, 0.6, 0.2),), walls=((3, -2, 3, 2), (-1, 1.2, 3, 1.2), (-1, -2, 3, -2)))

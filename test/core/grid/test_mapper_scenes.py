@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Drive, World, cells_at, centres, no_points
 
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, LabelledPoints
+from segfloor_ros.core.contracts import POINT_FLOOR, POINT_OBSTACLE, LabelledPoints
 from segfloor_ros.core.grid.occupancy import OccupancyGridSettings
 
 MakeDrive = Callable[..., Drive]
@@ -183,7 +183,7 @@ def point_cloud(xyz: list[tuple[float, float, float]], label: int) -> LabelledPo
 
 def test_a_table_top_over_free_floor_is_occupied(make_drive: MakeDrive) -> None:
     drive = make_drive(OccupancyGridSettings())
-    edge = point_cloud([(2.02, 0.02, 0.7)], OBSTACLE)
+    edge = point_cloud([(2.02, 0.02, 0.7)], POINT_OBSTACLE)
     for k in range(20):
         drive.look(ROOM, (0.0, 0.0, 0.0), edge if k % 2 else no_points())
     assert (cells_at(drive.grid(), centres((2.0, 2.1), (0.0, 0.05))) == 100).any()
@@ -194,7 +194,7 @@ def test_points_are_left_out_where_asked_for(
     make_drive: MakeDrive, use_points: bool, expected: int
 ) -> None:
     drive = make_drive(OccupancyGridSettings(use_points=use_points))
-    edge = point_cloud([(2.02, 0.02, 0.7)], OBSTACLE)
+    edge = point_cloud([(2.02, 0.02, 0.7)], POINT_OBSTACLE)
     for _ in range(10):
         drive.look(ROOM, (0.0, 0.0, 0.0), edge)
     assert cells_at(drive.grid(), np.array([[2.02, 0.02]])) == expected
@@ -202,13 +202,15 @@ def test_points_are_left_out_where_asked_for(
 
 def test_one_outlier_marks_nothing(make_drive: MakeDrive) -> None:
     drive = make_drive(OccupancyGridSettings())
-    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.02, 0.02, 0.5)], OBSTACLE))
+    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.02, 0.02, 0.5)], POINT_OBSTACLE))
     assert (drive.grid().cells != 100).all()
 
 
 def test_rays_to_floor_points_free_their_cells(make_drive: MakeDrive) -> None:
     drive = make_drive(OccupancyGridSettings(use_scan=False, footprint_radius_m=0.0))
-    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.0, 0.0), (0.0, 1.0, 0.0)], FLOOR))
+    drive.look(
+        World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.0, 0.0), (0.0, 1.0, 0.0)], POINT_FLOOR)
+    )
     grid = drive.grid()
     assert (cells_at(grid, np.array([[0.5, 0.0], [1.5, 0.0], [0.0, 0.5]])) == 0).all()
     assert (cells_at(grid, np.array([[2.2, 0.0], [1.0, 1.0], [0.0, 1.2], [0.0, -0.5]])) == -1).all()
@@ -230,7 +232,7 @@ def test_opening_removes_single_rays(
 ) -> None:
     settings = OccupancyGridSettings(use_scan=False, opening_cells=opening_cells)
     drive = make_drive(settings)
-    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.02, 0.0)], FLOOR))
+    drive.look(World(), (0.0, 0.0, 0.0), point_cloud([(2.0, 0.02, 0.0)], POINT_FLOOR))
     assert cells_at(drive.grid(), np.array([[1.5, 0.02]])) == expected
     assert cells_at(drive.grid(), np.array([[0.0, 0.0]])) == 0
 

@@ -9,13 +9,14 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.files.results import MapFile, from_bytes, to_bytes
 from segfloor_ros.core.geometry import invert, se3_exp
 from segfloor_ros.core.plugins.saved_slam import fill_map, load_slam, moved, save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.loop_closing import KnownMap, as_seen_by
-from segfloor_ros.core.slam.results import UNKNOWN_COVARIANCE, StereoSlamSettings
 from segfloor_ros.core.slam.rig import OffsetEstimate, Rig
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 

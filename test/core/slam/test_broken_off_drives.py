@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import WheelPose
+from segfloor_ros.core.contracts import WheelPose
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.plugins.saved_slam import (
@@ -20,7 +20,7 @@ from segfloor_ros.core.plugins.saved_slam import (
     save_slam,
 )
 from segfloor_ros.core.slam.mapping.back_end import Submap
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import HARDLY_BEGUN, StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -7,9 +7,10 @@ import pytest
 from hand_made_maps import row_of_views
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates
-from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Images
 from segfloor_ros.core.slam.tracking.map_tracking import LocalMap, Tracker

@@ -5,7 +5,7 @@ import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.pipeline import make_slam
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor
 

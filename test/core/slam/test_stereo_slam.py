@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.geometry import invert, rotation_angle
-from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=800)
@@ -343,7 +343,7 @@ def test_results_wait_for_the_mount_and_none_is_lost(frames):
 
 
 def test_waiting_for_the_mount_does_not_fill_the_memory(frames, monkeypatch):
-    monkeypatch.setattr('segfloor_ros.core.slam.results.MAX_HELD_KEYFRAMES', 3)
+    monkeypatch.setattr('segfloor_ros.core.slam.held_results.MAX_HELD_KEYFRAMES', 3)
     slam = StereoSlam(CAMERA, SETTINGS)
     for frame in frames[:-1]:
         assert slam.process(frame) == []

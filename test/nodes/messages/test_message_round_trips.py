@@ -8,13 +8,24 @@ from scipy.spatial.transform import Rotation
 
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.images import eye_calibration
-from segfloor_ros.core.camera.model import ImuSample, Mount, StereoCamera
-from segfloor_ros.core.cloud import FLOOR, OBSTACLE, UNKNOWN, LabelledPoints
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import (
+    POINT_FLOOR,
+    POINT_OBSTACLE,
+    POINT_UNKNOWN,
+    FloorObservation,
+    FloorScan,
+    ImuSample,
+    KeyframeFeatures,
+    KeyframePath,
+    LabelledPoints,
+    Mount,
+    SparseCloud,
+    VDisparity,
+)
 from segfloor_ros.core.errors import CalibrationError, InputError
-from segfloor_ros.core.floor.observation import FloorObservation, FloorScan, VDisparity
 from segfloor_ros.core.geometry import R_ROS_OPTICAL, make_transform, se3_exp
 from segfloor_ros.core.grid.occupancy import OccupancyGrid
-from segfloor_ros.core.slam.results import KeyframeFeatures, KeyframePath, SparseCloud
 from segfloor_ros.nodes.messages import arrays, poses
 from segfloor_ros.nodes.messages.arrays import (
     camera_info_message,
@@ -266,7 +277,7 @@ def test_labelled_points_survive_and_are_told_apart() -> None:
     labelled = LabelledPoints(
         np.array([1, 4, 6], np.int32),
         np.arange(9, dtype=np.float32).reshape(3, 3),
-        np.array([FLOOR, OBSTACLE, UNKNOWN], np.uint8),
+        np.array([POINT_FLOOR, POINT_OBSTACLE, POINT_UNKNOWN], np.uint8),
         np.array([0.25, 1.0, 0.0], np.float32),
     )
     message = over_the_wire(arrays.labelled_message(0, 'map', labelled))

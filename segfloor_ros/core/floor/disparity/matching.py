@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import SUBPIXEL, seen_from_right
-from segfloor_ros.core.camera.model import Mount, StereoCamera, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import SUBPIXEL, seen_from_right
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import Array
 
 NOISE_PX = 0.5

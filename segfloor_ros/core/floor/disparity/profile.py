@@ -17,15 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import SUBPIXEL
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.pixels import SUBPIXEL
+from segfloor_ros.core.contracts import Mount, VDisparity
 from segfloor_ros.core.floor.disparity.matching import (
     COARSE_ABOVE_PX,
     NOISE_PX,
     RUN_UP_ROWS,
     SAME_PX,
 )
-from segfloor_ros.core.floor.observation import VDisparity
 from segfloor_ros.core.geometry import Array
 
 SEGMENTS = 5

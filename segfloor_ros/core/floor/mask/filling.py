@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.matching import SAME_PX
 from segfloor_ros.core.floor.disparity.profile import (
     STEP_PX,
@@ -26,7 +27,6 @@ from segfloor_ros.core.floor.disparity.profile import (
     surface_above,
 )
 from segfloor_ros.core.floor.mask.pixel_evidence import EDGE_SLOPE, Comparison, below_floor
-from segfloor_ros.core.floor.observation import FLOOR, NO_EVIDENCE, NOT_FLOOR
 
 _MIN_REGION_PX = 15
 _MIN_COLUMNS = 0.3

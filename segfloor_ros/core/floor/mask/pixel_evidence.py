@@ -22,7 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import SUBPIXEL, measured_sigma_px
+from segfloor_ros.core.camera.pixels import SUBPIXEL, measured_sigma_px
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.matching import (
     BLOCK_PX,
     MEAN_NOISE,
@@ -31,12 +32,7 @@ from segfloor_ros.core.floor.disparity.matching import (
     SIGMAS,
 )
 from segfloor_ros.core.floor.disparity.profile import STEP_PX, FloorLine, FloorProfile, FloorView
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorSegmentationSettings,
-)
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 _MIN_DISPARITY_PX = 2.5
 """Farther floor is not judged."""

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import noise_grey
-from segfloor_ros.core.camera.model import Mount, StereoCamera, Up, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import noise_grey
+from segfloor_ros.core.contracts import Mount, Up
 from segfloor_ros.core.floor.disparity.matching import (
     BLOCK_PX,
     NOISE_PX,

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.floor.disparity.matching import NOISE_PX, SAME_PX
 from segfloor_ros.core.floor.disparity.profile import (
     HEIGHT_SIGMA,
@@ -27,7 +28,6 @@ from segfloor_ros.core.floor.disparity.profile import (
     rising,
 )
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.plugins.rig.estimates import OFFSET_SIGMA_PX
 
 MAX_PITCH_RAD, MAX_ROLL_RAD = np.radians([45.0, 20.0])
 HEIGHT_RANGE_M = (0.04, 4.0)

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import Region, shrunk
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import Region, shrunk
+from segfloor_ros.core.contracts import Mount, MovingPoints, StereoFrame
 from segfloor_ros.core.geometry import Array, invert, rotation_angle, transform_points
 from segfloor_ros.core.plugins.moving.scene_flow import (
     MAX_MOVING_SHARE,
@@ -33,9 +34,9 @@ from segfloor_ros.core.plugins.moving.scene_flow import (
     static_scale,
 )
 from segfloor_ros.core.slam.places.views import is_due
-from segfloor_ros.core.slam.results import CHANCE_SHARE, MAJORITY, MovingPoints
 from segfloor_ros.core.slam.rig import MIN_DEPTH_M
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, MAJORITY
 from segfloor_ros.core.slam.tracking.pose import FLOOR_M
 
 DISPARITIES = 64

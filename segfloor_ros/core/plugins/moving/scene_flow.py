@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import MovingPoints
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.plugins.sensors.gyroscope import MOMENT_NS
-from segfloor_ros.core.slam.results import MAJORITY, PROOF, MovingPoints
 from segfloor_ros.core.slam.rig import GATE, MIN_DEPTH_M, chi2_limit
 from segfloor_ros.core.slam.sparse_map import MAX_PATCH_ZOOM
+from segfloor_ros.core.slam.thresholds import MAJORITY, PROOF
 from segfloor_ros.core.slam.tracking.images import (
     SIGMA_FLOW_PX,
     SMALL_WIDTH_PX,

@@ -20,7 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.rig.estimates import (
     LEAST_NOISE_PX,

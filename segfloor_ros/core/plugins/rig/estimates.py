@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.camera.model import MAX_OFFSET_PX, StereoCamera
 from segfloor_ros.core.geometry import Array, se3_exp, skew, transform_points
 
 WIDTH_PX = 320
@@ -78,13 +78,6 @@ PAIR_SIGMA = 0.02
 """What is wrong in all points of a pair is in no covariance: by so much, as a share, pairs of good
 recordings differ."""
 
-OFFSET_SIGMA_PX = 0.1
-"""Error that all disparities share, expected of a rig: a tenth of a milliradian between its eyes at
-a focal length of a thousand pixels."""
-
-MAX_OFFSET_PX = 0.5
-"""An error of all disparities that is larger is not an imperfect rectification but a wrong
-calibration, px."""
 
 FOCAL_SHARE = 0.03
 """Depths that are wrong by less do not matter to a map; real calibrations are not better known."""

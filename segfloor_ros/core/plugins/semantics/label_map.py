@@ -13,13 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import (
+    CELL_M,
+    FLOOR,
+    NO_POINT,
+    NOT_FLOOR,
+    KeyframeFeatures,
+    KeyframePath,
+    Mount,
+)
 from segfloor_ros.core.files.results import Arrays, joined, split
-from segfloor_ros.core.floor.observation import CELL_M, FLOOR, NOT_FLOOR
 from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.grid.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED
-from segfloor_ros.core.slam.results import NO_POINT, KeyframeFeatures, KeyframePath
 
 LABELS = 'labels'
 """What a saved map calls its part of what networks saw."""

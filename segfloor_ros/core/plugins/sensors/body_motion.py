@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from segfloor_ros.core.camera.model import Measurement, WheelPose, is_sound
+from segfloor_ros.core.contracts import Measurement, RelativeMotion, WheelPose
 from segfloor_ros.core.geometry import (
     Array,
     adjoint,
@@ -36,7 +34,7 @@ from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     wheels_m,
     yaw_of,
 )
-from segfloor_ros.core.slam.results import ENOUGH
+from segfloor_ros.core.slam.thresholds import ENOUGH
 
 SIGMA_TURN_SHARE = 0.03
 """Error of a turn measured by wheels, as a share of it."""
@@ -50,37 +48,6 @@ WINDOW = 0.1, 0.1
 SLIP_REMARK = 'wheel odometry and images disagreed; the wheels slip, or the images show what moves'
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class RelativeMotion:
-    """The camera's motion between two frames: T_now_before (4, 4), and the covariance (6, 6) of the
-    twist in exp(twist) T_now_before, translation first. source: wheels, an IMU, a gyroscope alone
-    with a speed that is taken for constant, or nothing at all: the last pose is held.
-    """
-
-    T_now_before: Array
-    covariance: Array
-    source: Literal['wheels', 'IMU', 'gyroscope', 'nothing'] = 'wheels'
-
-    @property
-    def by_wheels(self) -> bool:
-        """Whether wheels measured it."""
-        return self.source == 'wheels'
-
-    @classmethod
-    def none(cls) -> RelativeMotion:
-        """Return the motion of no time at all."""
-        return cls(np.eye(4), np.zeros((6, 6)))
-
-    def then(self, later: RelativeMotion) -> RelativeMotion:
-        """Return the motion over both stretches (Barfoot 2017, section 7.3.3, to second order)."""
-        A = adjoint(later.T_now_before)
-        return RelativeMotion(
-            later.T_now_before @ self.T_now_before,
-            A @ self.covariance @ A.T + later.covariance,
-            later.source if self.by_wheels else self.source,
-        )
 
 
 class BodyMotion:
@@ -273,3 +240,15 @@ def _variance(measured: Stretch, calibration: WheelCalibration, sigma_turn: floa
     if sigma_turn is not None:
         tilt = yaw = sigma_turn**2
     return np.array([on_floor, on_floor, up, tilt, tilt, yaw]) + 1e-10
+
+
+def is_sound(measurement: Measurement) -> bool:
+    """Whether all that was measured are numbers that can be reckoned with: finite, as their squares
+    are.
+    """
+    if isinstance(measurement, WheelPose):
+        values = measurement.T_wheels_base
+    else:
+        values = np.concatenate([measurement.gyro_rad_s, measurement.accel_m_s2])
+    with np.errstate(over='ignore', invalid='ignore'):
+        return bool(np.isfinite(np.square(values.astype(np.float32))).all())

@@ -13,7 +13,8 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from segfloor_ros.core.camera.model import MAX_LAG_S, ImuSample
+from segfloor_ros.core.camera.recording import MAX_LAG_S
+from segfloor_ros.core.contracts import ImuSample
 from segfloor_ros.core.geometry import Array, rotation_angle, rotation_vectors, rotations_by
 from segfloor_ros.core.slam.rig import is_gated
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from segfloor_ros.core.camera.model import WheelPose
+from segfloor_ros.core.contracts import WheelPose
 from segfloor_ros.core.geometry import Array, between, invert, make_transform, rotation_from_angles
 from segfloor_ros.core.plugins.sensors.gyroscope import (
     LATE_NS,

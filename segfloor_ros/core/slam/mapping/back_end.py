@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.contracts import Up
 from segfloor_ros.core.files.results import Arrays
 from segfloor_ros.core.geometry import Array
 from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays
@@ -33,11 +33,12 @@ from segfloor_ros.core.slam.places.loop_closing import (
     solve_closing,
 )
 from segfloor_ros.core.slam.places.loops import Candidate, LoopDetector
-from segfloor_ros.core.slam.results import StereoSlamSettings, Track
 from segfloor_ros.core.slam.rig import OffsetEstimate
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.images import Features, Images
+from segfloor_ros.core.slam.tracking.track import Track
 from segfloor_ros.core.timing import timed
 
 GROWN = 1.25

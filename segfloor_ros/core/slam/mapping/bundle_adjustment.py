@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.model import StereoCamera, Up
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Up
 from segfloor_ros.core.geometry import (
     Array,
     invert,
@@ -37,7 +38,6 @@ from segfloor_ros.core.slam.mapping.normal_equations import (
     normal_equations,
     with_factors,
 )
-from segfloor_ros.core.slam.results import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
@@ -50,6 +50,7 @@ from segfloor_ros.core.slam.rig import (
     squared_norms,
 )
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, LoopEdge, SparseMap
+from segfloor_ros.core.slam.thresholds import ENOUGH, NEARLY_ALL, POINTS_PER_KEYFRAME
 
 CONVERGED = 2e-3
 """Stop at this relative decrease of the cost; the next keyframe goes on from there."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.images import SUBPIXEL
-from segfloor_ros.core.camera.model import StereoFrame, Up
+from segfloor_ros.core.camera.pixels import SUBPIXEL
+from segfloor_ros.core.contracts import NO_POINT, StereoFrame, Up
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     BundleProblem,
@@ -27,17 +27,9 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     gather,
 )
 from segfloor_ros.core.slam.mapping.normal_equations import factors_of
-from segfloor_ros.core.slam.results import (
-    CHANCE_SHARE,
-    ENOUGH,
-    MAJORITY,
-    NEARLY_ALL,
-    NO_POINT,
-    PROOF,
-    ObservedFeatures,
-)
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, NEIGHBOURS, SAME_PX
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MAJORITY, NEARLY_ALL, PROOF
 from segfloor_ros.core.slam.tracking.images import (
     MAX_HAMMING,
     SMALL_WIDTH_PX,
@@ -47,6 +39,7 @@ from segfloor_ros.core.slam.tracking.images import (
 )
 from segfloor_ros.core.slam.tracking.map_tracking import predict_points
 from segfloor_ros.core.slam.tracking.patch_alignment import ALIGNED_PX, SIDE_PX, measure_disparity
+from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 from segfloor_ros.core.timing import timed
 
 MIN_DISPARITY_PX = 1.0

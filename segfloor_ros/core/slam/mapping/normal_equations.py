@@ -30,9 +30,9 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import splu
 
-from segfloor_ros.core.camera.model import StereoCamera, Up
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import RelativeMotion, Up
 from segfloor_ros.core.geometry import Array, adjoint, invert, se3_logs
-from segfloor_ros.core.plugins.sensors.body_motion import RelativeMotion
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     SMALLEST,

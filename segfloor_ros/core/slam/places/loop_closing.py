@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.files.results import Arrays
 from segfloor_ros.core.geometry import Array, adjoint, invert, se3_exp, se3_log, se3_logs
 from segfloor_ros.core.plugins.saved_slam import fill_map, map_to_arrays, moved
@@ -41,12 +42,13 @@ from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
     Relocaliser,
 )
-from segfloor_ros.core.slam.results import NO_POINT, PROOF, Track
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES, OffsetEstimate, Rig, chi2_limit, is_gated
 from segfloor_ros.core.slam.sparse_map import LINK_SIGMA, KeyframeRecord, LoopEdge, Match, SparseMap
+from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.images import Features
 from segfloor_ros.core.slam.tracking.map_tracking import Pixels
 from segfloor_ros.core.slam.tracking.pose import CONVERGED
+from segfloor_ros.core.slam.tracking.track import Track
 
 STEPS = 20
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.core.slam.places.place_recognition import (
     PlaceRecognition,
@@ -31,7 +31,6 @@ from segfloor_ros.core.slam.places.views import (
     seen_ahead_m,
     views_near,
 )
-from segfloor_ros.core.slam.results import ENOUGH, MOST, NO_POINT, PROOF, SAME
 from segfloor_ros.core.slam.rig import (
     GATE,
     LOCAL_KEYFRAMES,
@@ -50,6 +49,7 @@ from segfloor_ros.core.slam.sparse_map import (
     features_of,
     loop_sigma,
 )
+from segfloor_ros.core.slam.thresholds import ENOUGH, MOST, PROOF, SAME
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels
 
 DRIFT_PER_M = 0.04, 0.01

@@ -31,11 +31,12 @@ from scipy.spatial import cKDTree
 from segfloor_ros.core.files.results import Arrays, joined, split
 from segfloor_ros.core.geometry import Array, invert, is_within, transform_points
 from segfloor_ros.core.slam.places.views import COLUMNS, ROWS
-from segfloor_ros.core.slam.results import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME, Track
 from segfloor_ros.core.slam.rig import LOCAL_KEYFRAMES
 from segfloor_ros.core.slam.sparse_map import GroundView, KeyframeRecord, SparseMap, features_of
+from segfloor_ros.core.slam.thresholds import CHANCE_SHARE, ENOUGH, MOST, PROOF, SAME
 from segfloor_ros.core.slam.tracking.images import Features, hamming
 from segfloor_ros.core.slam.tracking.map_tracking import MIN_VIEW_COSINE, Pixels, Tracker
+from segfloor_ros.core.slam.tracking.track import Track
 
 FILE = 'vocabulary.npy'
 BRANCHES, LEVELS = 30, 3

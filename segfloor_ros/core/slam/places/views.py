@@ -24,21 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.geometry import (
     Array,
     invert,
     make_transform,
     rotation_angle,
     transform_points,
-)
-from segfloor_ros.core.slam.results import (
-    CHANCE_SHARE,
-    ENOUGH,
-    MAJORITY,
-    NEARLY_ALL,
-    POINTS_PER_KEYFRAME,
-    PROOF,
 )
 from segfloor_ros.core.slam.rig import FITTING, NEIGHBOURS, SAME_PX, Rig, in_view
 from segfloor_ros.core.slam.sparse_map import (
@@ -47,6 +40,14 @@ from segfloor_ros.core.slam.sparse_map import (
     GroundView,
     KeyframeRecord,
     SparseMap,
+)
+from segfloor_ros.core.slam.thresholds import (
+    CHANCE_SHARE,
+    ENOUGH,
+    MAJORITY,
+    NEARLY_ALL,
+    POINTS_PER_KEYFRAME,
+    PROOF,
 )
 
 NEW_MOTION_RATIO, NEW_TURN_RAD = 0.04, 0.06

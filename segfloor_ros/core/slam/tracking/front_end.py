@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from segfloor_ros.core.camera.images import Region, union
-from segfloor_ros.core.camera.model import StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import Region, union
+from segfloor_ros.core.contracts import NO_POINT, LastPose, StereoFrame
 from segfloor_ros.core.geometry import Array, transform_points
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.places.place_recognition import (
@@ -23,18 +24,9 @@ from segfloor_ros.core.slam.places.place_recognition import (
     is_within,
 )
 from segfloor_ros.core.slam.places.views import ALIKE_SHARE
-from segfloor_ros.core.slam.results import (
-    ENOUGH,
-    MAJORITY,
-    MOST,
-    NO_POINT,
-    SAME,
-    LastPose,
-    ObservedFeatures,
-    StereoSlamSettings,
-    Track,
-)
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
+from segfloor_ros.core.slam.thresholds import ENOUGH, MAJORITY, MOST, SAME
 from segfloor_ros.core.slam.tracking.images import FeatureExtractor, Features, Images, is_inside
 from segfloor_ros.core.slam.tracking.map_tracking import Follower, LocalMap, Tracker
 from segfloor_ros.core.slam.tracking.motion import (
@@ -52,6 +44,7 @@ from segfloor_ros.core.slam.tracking.pose import (
     knows_more,
     refine_pose,
 )
+from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
 MIN_EXPECTED_SHIFT = 0.004

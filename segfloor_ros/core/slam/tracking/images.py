@@ -27,10 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.images import Region, noise_grey, union
-from segfloor_ros.core.camera.model import StereoCamera, StereoFrame, is_disparity
+from segfloor_ros.core.camera.model import StereoCamera, is_disparity
+from segfloor_ros.core.camera.pixels import Region, noise_grey, union
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.timing import timed
 
 SIDE_PX = 11

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.images import Region
+from segfloor_ros.core.camera.pixels import Region
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import Array, invert, transform_points
 from segfloor_ros.core.slam.places.views import View, is_keyframe, novelty, view_novelty, views_near
-from segfloor_ros.core.slam.results import ENOUGH, NO_POINT, ObservedFeatures, Track
 from segfloor_ros.core.slam.rig import (
     LOCAL_KEYFRAMES,
     MIN_DEPTH_M,
@@ -31,6 +31,7 @@ from segfloor_ros.core.slam.rig import (
     in_view,
 )
 from segfloor_ros.core.slam.sparse_map import Covisible, SparseMap
+from segfloor_ros.core.slam.thresholds import ENOUGH
 from segfloor_ros.core.slam.tracking.images import (
     PYRAMID_LEVELS,
     PYRAMID_SCALE,
@@ -56,6 +57,7 @@ from segfloor_ros.core.slam.tracking.pose import (
     PoseEstimate,
     solve_pnp,
 )
+from segfloor_ros.core.slam.tracking.track import ObservedFeatures, Track
 from segfloor_ros.core.timing import timed
 
 SIGMA_PIXEL = 0.6

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import LastPose, RelativeMotion
 from segfloor_ros.core.geometry import (
     Array,
     adjoint,
@@ -27,10 +28,10 @@ from segfloor_ros.core.geometry import (
     se3_log,
     without_drift,
 )
-from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion, RelativeMotion
+from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.inertial_odometry import SPEED_SIGMA
-from segfloor_ros.core.slam.results import SAME, LastPose
 from segfloor_ros.core.slam.rig import is_gated
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.images import SMALL_WIDTH_PX
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate
 

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.camera.images import disparity_at
+from segfloor_ros.core.camera.pixels import disparity_at
 from segfloor_ros.core.geometry import Array
-from segfloor_ros.core.slam.results import MAJORITY
 from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.thresholds import MAJORITY
 from segfloor_ros.core.slam.tracking.images import SIDE_PX, Images
 from segfloor_ros.core.timing import timed
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import UNKNOWN_COVARIANCE
 from segfloor_ros.core.geometry import (
     Array,
     invert,
@@ -24,7 +25,6 @@ from segfloor_ros.core.geometry import (
     se3_log,
     transform_points,
 )
-from segfloor_ros.core.slam.results import ENOUGH, MAJORITY, PROOF, UNKNOWN_COVARIANCE
 from segfloor_ros.core.slam.rig import (
     MIN_DEPTH_M,
     SAME_PX,
@@ -37,6 +37,7 @@ from segfloor_ros.core.slam.rig import (
     squared_norms,
 )
 from segfloor_ros.core.slam.sparse_map import SparseMap
+from segfloor_ros.core.slam.thresholds import ENOUGH, MAJORITY, PROOF
 from segfloor_ros.core.timing import timed
 
 ROUNDS, STEPS_PER_ROUND = 3, 6

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount
 from segfloor_ros.core.floor.disparity.matching import (
     DisparityMatcher,
     TwoScaleMatcher,

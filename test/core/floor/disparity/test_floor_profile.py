@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA
 
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import Mount, VDisparity
 from segfloor_ros.core.floor.disparity.profile import (
     BINS_PER_PX,
     SEGMENTS,
@@ -12,7 +12,7 @@ from segfloor_ros.core.floor.disparity.profile import (
     fit_profile,
     spline_basis,
 )
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings, VDisparity
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 SETTINGS = FloorSegmentationSettings()
 

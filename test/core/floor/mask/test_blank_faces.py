@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
-from segfloor_ros.core.floor.observation import FloorSegmentationSettings
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 AHEAD_DEG = 30.0
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from floor_scenes import FLOORS, Scene, box, floor_patch, wall
 
+from segfloor_ros.core.contracts import FLOOR
 from segfloor_ros.core.floor.mask.pixel_evidence import most_around, unlike_floor
-from segfloor_ros.core.floor.observation import FLOOR, FloorSegmentationSettings
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 
 def floor_image(rng, sigma):

@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, FLOORS, MOUNT, Patch, Scene, floor_patch, wall
 
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.disparity.profile import FloorView
 from segfloor_ros.core.floor.mask.filling import beside_something, drop_islands
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorSegmentationSettings,
-)
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 
 def test_patches_much_smaller_than_the_floor_are_dropped():

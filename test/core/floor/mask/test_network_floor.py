@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 from floor_scenes import SMALL_CAMERA, Scene, floor_patch, wall
 
+from segfloor_ros.core.contracts import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.floor.mask.filling import TRUSTED, NetworkFloor
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    MOVING,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorSegmentationSettings,
-)
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 from segfloor_ros.core.geometry import Array
 
 KEYFRAMES = 12

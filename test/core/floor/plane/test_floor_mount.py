@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from floor_scenes import SMALL_CAMERA, Patch, Scene, blank_floored, box, floor_patch, wall
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import Mount, StereoFrame
 from segfloor_ros.core.floor.plane.mount import (
     MAX_KEYFRAMES,
     MountEstimator,
@@ -17,7 +18,7 @@ from segfloor_ros.core.floor.plane.mount import (
 from segfloor_ros.core.floor.plane.plane import mean_climb, shares
 from segfloor_ros.core.pipeline import Pipeline, make_slam
 from segfloor_ros.core.plugins.sensors.gyroscope import STEP_NS
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.nodes.configuration import resolve
 
 

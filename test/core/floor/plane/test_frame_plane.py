@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 from floor_scenes import CAMERA, MOUNT, SMALL_CAMERA, Patch, Scene, box, floor_patch, wall
 
-from segfloor_ros.core.camera.model import Mount, StereoCamera
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import FLOOR, NO_EVIDENCE, NOT_FLOOR, Mount
 from segfloor_ros.core.floor.disparity.profile import FloorLine, column_step
-from segfloor_ros.core.floor.observation import (
-    FLOOR,
-    NO_EVIDENCE,
-    NOT_FLOOR,
-    FloorSegmentationSettings,
-)
 from segfloor_ros.core.floor.plane.plane import expectations, likeliest, plane_of_frame, swung
 from segfloor_ros.core.floor.segmentation import FloorSegmentation
+from segfloor_ros.core.floor.settings import FloorSegmentationSettings
 
 LONG_CAMERA = StereoCamera(1280, 480, 1000.0, 1000.0, 640.0, 200.0, 0.12)
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from segfloor_ros.core.camera.model import StereoCamera, Up
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX, StereoCamera
+from segfloor_ros.core.contracts import Up
 from segfloor_ros.core.floor.disparity.matching import BLOCK_PX, refined
 from segfloor_ros.core.floor.plane.mount import MountViewer, PlaneSearch, level_prior
 from segfloor_ros.core.floor.plane.plane import PlaneFit, Samples, plane_of, refine
-from segfloor_ros.core.plugins.rig.estimates import OFFSET_SIGMA_PX
 
 UNKNOWN, STILL = np.full(3, np.nan), np.zeros((0, 3))
 NOTHING = Samples(np.zeros((0, 3)), np.zeros(0), np.zeros(0), 1.0)

@@ -8,9 +8,10 @@ import pytest
 from moving_drive import MovingDrive
 from stereo_room import CAMERA, MOUNT
 
-from segfloor_ros.core.camera.images import union
+from segfloor_ros.core.camera.pixels import union
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import dilate, is_inside
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.plugins.moving.moving_regions import MovingRegions
 from segfloor_ros.core.plugins.moving.scene_flow import FlowVotes
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from camera_recordings import opened
 
-from segfloor_ros.core.camera.model import StereoCamera, StereoFrame
+from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.plugins.rig.check import InputFault, RigCheck
 
 WIDTH, HEIGHT = 640, 480

@@ -11,8 +11,8 @@ from small_network import constant_network, conv, grey_network, write_network
 from stereo_drive import room_drive, write_kitti
 
 from segfloor_ros.apps.recordings.opening import open_source
-from segfloor_ros.core.camera.model import StereoCameraSettings, StereoFrame
-from segfloor_ros.core.floor.observation import FLOOR, MOVING, NO_EVIDENCE
+from segfloor_ros.core.camera.recording import StereoCameraSettings
+from segfloor_ros.core.contracts import FLOOR, MOVING, NO_EVIDENCE, StereoFrame
 from segfloor_ros.core.plugins.semantics.network import ImageLabeller
 from segfloor_ros.core.timing import StageTimes
 from segfloor_ros.nodes.network_files import open_network

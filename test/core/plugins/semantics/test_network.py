@@ -12,8 +12,8 @@ import pytest
 import yaml
 from small_network import conv, grey_network, helper, write_network
 
+from segfloor_ros.core.contracts import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.errors import InputError
-from segfloor_ros.core.floor.observation import FLOOR, MOVING, NO_EVIDENCE, NOT_FLOOR
 from segfloor_ros.core.plugins.semantics.outputs import UNLABELLED, mask_rcnn, semantic, yolo_seg
 from segfloor_ros.nodes.network_files import open_network
 

@@ -9,13 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import ImuSample, StereoFrame, WheelPose
+from segfloor_ros.core.contracts import ImuSample, StereoFrame, WheelPose
 from segfloor_ros.core.geometry import invert
-from segfloor_ros.core.slam.results import StereoSlamSettings, Track
 from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.images import Images
 from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+from segfloor_ros.core.slam.tracking.track import Track
 
 SETTINGS = StereoSlamSettings(num_features=800)
 FRAMES = 34

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.model import ImuSample, Mount, WheelPose
+from segfloor_ros.core.contracts import ImuSample, Mount, RelativeMotion, WheelPose
 from segfloor_ros.core.geometry import adjoint, invert, make_transform, se3_exp, se3_log
-from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion, RelativeMotion
+from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.plugins.sensors.gyroscope import KEPT_NS, STEP_NS, Gyroscope, TimedSeries
 from segfloor_ros.core.plugins.sensors.wheel_odometry import (
     MAX_WINDOWS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.model import ImuSample
+from segfloor_ros.core.contracts import ImuSample
 from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.plugins.sensors.gyroscope import Gyroscope
 from segfloor_ros.core.plugins.sensors.inertial_odometry import Gravity

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_gravity import BESIDE, RATE_HZ, imu_sample, pose
 
-from segfloor_ros.core.camera.model import ImuSample
+from segfloor_ros.core.contracts import ImuSample
 from segfloor_ros.core.geometry import invert, make_transform
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
-from segfloor_ros.core.slam.results import SAME
+from segfloor_ros.core.slam.thresholds import SAME
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, TrackingState, sigma_m
 
 SEEN_S = 8.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from bundle_problems import CAMERA, disturbed, make_problem
 
+from segfloor_ros.core.contracts import RelativeMotion
 from segfloor_ros.core.geometry import se3_exp, transform_points
-from segfloor_ros.core.plugins.sensors.body_motion import RelativeMotion
 from segfloor_ros.core.slam.mapping.bundle_adjustment import BundleProblem, adjust
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Linearisation,

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from hand_made_maps import CAMERA
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.slam.mapping.keyframe_mapping import LocalMapper, guess_disparity
-from segfloor_ros.core.slam.results import NO_POINT, ObservedFeatures
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.tracking.images import Features, Images
+from segfloor_ros.core.slam.tracking.track import ObservedFeatures
 
 
 def shifted_pair(width, height, disparity):

@@ -9,12 +9,12 @@ from bundle_problems import CAMERA as VGA
 from bundle_problems import disturbed, make_problem
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.camera.model import OFFSET_SIGMA_PX
+from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.geometry import make_transform, se3_exp, transform_points
-from segfloor_ros.core.plugins.rig.estimates import OFFSET_SIGMA_PX
 from segfloor_ros.core.slam.mapping.bundle_adjustment import adjust
-from segfloor_ros.core.slam.results import StereoSlamSettings
 from segfloor_ros.core.slam.rig import DisparityOffset, OffsetEstimate
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 FRAMES, TURNED_FRAMES = 40, 21

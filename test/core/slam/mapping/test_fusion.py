@@ -5,9 +5,9 @@ import pytest
 from hand_made_maps import add, keyframe
 
 from segfloor_ros.core.camera.model import StereoCamera
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import transform_points
 from segfloor_ros.core.slam.mapping.keyframe_mapping import find_duplicates, fuse_duplicates
-from segfloor_ros.core.slam.results import NO_POINT
 from segfloor_ros.core.slam.rig import Rig
 from segfloor_ros.core.slam.sparse_map import SparseMap
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.contracts import NO_POINT, Up
 from segfloor_ros.core.geometry import invert, se3_exp, se3_log, transform_points
 from segfloor_ros.core.plugins.saved_slam import fill_map
 from segfloor_ros.core.slam.mapping import normal_equations
@@ -15,7 +15,6 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import (
     move_keyframes,
     solve_global,
 )
-from segfloor_ros.core.slam.results import NO_POINT
 from segfloor_ros.core.slam.rig import NO_OFFSET, Rig
 from segfloor_ros.core.slam.sparse_map import KeyframeRecord, SparseMap
 from tools.map_costs import CAMERA, bend, made_up_map, ring

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from segfloor_ros.core.camera.model import Up
+from segfloor_ros.core.contracts import RelativeMotion, Up
 from segfloor_ros.core.geometry import invert, make_transform, se3_exp, se3_log
-from segfloor_ros.core.plugins.sensors.body_motion import RelativeMotion
 from segfloor_ros.core.slam.mapping.normal_equations import (
     Levels,
     Links,

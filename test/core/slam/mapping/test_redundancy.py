@@ -5,11 +5,11 @@ import pytest
 from hand_made_maps import add, keyframe
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import StereoFrame
+from segfloor_ros.core.contracts import NO_POINT, StereoFrame
 from segfloor_ros.core.geometry import make_transform
 from segfloor_ros.core.slam.mapping.keyframe_mapping import redundant_share, retire_redundant
-from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import SparseMap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 

@@ -13,8 +13,8 @@ from segfloor_ros.core.plugins.saved_slam import load_slam, save_slam
 from segfloor_ros.core.slam.mapping.back_end import Submap
 from segfloor_ros.core.slam.places.loops import PlaceMatcher
 from segfloor_ros.core.slam.places.views import GroundViews, motion_between
-from segfloor_ros.core.slam.results import StereoSlamSettings
 from segfloor_ros.core.slam.rig import Rig
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import NOTHING, Match
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 

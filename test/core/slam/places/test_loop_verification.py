@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hand_made_maps import CAMERA, SCENES, add, keyframe, row_of_views, seen
 
-from segfloor_ros.core.camera.model import Mount
+from segfloor_ros.core.contracts import NO_POINT, Mount
 from segfloor_ros.core.geometry import make_transform, se3_exp
 from segfloor_ros.core.slam.places.loops import (
     DRIFT_PER_M,
@@ -15,9 +15,9 @@ from segfloor_ros.core.slam.places.loops import (
     objection_to_drift,
 )
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
-from segfloor_ros.core.slam.results import NO_POINT, PROOF
 from segfloor_ros.core.slam.rig import Observations, Rig
 from segfloor_ros.core.slam.sparse_map import Match, SparseMap
+from segfloor_ros.core.slam.thresholds import PROOF
 
 MOUNT = Mount(0.4, 0.15)
 POINTS = SCENES['wall']

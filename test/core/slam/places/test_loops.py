@@ -17,9 +17,10 @@ from segfloor_ros.core.slam.mapping.bundle_adjustment import move_keyframes
 from segfloor_ros.core.slam.places.loop_closing import apply_closing, plan_closing, solve_closing
 from segfloor_ros.core.slam.places.loops import PlaceMatcher, objection_to_drift
 from segfloor_ros.core.slam.places.place_recognition import PlaceRecognition
-from segfloor_ros.core.slam.results import PROOF, StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.sparse_map import LoopEdge, Match, SparseMap
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
+from segfloor_ros.core.slam.thresholds import PROOF
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 
 SETTINGS = StereoSlamSettings(num_features=600)

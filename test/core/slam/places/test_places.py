@@ -6,6 +6,7 @@ from hand_made_maps import WALL, row_of_views
 from scipy import sparse
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
+from segfloor_ros.core.contracts import NO_POINT
 from segfloor_ros.core.geometry import se3_exp
 from segfloor_ros.core.slam.places.views import (
     SECOND_VISIT,
@@ -14,8 +15,8 @@ from segfloor_ros.core.slam.places.views import (
     views_near,
     views_to_keep,
 )
-from segfloor_ros.core.slam.results import NO_POINT, StereoSlamSettings
 from segfloor_ros.core.slam.rig import NEIGHBOURS
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 HERE = np.eye(4)

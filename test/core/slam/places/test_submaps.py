@@ -8,7 +8,7 @@ from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
 from segfloor_ros.core.geometry import invert
 from segfloor_ros.core.slam.mapping.back_end import Submap
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 
 SETTINGS = StereoSlamSettings(num_features=600)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.tracking import images
 from segfloor_ros.core.slam.tracking.images import (
     FeatureExtractor,

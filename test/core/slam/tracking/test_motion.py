@@ -3,7 +3,7 @@
 import numpy as np
 from stereo_room import MOUNT, planar_pose
 
-from segfloor_ros.core.camera.model import ImuSample, WheelPose
+from segfloor_ros.core.contracts import ImuSample, WheelPose
 from segfloor_ros.core.geometry import invert, se3_exp
 from segfloor_ros.core.plugins.sensors.body_motion import BodyMotion
 from segfloor_ros.core.slam.tracking.motion import CameraMotion, sigma_m

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from stereo_room import CAMERA, MOUNT, StereoRoom, planar_pose
 
-from segfloor_ros.core.camera.model import WheelPose
-from segfloor_ros.core.slam.results import StereoSlamSettings
+from segfloor_ros.core.contracts import WheelPose
 from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.settings import StereoSlamSettings
 from segfloor_ros.core.slam.stereo_slam import StereoSlam
 from segfloor_ros.core.slam.tracking.front_end import FrontEnd
 from segfloor_ros.core.slam.tracking.patch_alignment import with_patch_noise

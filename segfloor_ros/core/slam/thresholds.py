@@ -1,0 +1,34 @@
+"""How much must agree for something to be believed: one answer for all rooms of SLAM."""
+
+from __future__ import annotations
+
+ENOUGH = 20
+"""Fewest points that must agree for a pose, or for two views of one place, to be believed; half as
+many for a first guess. Chance gives five or six."""
+
+SAME = 0.5, 0.3
+"""Two poses further apart than this, in m and rad, are two places."""
+
+MAJORITY = 0.5
+"""Share that must agree: a wrong pose has followers too, but not most."""
+
+CHANCE_SHARE = 0.1
+"""Share of the points of a view of which no more may be found by chance: far ones alone fit many
+places."""
+
+MOST = 0.6
+"""Share of what is expected at a pose that must be found there: what looks alike shows less."""
+
+NEARLY_ALL = 0.9
+"""Share of a keyframe's points that others must see as well, or of a view that they must cover, for
+it to add nothing (Mur-Artal et al., ORB-SLAM, IEEE T-RO 2015, section VI-E); and what counts as
+much as the best."""
+
+POINTS_PER_KEYFRAME = 300
+"""Points of a keyframe that hold the map together where it is adjusted as a whole, those that most
+others see, and corners of its floor; the rest moves along."""
+
+PROOF = 3
+"""Keyframes that must show something for it to be believed: that a point stands still, or is gone,
+that a view adds nothing, that a place is seen again; and corners of a thing that moves. By chance
+hardly two agree."""

@@ -1,0 +1,67 @@
+"""What tracking hands to mapping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from segfloor_ros.core.geometry import Array
+from segfloor_ros.core.slam.rig import Observations
+from segfloor_ros.core.slam.tracking.images import Features
+from segfloor_ros.core.slam.tracking.pose import PoseEstimate
+
+
+@dataclass(frozen=True)
+class ObservedFeatures:
+    """The features (F) of a frame as measured. observations: (F, 3) px, with a disparity where one
+    was measured. point_id: (F,) int32, the row of each feature's map point or `NO_POINT`.
+    """
+
+    features: Features
+    observations: Observations
+    point_id: NDArray[np.int32]
+
+    def take(self, rows: NDArray[np.intp]) -> ObservedFeatures:
+        """Return the chosen rows."""
+        return ObservedFeatures(
+            self.features.take(rows), self.observations.take(rows), self.point_id[rows]
+        )
+
+
+@dataclass(frozen=True)
+class Track:
+    """A frame with a pose.
+
+    point_ids: (N,) the map points that were found and agree, and observations (N) of them as
+    measured. visible_ids: those that were looked for. observed: set when the pose was found by
+    features. is_poor: whether few points of many support the pose. sigma_m: how uncertain the image
+    leaves the place on the axis where it is most, 0 where it shows plenty. prior: the pose that
+    wheels measured, where the image does not contradict it; is_prior_better: in some direction.
+    """
+
+    estimate: PoseEstimate
+    point_ids: NDArray[np.int32]
+    observations: Observations
+    visible_ids: NDArray[np.int32]
+    observed: ObservedFeatures | None = None
+    is_poor: bool = False
+    sigma_m: float = 0.0
+    prior: PoseEstimate | None = None
+    is_prior_better: bool = False
+
+    @property
+    def T_camera_world(self) -> Array:
+        """The pose (4, 4)."""
+        return self.estimate.T_camera_world
+
+    @property
+    def uv_px(self) -> Array:
+        """Where the points are in the image, (N, 2)."""
+        return self.observations.uvd_px[:, :2]
+
+    @property
+    def covariance(self) -> Array:
+        """The covariance (6, 6) of the pose's twist."""
+        return self.estimate.covariance
