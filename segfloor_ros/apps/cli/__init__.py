@@ -2,13 +2,19 @@
 
 import sys
 
-from segfloor_ros.core.processes import limit_threads
+from segfloor_ros.core.processes import (
+    end_in_silence_on_signals,
+    limit_threads,
+    open_standard_streams,
+)
 
 limit_threads()
 
 
 def start() -> None:
     """Run the command line; without its libraries, end with one line and status 2."""
+    open_standard_streams()
+    end_in_silence_on_signals()
     try:
         from segfloor_ros.apps.cli.main import main as run
         from segfloor_ros.core.files.images import own_standard_error

@@ -125,7 +125,7 @@ def evaluate_map(
         return print_json(dataclasses.asdict(score))
     console.print(map_table(score))
     if overlay is not None:
-        typer.echo(f'overlay: {overlay}')
+        console.print(f'overlay: {overlay}', soft_wrap=True)
 
 
 @app.command('trajectory')
@@ -173,7 +173,7 @@ def evaluate_trajectory(
     ]
     console.print(value_table('measure', rows))
     if plot is not None:
-        typer.echo(f'plot: {plot}')
+        console.print(f'plot: {plot}', soft_wrap=True)
 
 
 @app.command('floor')
@@ -219,7 +219,7 @@ def evaluate_report(
     """
     from segfloor_ros.apps.evaluation.report import write_report
 
-    typer.echo(f'report: {write_report(run, truth)}')
+    console.print(f'report: {write_report(run, truth)}', soft_wrap=True)
 
 
 def resolve_alignment(align: str, estimate: OccupancyGrid, truth: MapTruth) -> Pose2d:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import signal
 import sys
 from collections.abc import Callable
 from typing import Annotated
@@ -94,20 +97,41 @@ def with_optional_values(words: list[str]) -> list[str]:
 def run_app(program: typer.Typer) -> None:
     """Run a command line; known errors print one line.
 
-    Status 2: bad input; 1: no map came of it.
+    Status 2: bad input; 1: no map came of it, or what is printed could not be written.
     """
     logging.basicConfig(format='segfloor: %(message)s', level=logging.WARNING)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    status: str | int | None = 0
     try:
         with terminated_like_interrupted():
             program(args=with_optional_values(sys.argv[1:]))
+    except SystemExit as ended:
+        status = ended.code
+    except KeyboardInterrupt:
+        status = 130
     except MapError as error:
         print_error(str(error))
-        sys.exit(1)
+        status = 1
     except SegfloorError as error:
         print_error(str(error))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+        status = 2
+    except OSError as error:  # e.g. a name that is too long, or no space where is printed to
+        where = f'{str(error.filename)[:200]}: ' if error.filename else ''
+        print_error(f'{where}{error.strerror or error}')
+        status = 2
+    sys.exit(_flushed(status))
+
+
+def _flushed(status: str | int | None) -> str | int | None:
+    """Return a status, or 1 where it is 0 and what was printed cannot be written."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno != errno.EPIPE:
+            print_error(f'standard output: cannot be written ({error.strerror})')
+        return status or 1
+    return status
 
 
 if __name__ == '__main__':

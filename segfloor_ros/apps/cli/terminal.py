@@ -24,6 +24,7 @@ from rich.progress import (
 )
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 import segfloor_ros
 from segfloor_ros.apps.lockstep import MapOptions, SaveMasks
@@ -43,8 +44,17 @@ from segfloor_ros.core.processes import Interrupt
 from segfloor_ros.core.settings import suggestion
 from segfloor_ros.nodes.configuration import resolve
 
-console = Console(markup=False, highlight=False)
-error_console = Console(stderr=True, soft_wrap=True, markup=False, highlight=False)
+
+class PlainConsole(Console):
+    """A console that passes no control characters of names on to the terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text as it is shown."""
+        return super().render_str('\n'.join(map(printable, text.split('\n'))), **options)
+
+
+console = PlainConsole(markup=False, highlight=False)
+error_console = PlainConsole(stderr=True, soft_wrap=True, markup=False, highlight=False)
 
 Progress = Callable[..., None]
 """Told how many steps are done and, as `note`, the state in words."""
