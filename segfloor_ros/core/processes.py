@@ -181,8 +181,8 @@ def end_in_silence_on_signals(status: int | None = None) -> None:
 
 
 def open_standard_streams() -> None:
-    """Give a program that was started without standard input, output or error an empty one. The next
-    file that it opens would take the number of the missing one, and what is printed.
+    """Give a program that was started without standard input, output or error an empty one. The
+    next file that it opens would take the number of the missing one, and what is printed.
     """
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         try:

@@ -22,7 +22,7 @@ from std_msgs.msg import UInt8MultiArray
 from segfloor_ros.core.camera.calibration import StereoCalibration
 from segfloor_ros.core.camera.pixels import Region, shrink_factor, shrunk_camera, shrunk_image
 from segfloor_ros.core.contracts import FrameResult, Keyframe, Mount, StereoFrame
-from segfloor_ros.core.errors import MapError, SettingsError
+from segfloor_ros.core.errors import MapError, SegfloorError, SettingsError
 from segfloor_ros.core.files.results import SAVED_MAP, MapFile, read_map_file, write_map_file
 from segfloor_ros.core.files.whole import user_path
 from segfloor_ros.core.files.writing import check_output
@@ -427,6 +427,7 @@ class SlamMaps:
     def _load(self) -> str:
         if not self._own.load_map:
             raise SettingsError('load_map is empty; set it to the name of a saved map')
+        self.read()  # one that cannot be read leaves the map as it is
         self._node.reset('by ~/load_map')
         return self._own.load_map
 
@@ -456,20 +457,52 @@ class SlamMaps:
 
     async def _save(self) -> str:
         """Gather the map and write it beside tracking, which goes on meanwhile."""
+        return await self._completed(*self._begin_to_save())
+
+    def save_before_reset(self) -> None:
+        """Begin to save a map that is dropped now, where `save_map` names a file."""
+        slam = self._slam()
+        has_map = slam is not None and slam.mount is not None and bool(slam.map.keyframes)
+        if not (self._own.save_map and has_map) or self._own.localize or self._arrived is not None:
+            return
+        log = self._node.get_logger()
+        try:
+            path, saved = self._begin_to_save()
+        except (SegfloorError, OSError) as error:
+            log.error(f'the map is not saved before the reset: {error}')
+            return
+
+        async def complete() -> None:
+            try:
+                log.warning(f'the map before the reset is in {await self._completed(path, saved)}')
+            except (SegfloorError, OSError) as error:
+                log.error(f'the map before the reset is not saved: {error}')
+
+        assert self._node.executor is not None
+        self._node.executor.create_task(complete)
+
+    def _begin_to_save(self) -> tuple[Path, MapFile]:
+        """Ask for the parts of the other nodes; returns where to save, and SLAM's own part."""
         path = self._file_to_save()
-        check_output(path, SAVED_MAP, inputs := (self._own.load_map,), 'save_map')
+        check_output(path, SAVED_MAP, (self._own.load_map,), 'save_map')
         saved = self._slam_part()
-        start_ns = saved.header.pop('start_ns')
         self._arrived = Future()
-        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         last_ns = int(saved.parts['slam']['keyframe_stamp_ns'][-1])
         self._node.outputs.publish(MAP_WANTED, make_header(last_ns, self._own.map_frame))
+        return path, saved
+
+    async def _completed(self, path: Path, saved: MapFile) -> str:
+        """Save a map once the parts of the other nodes have come; returns where it is."""
+        start_ns, arrived = saved.header.pop('start_ns'), self._arrived
+        assert arrived is not None
+        give_up = self._node.inputs.steady_timer(PATIENCE_S, self._give_up)
         try:
-            await self._arrived
+            await arrived
             for part in self._parts.values():
                 if part.header['start_ns'] != start_ns:
                     raise MapError('the map was reset while it was saved')
                 saved.parts |= part.parts
+            inputs = (self._own.load_map,)
             await _in_background(partial(write_map_file, path, saved, inputs))
         finally:
             self._node.destroy_timer(give_up)

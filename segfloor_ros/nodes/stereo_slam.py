@@ -7,7 +7,6 @@ import time
 from segfloor_ros.core.contracts import StereoFrame
 from segfloor_ros.core.errors import InputError
 from segfloor_ros.core.files.results import MapFile
-from segfloor_ros.core.geometry import MAX_DISORDER_NS
 from segfloor_ros.core.pipeline import CAMERA_AS_BASE, make_slam
 from segfloor_ros.core.plugins.saved_slam import (
     last_pose_of,
@@ -23,7 +22,7 @@ from segfloor_ros.nodes.shared.inputs import CHECK_S
 from segfloor_ros.nodes.shared.running import run_node
 from segfloor_ros.nodes.shared.stage_node import StageNode
 from segfloor_ros.nodes.shared.transforms import Transforms
-from segfloor_ros.nodes.slam_camera import Pair, StereoInput
+from segfloor_ros.nodes.slam_camera import Pair, StampOrder, StereoInput
 from segfloor_ros.nodes.slam_outputs import CameraFrames, SlamMaps, SlamResults
 from segfloor_ros.nodes.slam_sensors import InitialPose, MaskInput, SensorInput
 
@@ -61,7 +60,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         self._sensors.reset()
         self.masks.reset()
         self._initial_pose.reset()
-        self._last_stamp_ns: int | None = None
+        self._stamps = StampOrder()
         self._is_started = self._is_resumed = False
         self._frame_count = 0
         if saved is not None:
@@ -69,6 +68,11 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
             camera = saved_camera(saved, name)
             self.slam = make_slam(camera, own, background=own.background)
             self._maps.loaded = saved, load_slam(self.slam, camera, saved, name, own.localize)
+
+    def reset(self, reason: str) -> None:
+        """Drop the map, which is saved first where `save_map` names a file."""
+        self._maps.save_before_reset()
+        super().reset(reason)
 
     def restore(self, saved: MapFile) -> None:
         """Go on with the map of a killed node: with its stamps, and where it ended. Raises
@@ -80,7 +84,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         camera = saved_camera(saved, 'kept map')
         self.slam = make_slam(camera, self.settings, background=self.settings.background)
         load_slam(self.slam, camera, saved, 'kept map', last=last)
-        self._last_stamp_ns = last.stamp_ns
+        self._stamps = StampOrder(last.stamp_ns)
         self._is_resumed = True
 
     def is_needed_otherwise(self) -> bool:
@@ -104,7 +108,7 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
 
     def _take_late_mask(self, stamp_ns: int) -> None:
         """Take points back, where the mask is of a frame that was tracked already."""
-        last_ns = self._last_stamp_ns
+        last_ns = self._stamps.last_ns
         if self.slam is not None and last_ns is not None and stamp_ns <= last_ns:
             mask = self.masks.mask_of(stamp_ns, self._camera.rectifier)
             self.slam.late_masks.add(stamp_ns, mask)
@@ -157,14 +161,16 @@ class StereoSlamNode(StageNode[StereoSlamNodeSettings]):
         """Whether a pair comes after the one before; where time has jumped back, e.g. because a
         recording is played again, the map is reset.
         """
-        last_ns = self._last_stamp_ns
-        if last_ns is not None and stamp_ns < last_ns - MAX_DISORDER_NS:
-            jump_s = 1e-9 * (last_ns - stamp_ns)
-            self.reset(f'the stamps of the images went back by {jump_s:.3f} s')
-        elif last_ns is not None and stamp_ns <= last_ns:
-            self.reporter.report(stamp_ns, Level.ERROR, 'older than the pair before it; dropped')
+        last_ns = self._stamps.last_ns
+        why_not = self._stamps.take(stamp_ns)
+        if why_not:
+            self.reporter.health.count('stamps out of order')
+            self.reporter.report(stamp_ns, Level.ERROR, why_not)
             return False
-        self._last_stamp_ns = stamp_ns
+        if last_ns is not None and stamp_ns < last_ns:
+            stamps = self._stamps
+            self.reset(f'the stamps of the images went back by {1e-9 * (last_ns - stamp_ns):.3f} s')
+            self._stamps = stamps
         return True
 
     def _process(self, stamp_ns: int, pair: Pair) -> None:

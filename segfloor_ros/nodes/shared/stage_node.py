@@ -308,7 +308,7 @@ class StageNode(LifecycleNode, ABC, Generic[Settings]):
 
     def reset(self, reason: str) -> None:
         """Drop the map and begin with an empty one, with one line in the log."""
-        self.get_logger().info(f'reset: {reason}')
+        self.get_logger().warning(f'reset: {reason}')
         self.kept_state.remove()
         self.reset_stage()
 
