@@ -4,7 +4,7 @@ the check of a calibration on a recording.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,16 +20,10 @@ from segfloor_ros.apps.recordings.source import StereoSource
 from segfloor_ros.core.camera.calibration import EyeCalibration, StereoCalibration
 from segfloor_ros.core.camera.model import StereoCamera
 from segfloor_ros.core.contracts import StereoFrame
-from segfloor_ros.core.errors import CalibrationError, InputError, os_errors
+from segfloor_ros.core.errors import CalibrationError, InputError
 from segfloor_ros.core.files.images import CorruptImageError, Grey, read_grey
 from segfloor_ros.core.files.writing import PAGE as HTML
-from segfloor_ros.core.files.writing import (
-    YAML,
-    add_files,
-    check_output,
-    check_target,
-    write_output,
-)
+from segfloor_ros.core.files.writing import YAML, check_output, write_output
 from segfloor_ros.core.geometry import Array, make_transform
 from segfloor_ros.core.plugins.rig.check import EVERY, InputFault, RigCheck
 from segfloor_ros.core.plugins.rig.estimates import ROWS_PX
@@ -244,7 +238,9 @@ def calibrate_folder(
     Recognition 2014. Raises InputError or CalibrationError.
     """
     left, right = find_image_pairs(folder)
-    check_writable(folder, out)
+    target = folder if out is None else out
+    for name, kind in KINDS.items():
+        check_output(target / name, kind)
     views, size, left_out = _find_boards(list(zip(left, right, strict=True)), board, on_progress)
     if len(views) < MIN_PAIRS:
         raise CalibrationError(
@@ -253,7 +249,8 @@ def calibrate_folder(
         )
     calibration, rms_px, errors_px = _solve(views, size, board, str(folder))
     texts = ros_calibration(calibration.left, 'left'), ros_calibration(calibration.right, 'right')
-    write(folder, out, {n: text.encode() for n, text in zip(FILES, texts, strict=True)})
+    for name, text in zip(FILES, texts, strict=True):
+        write_output(target / name, YAML, text.encode())
     rows_px = [_rows_rms_px(calibration, view) for view in views]
     errors_px = np.column_stack([errors_px, rows_px])
     order = np.argsort(-np.linalg.norm(errors_px[:, :2], axis=1), kind='stable')
@@ -261,26 +258,6 @@ def calibrate_folder(
     return CalibrationResult(
         calibration, board, rms_px, views, errors_px[order], left_out, len(left)
     )
-
-
-def check_writable(folder: Path, out: Path | None) -> None:
-    """Raise InputError unless the files of a calibration can be written: to a folder of results, or
-    where none is given beside the pictures.
-    """
-    if out is not None:
-        return check_target(out, KINDS)
-    for name, kind in KINDS.items():
-        check_output(folder / name, kind)
-
-
-def write(folder: Path, out: Path | None, files: Mapping[str, bytes]) -> None:
-    """Write files of a calibration. Raises InputError."""
-    if out is None:
-        for name, content in files.items():
-            write_output(folder / name, KINDS[name], content)
-        return
-    with os_errors(f'{out}: cannot be written', '; choose another --out'):
-        add_files(out, files)
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from rich.table import Table
 from segfloor_ros.apps.calibration import (
     DICTIONARY,
     FILES,
+    KINDS,
     PAGE,
     Board,
     CalibrationResult,
     calibrate_folder,
     check_recording,
 )
-from segfloor_ros.apps.calibration import write as write_calibration
 from segfloor_ros.apps.cli import terminal
 from segfloor_ros.apps.cli.terminal import console, figure_table, number_option, value_table
 from segfloor_ros.apps.cli.view import open_view, show_recording, show_results
@@ -34,6 +34,7 @@ from segfloor_ros.core.camera.recording import DEPTH
 from segfloor_ros.core.errors import InputError, SettingsError, os_errors
 from segfloor_ros.core.files.results import is_map_file
 from segfloor_ros.core.files.whole import user_path
+from segfloor_ros.core.files.writing import write_output
 from segfloor_ros.core.plugins.rig.check import SETTLED_FRAMES
 from segfloor_ros.core.processes import Interrupt, first_interrupt_noted
 
@@ -314,15 +315,14 @@ def calibrate(
         result = calibrate_folder(folder, pattern, out, progress)
     if result.left_out:
         terminal.print_error(f'{folder}: left out: {result.left_out}')
-    _print_calibration(result, folder, out)
+    _print_calibration(result, out or folder)
 
 
-def _print_calibration(result: CalibrationResult, pictures: Path, out: Path | None) -> None:
+def _print_calibration(result: CalibrationResult, folder: Path) -> None:
     """Print figures of a calibration and the errors of each pair, and write its report."""
     # Imported here: Matplotlib takes a second that other commands should not wait for.
     from segfloor_ros.apps.evaluation.report import calibration_page
 
-    folder = out or pictures
     table = figure_table('pair', 'left px', 'right px', 'rows px')
     for view, errors_px in zip(result.views, result.view_errors_px, strict=True):
         table.add_row(view.paths[0].name, *(f'{error:.3f}' for error in errors_px))
@@ -339,7 +339,7 @@ def _print_calibration(result: CalibrationResult, pictures: Path, out: Path | No
         ('baseline', f'{camera.baseline_m:.4f} m'),
     ]
     console.print(value_table('calibration', rows, str(folder)))
-    write_calibration(pictures, out, {PAGE: calibration_page(result, rows, folder)})
+    write_output(folder / PAGE, KINDS[PAGE], calibration_page(result, rows, folder))
     for name in (*FILES, PAGE):
         console.print(str(folder / name), soft_wrap=True)
 
