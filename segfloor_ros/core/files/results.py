@@ -17,9 +17,8 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
@@ -27,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from segfloor_ros.core.errors import InputError, os_errors
+from segfloor_ros.core.files.arrays import MapFile
 from segfloor_ros.core.files.whole import check_file, json_object, read_json, read_text
 
 MARKER = '.segfloor_result'
@@ -54,8 +54,6 @@ COMPRESSION_LEVEL = 3
 
 MAX_RATIO, SMALL = 20, 1 << 24
 """A map unpacks to at most so many times its size, and a small one to so many bytes more."""
-
-Arrays = dict[str, NDArray[Any]]
 
 
 @contextmanager
@@ -272,16 +270,6 @@ def _in_the_way(folder: Path, names: Iterable[str], own: set[str]) -> list[str]:
     return found
 
 
-@dataclass
-class MapFile:
-    """The parts of a map by the name of the stage that they belong to, and a header of plain values
-    (numbers, texts, lists, dictionaries).
-    """
-
-    header: dict[str, Any]
-    parts: dict[str, Arrays] = field(default_factory=dict)
-
-
 def write_map_file(path: Path, saved: MapFile) -> None:
     """Write a map in place of an older file. Raises InputError where that is not possible."""
     with writing(path.absolute()) as file:
@@ -390,32 +378,3 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes | memoryview) -> No
     member = zipfile.ZipInfo(name)  # without the time of day
     member.compress_type = archive.compression
     archive.writestr(member, content)
-
-
-def joined(arrays: list[NDArray[Any]], empty: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return arrays (N_i, ...) as one (sum N_i, ...) and their lengths; empty: one of no rows."""
-    lengths = np.array([len(array) for array in arrays], np.int64)
-    return np.concatenate([empty, *arrays]), lengths
-
-
-def split(array: NDArray[Any], lengths: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return the arrays that `joined` made one of. Raises ValueError where lengths do not fit."""
-    if lengths.sum() != len(array):
-        raise ValueError(f'{len(array)} rows, but {lengths.sum()} are expected')
-    return np.split(array, np.cumsum(lengths)[:-1].tolist()) if len(lengths) else []
-
-
-def take(arrays: Arrays, kept: NDArray[np.bool_], lengths: Mapping[str, str]) -> Arrays:
-    """Return the rows of columns (K, ...) that are kept (K,). lengths: of columns that `joined`
-    made by row, the names of those with their lengths; they need not be there. Raises IndexError or
-    ValueError where they do not fit.
-    """
-    there = {name: count for name, count in lengths.items() if name in arrays}
-    of_rows = {name: np.repeat(kept, arrays[count]) for name, count in there.items()}
-    return {name: array[of_rows.get(name, kept)] for name, array in arrays.items()}
-
-
-def check_lengths(arrays: Mapping[str, Sized]) -> None:
-    """Raise ValueError unless all arrays have the same length."""
-    if len({len(array) for array in arrays.values()}) > 1:
-        raise ValueError('columns of different lengths')
